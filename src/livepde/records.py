@@ -1,7 +1,7 @@
 """Records of estimates, and the dataset made of them.
 
-A record holds numbers and arrays only; what they mean (names, units, coordinates) stands once, in a
-layout of plain values. So a run can be read without its model, and while it goes on.
+A record holds numbers and arrays only; their names, units and coordinates are stored once, in a
+layout of plain values. So a run can be read without its model, and while it is in progress.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ __all__ = [
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
-NOTE = "note_"  # what a note is called whose own name is taken
-SMOOTHED = "_smoothed"  # after the name of a variable that is given all samples of a run
+NOTE = "note_"  # prefix of a note whose own name is taken
+SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a run
 DATE = "date"  # column of an exported table, beside the variables of the dataset
-# What stands beside an unknown or a component of the state: end of the variable's name -> meaning.
+# Variables beside an unknown or a component of the state: suffix of their names -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
 NUMBER_ENDS = {
@@ -67,11 +67,11 @@ class Snapshot:
     profiles
         Variable -> values at the vertices, in the order of `Layout.coordinates`.
     told
-        Field -> of how many modes the data have told, and how many there are.
+        Field -> number of modes that the data have determined, and number of all modes.
     correlation
-        Of the numbers, shape (unknowns, unknowns); None without covariance.
+        Correlation of the scalar unknowns, shape (unknowns, unknowns); None without covariance.
     left_out
-        Field -> share of its mean variance that is of modes that the law leaves out.
+        Field -> share of its mean variance in modes that the law leaves out.
     """
 
     profiles: Mapping[str, Array]
@@ -82,12 +82,12 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What is kept of an estimate.
+    """The stored part of an estimate.
 
     Attributes
     ----------
     t, steps, notes, innovation, withheld_error
-        Of the estimate.
+        Attributes of the estimate.
     numbers
         Values of the variables `Layout.numbers`, shape (numbers,).
     status
@@ -107,7 +107,7 @@ class Record:
 
 
 class Records(Protocol):
-    """Where records are kept: arrays, or the journal of a run."""
+    """A store of records: arrays, or the journal of a run."""
 
     def append(self, record: Record, /) -> None:
         """Keep one more."""
@@ -193,7 +193,7 @@ class RecordArrays:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays, with what they have in reserve."""
+        """Bytes of all arrays, reserved capacity included."""
         single = (self._t, self._numbers, self._innovation, self._error, self._status, self._steps)
         return self._snapshots.nbytes + sum(map(getsizeof, (*single, *self._notes.values())))
 
@@ -275,7 +275,7 @@ class _SnapshotArrays:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all arrays, with what they have in reserve."""
+        """Bytes of all arrays, reserved capacity included."""
         return sum(getsizeof(part) for _, *parts in self._groups for part in parts)
 
 
@@ -311,13 +311,13 @@ class _Structure:
 
 
 def _array(values: array[float]) -> Array:
-    """Return a copy: an array that is looked at could not grow."""
+    """Return a copy: a view would lock the size of the growing array."""
     return np.array(values, dtype=float)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What the numbers of records mean, in plain values.
+    """Names, units and coordinates of the numbers of records, as plain values.
 
     Attributes
     ----------
@@ -329,7 +329,7 @@ class Layout:
         Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an
         interval none, its vertices are in order.
     sensors, withheld
-        Names; `withheld` is None if no sensor is.
+        Names of the sensors; `withheld` is None if no sensor is withheld.
     numbers
         Variable over time -> its attributes, in the order of `Record.numbers`.
     units
@@ -360,7 +360,7 @@ class Layout:
     attrs: Mapping[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the layout as JSON can hold it."""
+        """Return the layout as a JSON object."""
         return asdict(self)
 
     def dataset(self, records: Iterable[Record], last: Snapshot | None = None) -> xr.Dataset:
@@ -476,7 +476,7 @@ class Layout:
         return data
 
     def _errors(self, rows: RecordArrays) -> dict[str, Any]:
-        """Return the variables of what was measured and not expected."""
+        """Return the variables of innovations and errors of withheld sensors."""
         unit = {"units": self.sensor_unit}
         innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}

@@ -36,22 +36,22 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What is known at one time.
+    """The estimate of parameter and state after one sample.
 
     Attributes
     ----------
     t
         Time of the sample.
     belief
-        Coefficients of parameter and state, and how well they are known.
+        Coefficients of parameter and state, with their uncertainty.
     innovation
         Measured minus expected before the sample was used, shape (sensors,); NaN where missing.
         For `GradientLaw`, which pulls the state to the sample within the step, the output error
-        that is left after it.
+        after the step.
     withheld_error
         Measured minus estimated of each withheld channel.
     status
-        How the step went; unless ok, q and u are those of the last good step.
+        Status of the step; unless ok, q and u are those of the last successful step.
     steps
         Substeps taken.
     notes
@@ -61,7 +61,7 @@ class Estimate:
     space
         The unknowns.
     judge
-        Gives what the law says of the run so far; see `verdict`.
+        Function that returns the verdict of the law on the run so far; see `verdict`.
     """
 
     t: float
@@ -215,7 +215,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """What an estimate says of one unknown.
+    """The marginal distribution of one unknown in an estimate.
 
     Attributes
     ----------
@@ -245,7 +245,7 @@ class Marginal:
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
-    """Return which scalar unknowns the data have hardly told of, or end at a bound."""
+    """Return findings on scalar unknowns that are hardly identified, or end at a bound."""
     for label, row in space.labels.items():
         unknown, value = unknown_of(space, label), float(belief.q[row])
         lower, upper = map(float, unknown.bounds)
@@ -265,11 +265,11 @@ class Result:
     Parameters
     ----------
     records
-        Where to keep them; default in arrays.
+        Store of the estimates; default arrays in memory.
     layout
-        What the numbers of records mean; default what model and sensors say.
+        Names, units and coordinates of the numbers of records; default those of model and sensors.
     count
-        Estimates that there were before, of which not all need be kept; default all records.
+        Number of earlier estimates, not all of which need be kept; default that of the records.
     """
 
     def __init__(

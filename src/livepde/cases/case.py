@@ -58,7 +58,7 @@ class Prepared:
     Attributes
     ----------
     first
-        The first sample, which describes the start.
+        The first sample, which gives the initial state and inputs.
     stream
         All samples. A `Table` can be iterated again, standard input cannot. Gaps of its boundary
         and input channels are interpolated, and spikes refused.
@@ -67,7 +67,7 @@ class Prepared:
     origin
         Date of t = 0, if the data have dates.
     raw
-        A finished record as it was read, with its gaps.
+        The table as read, with its gaps; None for a stream.
     """
 
     case: Case
@@ -113,7 +113,7 @@ class Prepared:
 
     @cached_property
     def u0(self) -> Any:
-        """The initial state: a number, or a function of x; None if the model says it itself."""
+        """The initial state: a number, or a function of x; None if the model defines it."""
         frame = self.case.frame
         if self.case.model.form_initial is None:
             return initial_of(frame, self.case.mesh, self.first)
@@ -132,12 +132,12 @@ class Prepared:
 
     @cached_property
     def layout(self) -> Layout:
-        """What the records of a run mean: title, start, units and references are the case's."""
+        """Layout of the records of a run, with title, start, units and references of the case."""
         who = self.identifier
         return self.described(layout_of(who.model, who.observed, who.withheld))
 
     def described(self, found: Layout) -> Layout:
-        """Return a layout with what the case says beside model and sensors."""
+        """Return a layout with the references, unit of length and attributes of the case."""
         references = {
             label: {**found.numbers[label], "reference": value}
             for label, value in self.case.references.items()
@@ -150,12 +150,12 @@ class Prepared:
         )
 
     def journal(self, path: Path | None = None) -> Journal:
-        """Return a new journal for a run of this case; without a path in memory."""
+        """Return a new journal for a run of this case; in memory if there is no path."""
         return Journal.create(path, self.identifier.channels, self.layout)
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What a dataset of this case should say about itself."""
+        """Attributes of a dataset of this case: title, equation, start and source of references."""
         equation = self.case.frame.equation
         found: dict[str, Any] = {"title": self.case.title, "equation": equation.formula}
         if np.isfinite(self.assimilate_from):
@@ -182,12 +182,12 @@ def load(
     allow_code
         Load an equation or a reader of the user's own ('module:function', 'file.py:function').
     settings
-        Key -> value instead of what the file says, as {"law.noise": "2 K"}.
+        Key -> value that overrides that of the file, as {"law.noise": "2 K"}.
 
     Raises
     ------
     CaseError
-        One sentence: which key, what it got, what was expected, and the remedy.
+        An invalid case: one sentence with key, given value, expected value and remedy.
     """
     file = Path(path)
     text = original = read_text(file)
@@ -205,14 +205,14 @@ def load(
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A case file whose parts fit together; `prepare` adds the data.
+    """A case file with consistent parts; `prepare` adds the data.
 
     Attributes
     ----------
     frame
         File, specification and equation.
     text
-        The case as it is run: the file's content, or with settings what it amounts to.
+        The effective case: content of the file, or of the file with settings applied.
     original
         The file's content.
     """
@@ -222,13 +222,13 @@ class Case:
     original: str
 
     def check(self) -> None:
-        """Build all that needs no data; raises `CaseError`."""
+        """Build all parts that need no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
         _ = self.scheme, self.dt_max, self.references, input_noise_of(self.frame)
         self._check_names()
 
     def _check_names(self) -> None:
-        """Refuse names of unknowns and channels that are those of other numbers of a run."""
+        """Refuse names of unknowns and channels that are reserved for other numbers of a run."""
         kinds = (
             ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
             ("channels", "channel", self.frame.roles("sensor", "withheld"), ROLES),
@@ -241,7 +241,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """A name for its runs."""
+        """Name of the case, used for its run directories."""
         return self.frame.name
 
     @property
@@ -251,7 +251,7 @@ class Case:
 
     @cached_property
     def references(self) -> dict[str, float]:
-        """Label of an unknown -> what others found, in the model's unit."""
+        """Label of an unknown -> its reference value, in the model's unit."""
         frame, space = self.frame, self.model.parameter_space
         found = {}
         for label, value in frame.spec.reference.items():
@@ -266,7 +266,7 @@ class Case:
 
     @property
     def source(self) -> str:
-        """Where the references come from."""
+        """Source of the references: a publication, say."""
         given = self.frame.spec.reference.get("source", "")
         return given if isinstance(given, str) and "source" not in self.references else ""
 
@@ -282,7 +282,7 @@ class Case:
 
     @property
     def fields_every(self) -> int:
-        """Fields of every so many samples are kept."""
+        """Number of samples between two that keep their fields."""
         return self.frame.spec.output.fields_every
 
     @property
@@ -307,12 +307,12 @@ class Case:
 
     @cached_property
     def columns(self) -> dict[str, Column]:
-        """Channel -> where it comes from in the data."""
+        """Channel -> its column in the data."""
         return columns_of(self.frame)
 
     @cached_property
     def observation(self) -> Observation:
-        """What is assimilated."""
+        """The assimilated sensors."""
         observation = observation_of(self.frame, self.mesh, self.options, "sensor")
         if observation is None:
             text = "there is no sensor to learn from; give at least one channel role = 'sensor'."
@@ -326,7 +326,7 @@ class Case:
 
     @cached_property
     def withheld(self) -> Observation | None:
-        """What is scored only."""
+        """The withheld sensors, which are scored only; None if there are none."""
         return observation_of(self.frame, self.mesh, self.options, "withheld")
 
     @cached_property
@@ -351,12 +351,12 @@ class Case:
 
     @cached_property
     def clock(self) -> Clock:
-        """How times are read."""
+        """The clock, which converts the column of times."""
         return clock_of(self.frame)
 
     @property
     def notes(self) -> list[str]:
-        """What is allowed and yet deserves a word."""
+        """Notes on allowed settings that may be mistakes."""
         found = [
             *drive_notes(self.frame, self.model),
             *process_notes(self.frame, self.mesh),
@@ -400,7 +400,7 @@ class Case:
             The data cannot be used; the message names file, row and column.
         """
         prepared = self.read(source)
-        _ = prepared.identifier  # raises what does not fit together
+        _ = prepared.identifier  # built here to raise errors of inconsistent data
         return prepared
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
@@ -418,31 +418,31 @@ class Case:
 
     @property
     def live(self) -> bool:
-        """Whether the case's own source goes on: a file that grows, a broker, a server."""
+        """Whether the case's own source is live: a file that grows, a broker or a server."""
         return self.frame.spec.data.live
 
     def goes_on(self, data: str | None) -> bool:
-        """Whether a source goes on: the case's own, or a file instead of one that is followed."""
+        """Return whether a source is live: the case's own, or a file instead of a followed one."""
         if data is None:
             return self.live
         return self.frame.spec.data.follow and data != "-" and not data.endswith(".parquet")
 
     def begin(self, first: Sample, origin: datetime | None = None) -> Prepared:
-        """Return an identifier for a process of which the first sample has come.
+        """Return the case with the first sample of a live process.
 
         Parameters
         ----------
         first
-            Describes the start.
+            The first sample, which gives the initial state and inputs.
         origin
             The date of t = 0, if times are dates.
 
         Raises
         ------
         DataError
-            The sample lacks what is needed to begin.
+            The sample lacks values needed for the initial state or inputs.
         """
         start = assimilation_start(self.frame, self.clock, origin)
         prepared = Prepared(self, first, (), start, origin)
-        prepared.identifier_with(self.law).step(first.t, first.z)  # raises what is missing
+        prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared

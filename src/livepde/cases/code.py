@@ -17,7 +17,7 @@ __all__ = ["check_options", "load_code"]
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
-    """Return what a case names: an object of a module, or of a file beside the case.
+    """Import the object that a case names, from a module or from a file beside the case.
 
     Parameters
     ----------
@@ -26,9 +26,9 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
     where
         File and key, for the message.
     expected
-        What the function has to be.
+        Description of the expected function, for the message.
     allowed
-        The user said --allow-code.
+        Whether the user passed --allow-code.
 
     Raises
     ------
@@ -63,7 +63,7 @@ def check_options(function: Any, given: Iterable[str], where: str) -> None:
 
 
 def _no_code(path: Path, source: str, folder: Path) -> str:
-    """Return a sentence about code that is not beside the case, but perhaps where the user is."""
+    """Return a sentence on a missing code file, with a hint if the working directory has it."""
     if Path(source).is_file():
         there = beside(Path(source), folder).as_posix()
         return f"there is no file '{path}', beside the case; did you mean '{there}'?"

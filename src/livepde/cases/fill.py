@@ -23,7 +23,7 @@ class Blank:
     path
         Its keys, as ("channels", "T_1", "at").
     value
-        What stands there: "? m", or a list that holds one.
+        The placeholder: "? m", or a list that holds one.
     comment
         The comment of its line.
     """

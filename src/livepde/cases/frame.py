@@ -40,7 +40,7 @@ class Frame:
 
     @property
     def name(self) -> str:
-        """A name for what comes of the case: that of the file, of its folder if that is 'case'."""
+        """Name of the case: that of its file, or of its folder if the file is 'case.toml'."""
         path = self.path.absolute()
         return path.stem if path.stem != "case" else path.parent.name or "case"
 

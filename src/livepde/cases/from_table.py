@@ -1,4 +1,4 @@
-"""The case for a table of measurements; what the table does not tell stays open, as '?'."""
+"""The case for a table of measurements, with '?' for values that the table does not hold."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _mesh(equation: Equation) -> dict[str, Any]:
 
 
 def _data(table: Measured, folder: Path) -> dict[str, Any]:
-    """Return how the files are written."""
+    """Return the format of the files as keys of [data], without defaults."""
     first, *others = (_written(one, folder) for one in table.tables)
     found = {key: value for key, value in first.items() if value != USUAL.get(key)}
     if others:
@@ -162,7 +162,7 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
 
 
 def _written(table: Measured, folder: Path) -> dict[str, Any]:
-    """Return how a file is written, with what is usual."""
+    """Return the format of a file as keys of [data], defaults included."""
     written, path = table.written, table.path
     file = path if path.is_absolute() else beside(path, folder)
     found: dict[str, Any] = {"file": file.as_posix(), "skip": written.skip}
@@ -179,7 +179,7 @@ def _written(table: Measured, folder: Path) -> dict[str, Any]:
 
 
 def _contents(table: Measured) -> Iterator[str]:
-    """Yield in comments what is in the files."""
+    """Yield comments on the contents of the files: span, row numbers and text columns."""
     for one in table.tables:
         yield f"# {one.path.name}: {one.span}" if table.more else f"# {one.span}"
         if one.row_numbers:
@@ -353,7 +353,7 @@ def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundCha
 
 
 def _range(values: Array) -> str:
-    """Return in words what a column holds."""
+    """Return the range of a column, and its number of missing values, as text."""
     present = values[np.isfinite(values)]
     missing = len(values) - len(present)
     if not len(present):

@@ -79,7 +79,7 @@ def _digits(value: int) -> str:
 
 
 def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
-    """Iterate over all values with their keys; what is too deep is not looked into."""
+    """Iterate over all values with their keys and depths; deeper levels are not entered."""
     stack: list[tuple[str, Any, int]] = [("", value, 0)]
     while stack:
         key, value, depth = stack.pop()

@@ -1,4 +1,4 @@
-"""A case beside a running process."""
+"""A case connected to a running process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LOG = logging.getLogger("livepde.run")
 
 
 class Wiring:
-    """What joins a case to its process; used in a `with` statement, or closed in the end.
+    """Connection of a case to its process; a context manager, or to be closed explicitly.
 
     ::
 
@@ -43,22 +43,22 @@ class Wiring:
     case
         The case.
     data
-        Instead of the case's own source: a file, lines of JSON as they come, or a `Source`.
+        Replacement of the case's own source: a file, an iterable of JSON lines, or a `Source`.
     path
-        Journal of the run. If there is one, the run goes on where it ended; None: in memory.
+        Journal of the run. An existing one is continued; None: in memory.
     pace
-        How many times faster than they happened samples of a finished file are taken; infinity: as
-        fast as it goes.
+        Speed of the replay of a finished file, relative to real time; infinity: as fast as
+        possible.
 
     Attributes
     ----------
     prepared
-        The case as its first sample found it; None before that.
+        The case with its first sample; None before that.
     silent
-        Nothing has come for too long while the first sample was waited for.
+        Whether the source has been silent for too long while waiting for the first sample.
     why
-        Why all is not well meanwhile, in one sentence: the source is silent, or what comes is
-        refused; empty if it is.
+        Reason why the run cannot begin yet, in one sentence: the source is silent, or its samples
+        are refused; empty if there is none.
 
     Raises
     ------
@@ -79,7 +79,7 @@ class Wiring:
         self.prepared: Prepared | None = None
         self.silent = False
         self.why = ""
-        # Before anything is connected: a case that is wrong says so at once.
+        # An invalid case is refused here, before anything is connected.
         self._policy, self._limits = policy_of(case.frame), limits_of(case.frame)
         self._path = path
         self._journal: Journal | None = None
@@ -101,30 +101,31 @@ class Wiring:
         self.close()
 
     def close(self) -> None:
-        """Let go of source, sinks and journal."""
+        """Close source, sinks and journal."""
         self._stack.close()
 
     def live(
         self, sinks: Iterable[Sink] = (), stopping: threading.Event | None = None
     ) -> Live | None:
-        """Wait for the first sample that has what is needed, and return the run, ready to go on.
+        """Wait for the first sample with all initial values, and return the run, ready to go on.
 
         Parameters
         ----------
         sinks
-            Where estimates go beside the journal and what the case names; closed with this.
+            Destinations of estimates in addition to the journal and to those of the case; closed
+            with this object.
         stopping
-            Ends the waiting, and the run.
+            Event that ends the waiting, and the run.
 
         Returns
         -------
         Live or None
-            None if it was ended before.
+            The run; None if `stopping` was set before the first sample.
 
         Raises
         ------
         DataError
-            The source ended before.
+            The source ended before the first sample.
         """
         stopping = stopping or threading.Event()
         sinks = [*sinks, *publishers_of(self.case.frame)]
@@ -172,9 +173,9 @@ class Wiring:
     def _begun(
         self, stopping: threading.Event, irregular: dict[tuple[str, str], Remark]
     ) -> tuple[Prepared, Sequence[Ready]] | None:
-        """Return the case as its first sample finds it, and the samples that wait.
+        """Return the case with its first sample, and the samples from it on; None if stopped.
 
-        What was irregular meanwhile is added to what is given.
+        Remarks on irregular rows received meanwhile are added to `irregular`.
         """
         LOG.info("waits for the first sample")
         why = told = "no sample came"

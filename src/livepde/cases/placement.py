@@ -1,4 +1,4 @@
-"""Sensor placement: the position of one more sensor that tells most."""
+"""Sensor placement: the most informative position of one more sensor."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Advice:
     position
         Coordinates, shape (d,).
     now, then
-        Name of each unknown -> share of its prior deviation that the sensors leave, and that they
-        would leave with the new one; of a field the root of the share of its mean variance.
+        Name of each unknown -> remaining share of its prior standard deviation with the present
+        sensors, and with the new one; of a field the root of the share of its mean variance.
     candidates
-        How many positions were compared.
+        Number of compared positions.
     """
 
     position: Array
@@ -59,10 +59,10 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     to the reduced coordinates a ~ N(0, I), over its noise, the posterior covariance of a is
     (I + sum of Y^T Y)^-1. So one run that assimilates nothing gives the sums of all candidates.
 
-    What old samples say of an unknown that moves fades, and does not add up. Then the candidates
-    are ranked by what one more reading would tell at each sample of the preview, from the joint
-    covariance of state and unknowns; the best few are tried in a preview of their own, and the one
-    that leaves the least at its end is the advice.
+    If unknowns move, the information of old samples fades and does not add up. Then the candidates
+    are ranked by the variance reduction of one more reading at each sample of the preview, from the
+    joint covariance of state and unknowns; each of the best few gets a preview of its own, and the
+    one with the smallest final variance is the advice.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
 
 
 def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
-    """Return what reads the state at each candidate, positions (d, candidates), and of what."""
+    """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
@@ -178,14 +178,14 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
 def _previewed(
     prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample], sensors: Observation
 ) -> Iterator[Belief]:
-    """Yield what a filter believes that is linear about the prior, after each measurement."""
+    """Yield the belief of a filter linearised at the prior, after each measurement."""
     identifier = prepared.identifier_with(law, sensors)
     own = [name for name in identifier.observed.names if name != NEW]
     count = 0
     for sample in samples:
         given: Mapping[str, float] = sample.z  # type: ignore[assignment]
         seen = any(np.isfinite(given.get(name, np.nan)) for name in own)
-        # What it reads does not matter for the covariance, only that it reads.
+        # The covariance does not depend on the value of a reading, only on its presence.
         z = {**given, **({NEW: 0.0} if seen and NEW in identifier.observed.names else {})}
         identifier.step(sample.t, z, sample.inputs)
         if seen and sample.t >= prepared.assimilate_from:
@@ -209,7 +209,7 @@ def _reduced(model: Model, belief: Belief) -> Array:
 
 
 def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
-    """Return the share of the prior deviation that is left of each unknown."""
+    """Return the remaining share of the prior standard deviation of each unknown."""
     return {name: float(np.sqrt(np.sum(W * (C @ C.T)))) for name, W in weights.items()}
 
 

@@ -34,7 +34,7 @@ class Identified:
     name
         Label of a number; of a field its name, with the vertices known best and worst.
     prior, posterior
-        Deviations before and after.
+        Standard deviations before and after the samples.
     """
 
     name: str
@@ -44,31 +44,31 @@ class Identified:
 
     @property
     def left(self) -> float:
-        """Share of the prior deviation that is left."""
+        """Remaining share of the prior standard deviation."""
         return self.posterior / self.prior
 
     @property
     def hardly(self) -> bool:
-        """True if the sensors have hardly told anything."""
+        """True if the sensors provide hardly any information on it."""
         return self.left > FLAT
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What the first samples of a case would tell.
+    """Information on the unknowns in the first samples of a case.
 
     Attributes
     ----------
     unknowns
         One item for each number, two for each field.
     samples
-        How many samples with a measurement it took.
+        Number of samples with a measurement.
     sentences
-        What is traded off, and how many modes of each field are known; what the discretisation
-        does to the unknowns, and which errors of sensors would not be seen.
+        Sentences on unknowns that are traded off, the number of identified modes of each field,
+        shifts of unknowns by the discretisation, and sensor errors that would go undetected.
     last
-        The same unknowns if the run began with the last samples instead, as many; empty if there
-        are no more.
+        The same unknowns for a run of the last samples instead, as many; empty if there are no
+        more.
     """
 
     unknowns: tuple[Identified, ...] = ()
@@ -78,9 +78,9 @@ class Preview:
 
 
 class StatedNoise(SensitivityLaw):
-    """The sensitivity law with the covariance of its filter: as if all it states were right.
+    """The sensitivity law with the covariance of its filter, as if model and noise were right.
 
-    What innovations say does not count.
+    The covariance is not inflated by innovations.
     """
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
@@ -88,9 +88,9 @@ class StatedNoise(SensitivityLaw):
 
 
 def linearised(law: AnyLaw) -> SensitivityLaw | None:
-    """Return the law as a filter that is linear about the prior; None for one without covariance.
+    """Return the law as a filter linearised at the prior; None for a law without covariance.
 
-    Of a bank the member whose unknowns stay.
+    Of a bank it is the member with constant unknowns.
     """
     if isinstance(law, AutoLaw):
         law = law.member
@@ -103,16 +103,16 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
     """Return the identifiability by the first samples, linearised at the prior.
 
-    A filter that is linear about one reference has a covariance that does not depend on what is
-    measured, only on when and with which inputs. So the law runs about the prior, never moves its
-    reference, and its estimates are thrown away. What is left is the best case: noise as stated,
-    and a model without error. Nothing for a law without covariance.
+    The covariance of a filter with a fixed linearisation does not depend on measured values, only
+    on their times and on inputs. So the law is linearised at the prior, never moves its reference,
+    and its estimates are discarded. The remaining standard deviations are a best case: noise as
+    stated, and a model without error. The preview of a law without covariance is empty.
     """
     linear = linearised(prepared.case.law)
     if linear is None:
         return Preview()
     if linear.noise is None and prepared.identifier.observed.noise is None:
-        return Preview()  # to be found from the samples
+        return Preview()  # the law estimates it from the samples
     begun, all_of = tee(samples)
     found = _told(prepared, replace(linear, shadows=Shadows()), begun)
     end = deque(enumerate(all_of, 1), maxlen=MOST_SAMPLES)
@@ -167,7 +167,7 @@ def _shifted(notes: Mapping[str, Any], std: Mapping[str, float]) -> list[str]:
 
 
 def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identified]:
-    """Return the deviations of all unknowns before and after."""
+    """Return the standard deviations of all unknowns before and after the samples."""
     space = prepared.case.model.parameter_space
     units = {name: unknown.unit for name, unknown in space.unknowns.items()}
     prior, posterior = (np.asarray(belief.q_std) for belief in (before, after))

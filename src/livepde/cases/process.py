@@ -42,7 +42,7 @@ __all__ = ["constants_of", "drive_notes", "mesh_of", "model_of", "options_of", "
 
 
 def mesh_of(frame: Frame) -> Any:
-    """Return the mesh."""
+    """Return the mesh of a case: from a file, or a line or rectangle of nodes or cells."""
     spec, unit = frame.spec.mesh, frame.equation.length_unit
     if spec.file is not None:
         scale = conversion(spec.unit or unit, unit, frame.where("mesh.unit")).factor
@@ -63,7 +63,7 @@ def mesh_of(frame: Frame) -> Any:
             return _built(frame, "mesh", lambda: rectangle((x[0], x[1]), (y[0], y[1]), number))
         check_cells(float(len(x)) * len(y), frame.where("mesh"))
         return _built(frame, "mesh", lambda: grid(x, y))
-    cells: Any = spec.cells  # a number: the schema has seen to it
+    cells: Any = spec.cells  # the schema allows only a number here
     check_cells(cells, frame.where("mesh.cells"))
     start = frame.convert(spec.start, unit, "mesh.from")
     stop = frame.convert(spec.stop, unit, "mesh.to")
@@ -71,6 +71,8 @@ def mesh_of(frame: Frame) -> Any:
         raise frame.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
     geometric = spec.spacing == "geometric"
     _check_graded(frame, start, geometric)
+    # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
+    # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
     plain = interval(start, stop, cells, geometric=geometric)
     edges = [edge for _, edge in layer_edges(frame)]
     through = _fitted(plain.p[0], edges)
@@ -82,7 +84,7 @@ def mesh_of(frame: Frame) -> Any:
 def _graded(
     frame: Frame, sides: Iterable[Sequence[float]], cells: Iterable[int], graded: Iterable[bool]
 ) -> Any:
-    """Return a rectangle whose nodes are spaced geometrically or not along each side."""
+    """Return a rectangle with geometric or uniform spacing along each side."""
     nodes = []
     for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
         _check_graded(frame, start, geometric)
@@ -116,7 +118,7 @@ def layer_edges(frame: Frame) -> list[tuple[str, float]]:
 
 
 def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
-    """Return the edges inside of a mesh to which its nearest nodes can move, each to one."""
+    """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
     inner = nodes[1:-1]
     found: dict[int, float] = {}
     for edge in edges:
@@ -127,6 +129,7 @@ def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
 
 def _inside(nodes: Array, edge: float) -> bool:
     """Return whether an edge lies between the ends of a mesh, and not on them."""
+    # Conversion of units rounds, so that an end of the mesh may seem to lie just inside of it.
     slack = 1e-6 * float(np.ptp(nodes))
     return bool(nodes.min() + slack < edge < nodes.max() - slack)
 
@@ -169,7 +172,7 @@ def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
 
 
 def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
-    """Return the model."""
+    """Return the model of a case; raises `CaseError` on missing or superfluous parts."""
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
     constants = constants_of(frame)
@@ -181,6 +184,7 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
     except NameClashError as error:
         raise frame.error("unknowns", str(error)) from None
+    # Only the built model knows which optional inputs it reads with these unknowns.
     for name in model.inputs:
         if name not in {**inputs, **constants}:
             known = frame.equation.inputs.get(name)
@@ -271,6 +275,7 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, An
 
     def value(given: float | str, item: str) -> float:
         if isinstance(given, str):
+            # An equation of the user's own may declare no unit, and then text cannot be converted.
             if not unit and ":" in frame.spec.equation:
                 text = f"got '{given}'; '{frame.spec.equation}' has no units of its own: "
                 text += f"say {key}.unit, too, or write numbers."
@@ -279,6 +284,7 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, An
         return rule.factor * given + rule.offset
 
     prior = value(spec.prior, "prior")
+    # A standard deviation is a difference, so the offset of a unit as degC does not apply.
     given = spec.std if isinstance(spec.std, str) else rule.factor * spec.std
     std = frame.positive(given, unit, f"{key}.std")
     low, high = -np.inf, np.inf
@@ -300,10 +306,10 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, An
 def _evolution(
     frame: Frame, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
 ) -> Evolution:
-    """Return how an unknown moves; a rate is its deviation after one unit of time."""
+    """Return the evolution of an unknown; a rate is a standard deviation after one unit of time."""
     time = frame.equation.time_unit
     if spec.rate is not None:
-        # A difference, of the logarithm if that is what moves; "degC" cannot be divided.
+        # A rate is a difference, of the logarithm under a transform; "degC" cannot be divided.
         moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
         per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
         return RandomWalk(frame.positive(spec.rate, per, f"{key}.rate"))
@@ -323,7 +329,7 @@ def _field(
     # In one dimension the covariance is std^2 exp(-|x - y|/length) inside.
     dimension = len(mesh.p)
     inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
-    # A transform acts on values at nodes.
+    # A transform acts on each coefficient, which in linear elements is the value at a node.
     element = linear(mesh) if spec.transform else frame.equation.element(mesh)
     return Field(mesh, element, inner=inner, **given)
 
@@ -334,6 +340,7 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
     Every point has to lie in exactly one.
     """
     unit = frame.equation.length_unit
+    # Midpoints of cells decide, since a vertex on an interface would belong to two regions.
     middle = mesh.p[:, mesh.t].mean(axis=1)
     count = np.zeros(middle.shape[1])
     found: dict[str, Any] = {}
@@ -372,12 +379,12 @@ def _ends(mesh: Any) -> tuple[Any, Any]:
 
 
 def drive_notes(frame: Frame, model: Model) -> list[str]:
-    """Return a note where nothing drives the process but its initial state.
+    """Return a note if only the initial state drives the process.
 
     Without values on boundaries and without inputs, a state that is the same everywhere neither
-    changes nor depends on the unknowns if A'(q), B and F vanish there. Then the unknowns are only
-    in the decay of the differences of the initial state. Periodic states carry waves and are left
-    out, and equations of the user's own, which need not be defined for any state.
+    changes nor depends on the unknowns if A'(q), B and F vanish there. Then only the decay of
+    differences in the initial state depends on the unknowns. Left out are periodic states, which
+    carry waves, and equations of the user's own, which need not be defined for any state.
     """
     if ":" in frame.spec.equation:
         return []
@@ -385,8 +392,10 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
     held = any(field.boundary_values or field.periodic for field in fields)
     if held or model.channels or model.form_initial is not None:
         return []
+    # Terms at a constant state are compared with those at an uneven one, which give their size:
+    # rounding leaves no exact zeros.
     level = model.state_space.interpolate(1.0)
-    uneven = level * (1.0 + np.arange(len(level)) % 3)  # for the size of each term
+    uneven = level * (1.0 + np.arange(len(level)) % 3)
     flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
     known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
     if known or model.F().any() or (flat > 1e-9 * steep).any():
@@ -399,7 +408,7 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
 
 
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
-    """Return notes on settings that are allowed and yet doubtful."""
+    """Return notes on allowed settings that may be mistakes."""
     found = []
     nodes, spec = mesh.p[0], frame.spec.mesh
     graded = frame.equation.spacing == "geometric"

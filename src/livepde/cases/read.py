@@ -136,7 +136,7 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
 
 
 def _line(text: str, reason: str) -> str:
-    """Return the line of a TOML file about which a reason speaks, with what is mostly wrong."""
+    """Return the line of a TOML file that an error message names, with the usual causes."""
     number = re.search(r"at line (\d+)", reason)
     line = re.split(r"\s+#", text.splitlines()[int(number[1]) - 1])[0].strip() if number else ""
     if not line:
@@ -152,7 +152,7 @@ def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
 
 
 def spec_of(raw: Mapping[str, Any], where: str) -> CaseSpec:
-    """Return the same of a case that may still have something open."""
+    """Return the checked content of a document that may still have blanks."""
     try:
         return CaseSpec.model_validate(raw)
     except ValidationError as error:

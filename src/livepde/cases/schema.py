@@ -139,7 +139,7 @@ class OpcuaSpec(Spec):
 
 
 class FileSpec(Spec):
-    """One of several files, and what is written otherwise in it than `[data]` says."""
+    """One of several files, with keys that override those of `[data]`."""
 
     file: Name
     separator: Annotated[str, Field(min_length=1, max_length=1)] | None = None
@@ -152,7 +152,7 @@ class FileSpec(Spec):
 
 
 def _file(given: Any) -> Any:
-    """Take what is no table as the name of a file."""
+    """Wrap a value that is no table as the name of a file."""
     return given if isinstance(given, Mapping) else {"file": given}
 
 
@@ -216,7 +216,7 @@ class DataSpec(Spec):
 
 
 class IntakeSpec(Spec):
-    """What becomes of rows that are late, doubled, broken or too fast."""
+    """Policy for rows that are late, repeated, malformed or too fast."""
 
     wait: Quantity = 0.0
     tolerance: Quantity = 0.0
@@ -246,7 +246,7 @@ class EvolutionSpec(Spec):
 
 
 class RegionSpec(Spec):
-    """A region, and what is said of the unknown there instead of everywhere."""
+    """A region, with values of the unknown that hold there instead of everywhere."""
 
     over: Pair | Box | Name
     prior: Quantity | None = None
@@ -258,7 +258,7 @@ class RegionSpec(Spec):
 
 
 def _over(given: Any) -> Any:
-    """Take what is no table as the place of a region."""
+    """Wrap a value that is no table as the place of a region."""
     return given if isinstance(given, Mapping) else {"over": given}
 
 
@@ -334,7 +334,7 @@ class ChannelSpec(Spec):
 
     @property
     def gaps(self) -> Literal["interpolate", "hold", "skip"]:
-        """What becomes of gaps."""
+        """Treatment of gaps."""
         return self.missing or ("interpolate" if self.drives else "hold")
 
     @property
@@ -415,7 +415,7 @@ class GuardsSpec(Spec):
 
 
 class ShadowsSpec(Spec):
-    """Which discretisation errors are followed and widen what is reported."""
+    """Discretisation errors that are followed and widen the reported intervals."""
 
     step: StrictBool = Shadows.step
     mesh: StrictBool = Shadows.mesh
@@ -491,7 +491,7 @@ class PublishSpec(BrokerSpec):
 
 
 class OutputSpec(Spec):
-    """What is kept of a run, and where else estimates go."""
+    """Stored output of a run, and further destinations of its estimates."""
 
     fields_every: PositiveInt = 24
     retain: Quantity | None = None
@@ -519,7 +519,7 @@ class VariantSpec(Spec):
 
 
 def _kind(value: Any) -> Any:
-    """Take a table that names no law as one of the sensitivity law."""
+    """Complete a table that names no law as one of the sensitivity law."""
     return {"kind": "sensitivity", **value} if isinstance(value, Mapping) else value
 
 
@@ -552,7 +552,7 @@ class BoundarySpec(Spec):
 
 
 def _value(given: Any) -> Any:
-    """Take what is no table as the value of a boundary."""
+    """Wrap a value that is no table as the value of a boundary."""
     return given if isinstance(given, Mapping) else {"value": given}
 
 
@@ -560,7 +560,7 @@ Boundary: TypeAlias = Annotated[BoundarySpec, BeforeValidator(_value)]
 
 
 class SourceSpec(Spec):
-    """What is gained in a region, or everywhere: a number, a channel or an unknown."""
+    """A source term in a region, or everywhere: a number, a channel or an unknown."""
 
     value: Quantity
     over: Pair | Box | Name | None = None

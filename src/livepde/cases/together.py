@@ -1,6 +1,6 @@
-"""Members of a fleet that differ in nothing but data and start: stepped as blocks.
+"""Members of a fleet that differ only in data and initial state, stepped as blocks.
 
-Each has a journal of its own, in which all stands that a separate run leaves there.
+Each member has a journal of its own, with the same records as that of a separate run.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["MemberBlock", "blocks"]
 
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
-# Members may differ in how a channel is read, and in what is said about a run.
+# Members may differ in how a channel is read, and in descriptions of a run.
 READ = {
     "column",
     "columns",
@@ -41,10 +41,10 @@ TOLD = {"title", "initial", "data", "intake", "reference", "expect", "variants"}
 
 
 def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
-    """Return members that can be stepped together, and of all others why they cannot.
+    """Return blocks of members that can be stepped together, and the reasons why others cannot.
 
-    Together go those whose cases differ in nothing but data, initial state and what is said about
-    them, and whose samples have the same times; if `Fleet` has blocks for them.
+    A block has members whose cases differ only in data, initial state and descriptions, and whose
+    samples have the same times, if `Fleet` can step their model and law together.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def _settings(case: Case) -> str:
 
 
 def _refuses(one: Prepared) -> str:
-    """Return why a member cannot begin as others do; its own run tells the user."""
+    """Return the reason why a member cannot join a block; its own run reports the error."""
     try:
         _ = one.u0
     except LivepdeError:
@@ -134,12 +134,13 @@ class MemberBlock:
         self._taken = self._written = 0  # samples
 
     def run(self, paths: Sequence[Path]) -> None:
-        """Take all samples; what was reached is kept also if it ends early.
+        """Take all samples; estimates so far are kept also if the run ends early.
 
         Parameters
         ----------
         paths
-            Of new journals, one for each member. They grow from time to time; `ended` has the rest.
+            Paths of new journals, one for each member. They are written at intervals; `ended`
+            writes the rest.
 
         Raises
         ------
@@ -191,7 +192,7 @@ class MemberBlock:
         return journal
 
     def _write(self, k: int, journal: Journal, identifier: Identifier) -> None:
-        """Add what waits to the journal of a member."""
+        """Add pending samples, estimates and events to the journal of a member."""
         if journal.accepted != self._written:
             raise RunError(f"{journal.path.parent} is being written by another process: stop it.")
         table = self._tables[k]

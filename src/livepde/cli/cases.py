@@ -109,7 +109,7 @@ def init(
 
 
 def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int | None) -> Measured:
-    """Read the tables; on a terminal ask for the order of day and month where it is open."""
+    """Read the tables; on a terminal ask for the order of day and month if it is ambiguous."""
     from livepde.cases.measured import measured
     from livepde.cli.questions import asks, date_order
 
@@ -124,7 +124,7 @@ def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int 
 
 
 def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
-    """Return the text of a case with what is known beside the table: by --set and by answers."""
+    """Return the text of a case with the values given by --set and by answers to questions."""
     from livepde.cases.fill import filled
     from livepde.cases.settings import parse
     from livepde.cli.questions import answered, asks
@@ -136,7 +136,7 @@ def _known(text: str, read: Measured, equation: Equation, settings: list[str], w
 def _show_written(
     console: Console, case: Path, data: Sequence[Path], files: Mapping[str, str]
 ) -> None:
-    """Print which files were written and what is open in them."""
+    """Print the names of the written files, and the number of blanks in them."""
     from livepde.cases.fill import blanks
 
     left = len(blanks(files["case.toml"]))
@@ -148,7 +148,7 @@ def _show_written(
 
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:
-    """Print what was read: times, and the columns with their roles, units and ranges."""
+    """Print a summary of the tables: times, and columns with roles, units and ranges."""
     import numpy as np
 
     from livepde.cases.from_table import channels_in

@@ -88,7 +88,7 @@ def _refused(prepared: Prepared) -> list[str]:
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
-    """Print what the sensors can tell; return sentences on it."""
+    """Print the information on the unknowns that the sensors give; return sentences on it."""
     from livepde.cases.preview import MOST_SAMPLES, preview
     from livepde.runs import Table
     from livepde.verdict import TELLING
@@ -144,7 +144,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 
 def _show_wiring(console: Console, case: Case) -> None:
-    """Print where the samples of a process come from, and what becomes of them."""
+    """Print the source of a process's samples, and the intake policy of each channel."""
     from livepde.cases.sources import policy_of, source_text
     from livepde.runs import Table
 

@@ -17,7 +17,7 @@ Work = Mapping[str, Any]
 
 
 class CitationForm(StrEnum):
-    """What a citation is written for."""
+    """Formats of a citation."""
 
     bibtex = "bibtex"
     apa = "apa"

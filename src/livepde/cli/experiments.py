@@ -1,4 +1,4 @@
-"""Published experiments: the demo, and what the paper shows."""
+"""Published experiments: the demo, and reproductions of the paper's experiments."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def demo(out: OutOption = None) -> None:
 
 
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
-    """Write what an experiment gave; return the names of its figures, if any can be drawn."""
+    """Write the outcome of an experiment; return the names of its figures, if any can be drawn."""
     figures = outcome.figures if can_draw(console) else {}
     writer.finish(
         status="finished",

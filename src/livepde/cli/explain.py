@@ -1,4 +1,4 @@
-"""Test what a verdict suspects: a run again, with one cause free."""
+"""Test a likely cause of a verdict: repeat the run with that cause free."""
 
 from __future__ import annotations
 

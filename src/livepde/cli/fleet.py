@@ -431,7 +431,7 @@ def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[C
 
 
 def _how(ended: Sequence[Ended]) -> str:
-    """Return in one line which members were stepped together, and why others were not."""
+    """Return a sentence on the members stepped together, and on the reasons of the others."""
     apart = Counter(item.apart for item in ended if item.apart)
     count = sum(apart.values())
     together = sum(not item.apart and item.samples > 0 for item in ended)
@@ -442,7 +442,7 @@ def _how(ended: Sequence[Ended]) -> str:
 
 
 def _summary(ended: Sequence[Ended]) -> pd.DataFrame:
-    """Return a row for each run: how it ended, and what it found."""
+    """Return a row for each run: status, number of samples and final estimates."""
     import pandas as pd
 
     rows = []

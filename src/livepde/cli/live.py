@@ -40,11 +40,11 @@ class Beside:
     data
         A file, or lines of JSON, instead of the case's own source.
     speed
-        How many times faster than they happened the samples of a finished file are taken.
+        Speed of the replay of a finished file, relative to real time.
     listen, page
-        Where /health and /metrics, and the page, are served; None: nowhere.
+        Addresses of /health and /metrics, and of the page; None: not served.
     token
-        What visitors have to know.
+        Secret that visitors need.
     estimates
         Print each estimate as a line of JSON.
     """
@@ -65,14 +65,15 @@ def beside(
     Parameters
     ----------
     write
-        Makes the run directory, when the source has been reached.
+        Makes the run directory; called when the source is connected.
     stack
-        Closes what was opened: the journal, from which the result reads, among it.
+        Closes all opened resources, among them the journal, from which the result reads.
 
     Returns
     -------
     writer, taken
-        Of the directory; the case and how far it came, None if it ended before the first sample.
+        Writer of the run directory; the case with its result, None if the run ended before the
+        first sample.
     """
     from livepde.cases.live import Wiring
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
@@ -96,7 +97,7 @@ def beside(
 
 
 class _LiveHealth:
-    """What /health says, also before there is a run."""
+    """Content of /health, also before the first sample."""
 
     def __init__(self, wiring: Wiring) -> None:
         self.live: Live | None = None
@@ -116,7 +117,7 @@ class _LiveHealth:
 
 
 class _Heartbeat:
-    """Says in the log from time to time how far a run is; a sink."""
+    """A sink that logs the progress of a run at intervals."""
 
     def __init__(self) -> None:
         self._said = -math.inf

@@ -72,9 +72,9 @@ CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show
 
 
 def names_in(place: str) -> Callable[[str], list[str]]:
-    """Return what the shell asks after Tab: names in `module:MAPPING` that begin as the word does.
+    """Return a shell completion: keys of `module:MAPPING` that begin with the typed text.
 
-    The module is loaded by then only.
+    The module is imported on completion only.
     """
 
     def complete(incomplete: str) -> list[str]:

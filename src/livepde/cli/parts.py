@@ -37,27 +37,27 @@ def in_parts(
     backend: Backend | None,
     told: list[str],
 ) -> Iterator[Found]:
-    """Run rows in parts of bounded size, and iterate over what they give, in any order.
+    """Run rows in parts of bounded size, and iterate over their results, in any order.
 
-    A part whose worker died is run again; `run` has to find what it left and go on there.
+    A part whose worker died is run again; `run` has to resume from its run directories.
 
     Parameters
     ----------
     run
-        Is sent to workers, as are rows: all paths in it must hold there.
+        Function of the rows of a part; both are sent to workers, where their paths must be valid.
     jobs
-        Processes at once; -1 for one on each processor. Dask takes all workers of its cluster.
+        Number of parallel processes; -1 for one on each processor. Dask takes all workers of its cluster.
     backend
-        None: that of the surrounding `joblib.parallel_config`, else loky.
+        Backend of joblib; None: that of the surrounding `joblib.parallel_config`, else loky.
     told
-        Gets a sentence for each loss of a worker.
+        List that receives a sentence for each loss of a worker.
 
     Raises
     ------
     ConfigurationError
         joblib or the backend is not installed.
     RunError
-        Workers died `ATTEMPTS` times with no part that came back in between.
+        Workers died `ATTEMPTS` times in a row without a finished part in between.
     """
     try:
         from joblib import Parallel, delayed, effective_n_jobs
@@ -105,12 +105,12 @@ def _attempt(
 
 
 def _died(error: Exception) -> bool:
-    """Return whether a worker died, in the words of a backend: killed, or out of memory."""
+    """Return whether an exception of a backend means a dead worker: killed, or out of memory."""
     return isinstance(error, BrokenExecutor) or type(error).__name__ in DEAD_WORKER
 
 
 def _configure(backend: Backend, stack: ExitStack) -> None:
-    """Make a backend that of joblib until the stack is closed."""
+    """Configure the backend of joblib until the stack is closed."""
     from joblib import parallel_config
 
     if backend is Backend.ray:

@@ -22,7 +22,7 @@ SKIP = "Press Enter to leave a question open."
 
 
 def asks() -> bool:
-    """Return whether somebody is there to answer."""
+    """Return whether standard input is a terminal."""
     return sys.stdin.isatty()
 
 
@@ -37,7 +37,7 @@ def date_order(column: str, cell: str, formats: Sequence[str]) -> str:
 
 
 def answered(text: str, equation: Equation, columns: Sequence[str], where: str) -> str:
-    """Return the text of a case with what was answered; what was skipped stays open."""
+    """Return the text of a case with answers filled in; skipped questions stay blank."""
     if blanks(text):
         typer.echo(SKIP)
     asked: set[str] = set()

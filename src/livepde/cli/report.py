@@ -1,4 +1,4 @@
-"""Look at what a run found."""
+"""Report of a run: tables and figures, or theory."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def report(
 
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
-    """Take a run's samples again, and print and write what the theory says."""
+    """Take a run's samples again; print and write the theory report."""
     from livepde.diagnostics import theory_report
     from livepde.runs import Table
 

@@ -50,7 +50,7 @@ __all__ = ["batch", "concluded", "run", "writer_of"]
 
 
 class LogKind(StrEnum):
-    """How a log is written."""
+    """Formats of the log."""
 
     text = "text"
     json = "json"
@@ -210,7 +210,7 @@ def _refuse(
 def writer_of(
     loaded: Case, folder: Path, settings: Sequence[str], resume: bool, command: Sequence[str]
 ) -> RunWriter:
-    """Return the writer of the run directory, new or to go on with."""
+    """Return the writer of the run directory, a new or a resumed one."""
     from livepde.runs import RECORD, RunWriter
 
     if resume and (folder / RECORD).exists():
@@ -236,11 +236,11 @@ def batch(
     *,
     quiet: bool,
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
-    """Take data that are there; what is wrong with them ends the run."""
+    """Run a case on finished data; an unusable sample ends the run."""
     from livepde.runs import JOURNAL, Journal, drive
     from livepde.streams import Table as Samples
 
-    identifier = prepared.identifier  # what does not fit together raises, and nothing is written
+    identifier = prepared.identifier  # raises on inconsistent data before anything is written
     writer, path = write(), folder / JOURNAL
     table = prepared.stream if isinstance(prepared.stream, Samples) else None
     if path.exists():
@@ -268,12 +268,12 @@ def concluded(
     *,
     draw: bool = True,
 ) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
-    """Write what a run gave; return its dataset, tables, checks and notes.
+    """Write the results of a run; return its dataset, tables, checks and notes.
 
     Parameters
     ----------
     draw
-        With figures.
+        Whether to draw figures.
     """
     from livepde.linalg import in_use
     from livepde.runs import arrivals, checks_of, input_findings, tables, verdict, verdict_table
@@ -332,7 +332,7 @@ def concluded(
 def _with_smoothed(
     prepared: Prepared, driven: Driven, dataset: xr.Dataset
 ) -> tuple[xr.Dataset, list[str]]:
-    """Return the dataset of a run with what is smoothed beside it, or a note why it is not."""
+    """Return the dataset of a run with smoothed estimates, or with a note on their absence."""
     from livepde.hindsight import with_smoothed
 
     if driven.status != "finished" or not len(driven.result):
@@ -341,13 +341,13 @@ def _with_smoothed(
     begun = prepared.identifier_with(prepared.case.law)
     try:
         smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
-    except LivepdeError as error:  # what the run has found is kept
+    except LivepdeError as error:  # the estimates of the run are kept
         return dataset, [f"Nothing is smoothed: {error}"]
     return with_smoothed(dataset, smoothed), []
 
 
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:
-    """Return the notes on the data of a whole run."""
+    """Return sentences on the identifiability of the unknowns by the whole run."""
     from livepde.diagnostics import identifiability
     from livepde.laws import AutoLaw, SensitivityLaw
 

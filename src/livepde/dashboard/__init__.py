@@ -1,4 +1,4 @@
-"""The live page: what a run shows in a browser, while it goes on and afterwards.
+"""The live page of a run in a browser, during the run and afterwards.
 
 `serve` starts it; `figures` draws datasets, also for reports.
 """

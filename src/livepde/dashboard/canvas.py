@@ -1,4 +1,4 @@
-"""The style of figures in a browser: empty ones, over time, bands, what an axis shows.
+"""The style of figures in a browser: empty figures, time axes, bands and labels.
 
 Names that come from files are shown as text, never as markup.
 """
@@ -35,18 +35,18 @@ __all__ = [
 DECADES = 100.0  # from which ratio on a scale is logarithmic
 INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
-# A second axis, for what is marked at a time and has no value.
+# A second axis, for marks at a time that have no value.
 MARKS: Any = {"overlaying": "y", "range": [0, 1], "visible": False, "fixedrange": True}
 CONFIG: Any = {"displayModeBar": False, "responsive": True}  # for Plotly
 
 
 def text(value: object) -> str:
-    """Return text from a file so that Plotly shows it as it stands."""
+    """Return text from a file, escaped so that Plotly shows it unchanged."""
     return html.escape(str(value), quote=False)
 
 
 def unit_of(data: xr.Dataset, name: str) -> str:
-    """Return the unit of a variable as it is written."""
+    """Return the unit of a variable as the dataset states it."""
     return str(data[name].attrs.get("units", ""))
 
 

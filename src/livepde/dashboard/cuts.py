@@ -101,13 +101,13 @@ def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
     Parameters
     ----------
     share
-        Where each plane lies between the least and the largest coordinate.
+        Position of each plane, as a share of the range of its coordinate.
     """
     return _slices(_solid(data), share)
 
 
 class _Mesh:
-    """Vertices and cells, told apart by their content: a key for what was found before."""
+    """Vertices and cells, hashed by their content: a key for cached cuts."""
 
     def __init__(self, points: Array, cells: Any) -> None:
         self.points = points

@@ -1,4 +1,4 @@
-"""Numbers of a run over time, in a browser: unknowns, sensors, what the data have told."""
+"""Figures of a run over time, in a browser: unknowns, sensors and gained information."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from livepde.runs.summary import shown
 __all__ = ["correlation", "open_shares", "ratio", "residuals", "told", "unknowns"]
 
 MOST_POINTS = 2000  # of a line
-SURE, FLAT = 0.1, 0.9  # shares of the prior deviation: pinned, told hardly anything
+SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: pinned, hardly identified
 
 
 def _bounded(data: xr.Dataset) -> xr.Dataset:
-    """Return at most so many times, spread evenly; failed steps and jumps are kept."""
+    """Return a dataset thinned to evenly spread samples; failed steps and jumps are kept."""
     count = data.sizes["time"]
     if count <= MOST_POINTS:
         return data
@@ -160,7 +160,7 @@ def residuals(
 
 
 def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
-    """Draw the squared misses of the sensors over what is expected of them."""
+    """Draw the ratio of squared innovations to their expected square."""
     data = _bounded(data)
     figure, axis = over_time(data, "", at)
     t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
@@ -186,7 +186,7 @@ def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
 
 
 def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
-    """Return unknown -> share of its prior deviation that is left; of fields over their modes."""
+    """Return unknown -> remaining share of its prior standard deviation; of fields over modes."""
     found: dict[str, float] = {}
     k = at_time(data, "time", at)
     for label in scalars(data):

@@ -209,7 +209,7 @@ def _steer(app: dash.Dash, view: View) -> None:
 
 
 def _draw(app: dash.Dash, view: View) -> None:
-    """Let it say and draw what there is at that time."""
+    """Register the callbacks that draw text, tables and figures for the chosen time."""
 
     @app.callback(
         Output("verdict", "children"),
@@ -260,7 +260,7 @@ def _draw(app: dash.Dash, view: View) -> None:
 
 
 def _framed(panel: Panel) -> Any:
-    """Return a figure with its title and what it shows in words."""
+    """Return a figure with its title and caption."""
     return html.Figure(
         [
             html.H3(panel.title),
@@ -284,7 +284,7 @@ def harden(app: dash.Dash) -> None:
     policy = "; ".join(
         [
             "default-src 'self'",
-            # Plotly compiles what it draws with WebGL.
+            # Plotly compiles code for its drawings with WebGL.
             f"script-src 'self' 'unsafe-eval' {scripts}",
             "style-src 'self' 'unsafe-inline'",
             "img-src 'self' data: blob:",

@@ -35,16 +35,16 @@ SECTIONS = {
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A figure with what it shows in words.
+    """A figure with its title and caption.
 
     Attributes
     ----------
     name
-        Its own among the panels of a run.
+        Unique name among the panels of a run.
     section
         Key of `SECTIONS`.
     title, about
-        Plain text: what it is, and how to read it.
+        Title and caption, as plain text.
     """
 
     name: str
@@ -55,7 +55,7 @@ class Panel:
 
 
 def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[Panel]:
-    """Return all there is to draw of a run.
+    """Return all panels of a run.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
     at
         Time to look back to; default the newest.
     cut
-        Where solids are cut, as share of their size along each axis.
+        Position of the cuts through solids, as a share of their size along each axis.
     """
     if not data.sizes.get("time"):
         return []

@@ -1,6 +1,6 @@
 """A run as one HTML file: sentences, tables and figures, to keep or to send.
 
-The file holds all that it shows; its policy forbids a browser to ask anybody for anything.
+The file is self-contained; its policy forbids a browser to load anything else.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def write_report(run: Run, target: Path, *, force: bool = False) -> None:
     Parameters
     ----------
     force
-        Write over what is there.
+        Replace an existing file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Time axis of a run in a browser, and the time that is looked at."""
+"""Time axis of a run in a browser, and index of the selected time."""
 
 from __future__ import annotations
 
@@ -19,16 +19,17 @@ FAR = 1e11  # seconds from the origin beyond which times are numbers
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """How model times are shown: dates, or numbers in a unit that suits the span.
+    """Axis of model times: dates, or numbers in a unit that suits the span.
 
     Attributes
     ----------
     scale, start
-        What is drawn is `start + t * scale`; of dates in milliseconds since 1970, as Plotly has it.
+        Coefficients of the coordinate `start + t * scale`; of dates in milliseconds since 1970, the
+        convention of Plotly.
     unit
-        Of numbers.
+        Unit of numbers.
     dates
-        Whether they are dates.
+        Whether times are dates.
     """
 
     scale: float
@@ -49,7 +50,7 @@ class TimeAxis:
 
 
 def when_axis(data: xr.Dataset) -> TimeAxis:
-    """Return how the times of a dataset are shown."""
+    """Return the time axis of a dataset."""
     dates = dated(data)
     if dates is not None:
         origin, second = dates

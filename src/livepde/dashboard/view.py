@@ -84,30 +84,30 @@ class Spread(Generic[T]):
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """What there is to see of a run.
+    """Contents of the live page of a run.
 
     Attributes
     ----------
     version
-        Another one means other content.
+        Number that changes with the contents.
     title, status
-        Of the run. Status is "waiting" (for the first sample), "running", "silent" (its source),
-        "stopped" (it did not end, but nobody writes any more), "finished", "interrupted" or
+        Title and status of the run. Status is "waiting" (for the first sample), "running", "silent"
+        (its source), "stopped" (unfinished, but without a writer), "finished", "interrupted" or
         "failed"; "unreadable" with a sentence in `problem`.
     dataset
         Estimates, thinned; None before the first.
     samples, gap
-        How many estimates there are, and that of these one in `gap` is in the dataset.
+        Number of estimates; one in `gap` of them is in the dataset.
     reading
         True while there is more to read.
     events, counts
-        Of the journal.
+        Events and counts of the journal.
     unwell
-        Why the run is not well, as /health says it; empty if it is.
+        Reason why the run is not well, as in /health; empty if it is.
     doubts, notes, checks
-        What speaks against the estimates; what the run said else; its checks.
+        Findings against the estimates, further notes of the run, and its checks.
     written
-        Seconds since 1970 when something was written last.
+        Time of the last write, in seconds since 1970.
     ended
         Date when the run ended, "" before.
     """
@@ -131,10 +131,10 @@ class RunView:
 
 
 class View:
-    """A run directory as it stands, for any number of visitors.
+    """The current contents of a run directory, for any number of visitors.
 
-    Memory and the work of a look are bounded, whatever the length of the run: of a journal only
-    what is new is read, and what is kept is thinned.
+    Memory and the cost of each update are bounded, whatever the length of the run: only new records
+    of a journal are read, and those in memory are thinned.
 
     Parameters
     ----------

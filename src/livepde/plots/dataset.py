@@ -97,7 +97,7 @@ def time_scale(data: xr.Dataset) -> tuple[float, str]:
 
 
 def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
-    """Return times as a time axis has them: dates if the run has them, else as `time_scale`."""
+    """Return coordinates on a time axis: dates if the run has them, else as `time_scale`."""
     dates = instants(data, times)
     if dates is None:
         scaled: Array = np.asarray(times, dtype=float) / time_scale(data)[0]
@@ -107,7 +107,7 @@ def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
 
 
 def time_label(data: xr.Dataset) -> str:
-    """Return the label of a time axis; empty for dates, which say what they are."""
+    """Return the label of a time axis; empty for dates."""
     return "" if instants(data, []) is not None else labelled("t", time_scale(data)[1])
 
 

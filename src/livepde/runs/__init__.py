@@ -1,4 +1,4 @@
-"""Runs: what they hand back, the loop that makes them, and the directory they leave."""
+"""Runs: the loop that executes them, their outcomes, journals and run directories."""
 
 from __future__ import annotations
 

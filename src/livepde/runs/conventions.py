@@ -131,7 +131,7 @@ def cf(
     Dataset
         `time` and `snapshot` count from a date where the run has one, so that xarray opens them as
         dates; units are as UDUNITS reads them; names consist of letters, digits and underscores,
-        and `long_name` holds what they stand for; deviations and ends of intervals are
+        and `long_name` holds the original name; standard deviations and ends of intervals are
         `ancillary_variables`; a mesh in two or three dimensions follows UGRID. Of standard names
         only those of the times: the others are of sea and air.
     """
@@ -163,7 +163,7 @@ def cf(
 
 
 def bounded(data: xr.Dataset) -> xr.Dataset:
-    """Return a copy with the ends of the 95 % interval of every number beside its deviation."""
+    """Return a copy with the 95 % interval of each scalar beside its standard deviation."""
     found = {}
     for name, variable in data.data_vars.items():
         found[name] = variable.copy(deep=False)
@@ -176,7 +176,7 @@ def bounded(data: xr.Dataset) -> xr.Dataset:
 
 
 def free_names(wanted: Iterable[str]) -> dict[str, str]:
-    """Return name -> one of letters, digits and underscores that no other has."""
+    """Return name -> a unique name of letters, digits and underscores."""
     found: dict[str, str] = {}
     for name in wanted:
         stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
@@ -189,7 +189,7 @@ def free_names(wanted: Iterable[str]) -> dict[str, str]:
 
 
 def _describe(data: xr.Dataset, name: str) -> None:
-    """Say what a variable is, and in which unit."""
+    """Set the CF attributes of a variable: long name, unit, axis and type of flags."""
     variable = data[name]
     attrs = variable.attrs
     attrs.setdefault("long_name", LONG_NAMES.get(name, name))
@@ -219,7 +219,7 @@ def kinds_of(data: xr.Dataset) -> list[str]:
 
 
 def oriented(data: xr.Dataset, kind: str) -> Any:
-    """Return the corners of each cell so that all turn the same way: others count on that."""
+    """Return the corners of each cell with positive orientation, which other programs expect."""
     corners = np.array(data[kind].values)
     about = KINDS[kind]
     axes = "xyz"[: about.dimension]
@@ -231,7 +231,7 @@ def oriented(data: xr.Dataset, kind: str) -> Any:
 
 
 def _add_topology(data: xr.Dataset, kind: str) -> None:
-    """Say how vertices and cells are a mesh, after UGRID."""
+    """Add the mesh topology of vertices and cells after UGRID."""
     dimension, cell = KINDS[kind].dimension, KINDS[kind].role
     name = "mesh"
     while name in data:

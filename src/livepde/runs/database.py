@@ -1,4 +1,4 @@
-"""The SQLite file of a journal: opened, locked, and what is said when it fails or is damaged."""
+"""The SQLite file of a journal: connections, locks, checksums and error messages."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ __all__ = [
 
 LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
 MOMENT = 0.5  # seconds for which who only asks whether a journal is written may hold its lock
-# What a file of somebody else may make of reading it.
+# Exceptions that decoding the content of a damaged or hostile file may raise.
 DAMAGE = (
     ArithmeticError,
     AttributeError,
@@ -58,7 +58,7 @@ CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 
 def in_memory() -> sqlite3.Connection:
-    """Open one that is in memory only."""
+    """Open a database that is in memory only."""
     return sqlite3.connect(":memory:", factory=_Connection)
 
 
@@ -88,14 +88,14 @@ def reader(path: Path) -> sqlite3.Connection:
 
 
 def salvager(path: Path) -> sqlite3.Connection:
-    """Open a damaged file to read what is whole, also where it has been cut off."""
+    """Open a damaged or truncated file to read its intact records."""
     connection = _connect(path, "mode=ro")
-    connection.execute("PRAGMA writable_schema = ON")  # no look at the size of the file
+    connection.execute("PRAGMA writable_schema = ON")  # a truncated file opens nevertheless
     return connection
 
 
 class _Connection(sqlite3.Connection):
-    """Closed when nobody holds it any more; Python 3.13 warns of others."""
+    """A connection that closes on garbage collection; Python 3.13 warns of unclosed ones."""
 
     def __del__(self) -> None:
         with suppress(sqlite3.Error):  # of another thread
@@ -117,7 +117,7 @@ def log_of(path: Path) -> Path:
 
 
 def written(path: Path) -> float:
-    """Return when a journal was written last, in seconds since 1970; 0 if there is none."""
+    """Return the time of the last write to a journal, in seconds since 1970; 0 if there is none."""
     times = [0.0]
     for file in (path, log_of(path)):
         with suppress(OSError):  # the log goes away with its writer
@@ -141,7 +141,7 @@ def _lock_of(path: Path) -> FileLock:
 
 
 def locked(path: Path) -> FileLock:
-    """Become the one writer of a file, or say that there is one."""
+    """Acquire the lock of the single writer of a file; raise `RunError` if it is held."""
     lock = _lock_of(path)
     try:
         lock.acquire(timeout=MOMENT)
@@ -156,7 +156,7 @@ def locked(path: Path) -> FileLock:
 
 @contextmanager
 def released(path: Path, lock: FileLock | None) -> Iterator[None]:
-    """Let go of a journal that cannot be opened, and say why in one sentence."""
+    """Release the lock of a journal that cannot be opened, and raise `RunError` with the reason."""
     try:
         yield
     except (OSError, sqlite3.Error, UnicodeDecodeError, RunError) as error:
@@ -171,7 +171,7 @@ def released(path: Path, lock: FileLock | None) -> Iterator[None]:
 
 @contextmanager
 def sound(path: Path) -> Iterator[None]:
-    """What a damaged file, or one made to do harm, makes of its content is one sentence."""
+    """Turn exceptions from decoding a damaged or hostile file into a `RunError` of one sentence."""
     try:
         yield
     except DAMAGE as error:
@@ -189,7 +189,7 @@ def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
 
 
 def remedy_of(error: Exception) -> str:
-    """Return after what a file can be used again that is whole; empty if nothing is known."""
+    """Return the remedy for an error of an intact file; empty if none is known."""
     return REMEDIES.get(getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT) & 0xFF, "")
 
 
@@ -199,7 +199,7 @@ def damaged(path: Path, why: str) -> str:
 
 
 def checksum(table: str, *values: Any) -> int:
-    """Return the checksum of a record: its table, its number and all else that is kept of it."""
+    """Return the CRC-32 checksum of a record: its table, its number and all its values."""
     total = zlib.crc32(table.encode())
     for value in values:
         if not isinstance(value, bytes):

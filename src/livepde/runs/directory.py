@@ -1,10 +1,10 @@
-"""The run directory: what a run leaves behind, and its reader.
+"""The run directory: files of a run, their writer and their reader.
 
 ::
 
     RUN/run.json          version, command, status, checks, hash of the case
     RUN/case.toml         a copy of the case
-    RUN/journal.sqlite    samples and estimates while they come: what survives a kill
+    RUN/journal.sqlite    samples and estimates as they arrive; survives a kill
     RUN/estimates.nc      the dataset (netCDF 3: any netCDF reader opens it)
     RUN/checkpoint.bin    the identifier's state
     RUN/report.md         tables
@@ -82,7 +82,7 @@ def refuse_taken(path: Path) -> None:
 
 
 def _only_begun(path: Path, case: str) -> bool:
-    """Return whether a kill or a full disk has ended the making of this very folder."""
+    """Return whether a kill or a full disk has interrupted the creation of this run directory."""
     names = {item.name for item in path.iterdir()} if path.is_dir() else set()
     names = {name for name in names if not name.endswith(PARTIAL)}
     if names != {CASE}:
@@ -91,7 +91,7 @@ def _only_begun(path: Path, case: str) -> bool:
 
 
 def _nearest(folder: Path) -> str:
-    """Return where the run may be that is not in this folder: below it, or in runs/."""
+    """Return a hint on the nearest run directory: below the folder, beside it, or in runs/."""
     if folder.is_file():  # a case, or a file of a run
         folder = folder.parent
     near = difflib.get_close_matches(folder.name, run_names(folder.parent), n=1)
@@ -109,14 +109,14 @@ def run_names(folder: Path) -> list[str]:
 
 
 def _refuse_links(path: Path) -> None:
-    """Raise `RunError` where a file of a run is a link: what is written to it lands elsewhere."""
+    """Raise `RunError` if a file of a run is a link: writing to it would change another file."""
     for item in path.iterdir():
         if item.is_symlink():
             raise RunError(f"{item} is a link: a run is gone on with in files of its own only.")
 
 
 class RunWriter:
-    """A run directory while it is written; nothing that stands there is ever written over."""
+    """Writer of a run directory: a new or empty folder, or that of a run to resume."""
 
     def __init__(self, path: Path, record: dict[str, Any]) -> None:
         self.path = path
@@ -139,11 +139,11 @@ class RunWriter:
         Parameters
         ----------
         path, version, command, title
-            Where, and what the record says.
+            The directory, and the entries of its record.
         case
             The case as it is run.
         settings
-            What was set from outside, 'key=value'.
+            Overrides of keys of the case, 'key=value'.
         original
             The case file as it stands, if that is another text.
 
@@ -210,7 +210,7 @@ class RunWriter:
         notes: Iterable[str] = (),
         figures: Mapping[str, FigureFactory] | None = None,
     ) -> None:
-        """Write what a run gave: dataset, checkpoint, report and record; figures at last."""
+        """Write the results of a run: dataset, checkpoint, report and record; figures last."""
         shown, checks, notes = list(shown), list(checks), list(notes)
         title = str(self.record["title"])
         try:
@@ -268,7 +268,7 @@ class Run:
 
     @property
     def notes(self) -> list[str]:
-        """What the run had to say beside its numbers."""
+        """Notes of the run: warnings and remarks beside its numbers."""
         return [str(note) for note in self.record.get("notes", [])]
 
     @property
@@ -312,14 +312,14 @@ class Run:
             raise RunError(f"{path} is damaged: {error}.") from error
 
     def salvage(self) -> list[str]:
-        """Take as dataset what is whole in a damaged journal; return what is not, in words."""
+        """Read the intact records of a damaged journal as dataset; return sentences on the rest."""
         kept = Salvage(self.path / JOURNAL)
         with kept:
             self.__dict__["dataset"] = kept.dataset()
         return kept.sentences()
 
     def case_file(self) -> Path:
-        """Return the case to take a run's samples again: where it was run, if it is unchanged.
+        """Return the case file to run again: the original if it is unchanged, else the copy.
 
         Data files are named relative to the case, so the copy in the run directory serves only if
         the original is gone or has changed; then the data must be given.
@@ -345,12 +345,12 @@ class Run:
 
     @property
     def settings(self) -> list[str]:
-        """What was set from outside, 'key=value'."""
+        """Overrides of keys of the case, 'key=value'."""
         return [str(item) for item in self.record.get("settings", [])]
 
     @property
     def data_file(self) -> str | None:
-        """What --data named when the run was made; None: the case's own, or standard input."""
+        """The file that --data named for the run; None: the case's own, or standard input."""
         return _data_of(self.record.get("command", []))
 
     def refuse_other(self, command: Sequence[str], case: str, settings: Sequence[str]) -> None:
@@ -414,7 +414,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
 
 
 def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[str]) -> list[str]:
-    """Draw figures into a folder; return their files. One that cannot be drawn is a note."""
+    """Draw figures into a folder; return their file names. A failure becomes a note."""
     drawn = []
     for name, draw in figures.items():
         file = f"{name}.png"
@@ -504,7 +504,7 @@ def plain(value: Any) -> Any:
 
 
 def _without_token(command: Sequence[str]) -> list[str]:
-    """Return a command as it may be written down."""
+    """Return a command with its token masked."""
     kept = [re.sub("^--token=.*", "--token=...", word) for word in command]
     for k, word in enumerate(kept[:-1]):
         if word == "--token":

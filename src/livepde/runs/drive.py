@@ -22,18 +22,18 @@ __all__ = ["Driven", "conduct", "drive", "journal_of", "stopped_by_signals"]
 
 @dataclass
 class Driven:
-    """How far a run came.
+    """Result, journal and status of a run.
 
     Attributes
     ----------
     result
         Estimates so far.
     journal
-        Where they are kept.
+        The journal that holds samples and estimates.
     status
         "finished", "interrupted" (Ctrl-C) or "failed" (a sample that cannot be used).
     error
-        Why it failed.
+        Reason of the failure.
     """
 
     result: Result
@@ -44,12 +44,12 @@ class Driven:
 
 @contextmanager
 def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> Iterator[None]:
-    """Let Ctrl-C and SIGTERM set an event; where nothing is busy, or the second time, end at once.
+    """Let Ctrl-C and SIGTERM set an event; when idle, or the second time, raise at once.
 
     Raises
     ------
     KeyboardInterrupt
-        To end at once.
+        While no step is computed, or at the second signal.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -69,7 +69,7 @@ def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> I
 
 
 def conduct(live: Live, *, patient: bool = False) -> Driven:
-    """Let a run go on until its source or a signal ends it; what it has is kept in any case.
+    """Run until the source or a signal ends it; samples and estimates are kept in any case.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def drive(
     fields_every: int = 1,
     journal: Journal | None = None,
 ) -> Driven:
-    """Run an identifier on a stream; what was reached is returned also if it ends early.
+    """Run an identifier on a stream; return the estimates so far also if it ends early.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def drive(
     fields_every
         Keep fields of every so many samples.
     journal
-        Where to keep samples and estimates, and to go on from what it holds; default in memory.
+        The journal to write, and to continue if it holds samples; default: a new one in memory.
     """
     from livepde.progress import watched
 
@@ -128,13 +128,13 @@ def drive(
 
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
-    """Return a new journal for what an identifier takes and finds; without a path in memory."""
+    """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
     layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
     return Journal.create(path, identifier.channels, layout)
 
 
 def _ends(stream: object) -> bool:
-    """Return whether all samples of a stream are at hand: one that is live has no length."""
+    """Return whether a stream is finite: a live one has no length."""
     if not isinstance(stream, Sized):
         return False
     try:

@@ -1,7 +1,7 @@
 """A run in the formats of other programs: netCDF, Zarr, CSV, XDMF and VTK.
 
-Inside, a dataset has the names and units of the model. Outside it follows the CF conventions:
-units that UDUNITS reads, times with their date, what belongs to what; and UGRID for the mesh.
+A run's dataset has the names and units of the model. An exported one follows the CF conventions
+(units that UDUNITS reads, times with their date, ancillary variables) and UGRID for the mesh.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ __all__ = ["AT_ONE_TIME", "FORMATS", "NEEDS", "cf", "export", "into_place", "nee
 def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
     """Write a run in the format that the ending of a file names: see `FORMATS`.
 
-    Of a run that still goes on, what it has until now. The file appears whole or not at all.
+    A run that is still in progress is exported up to now. The file is written atomically.
 
     Parameters
     ----------
     at
         For formats of one time (`AT_ONE_TIME`): the fields nearest to this time; default the last.
     force
-        Write over what is there.
+        Replace an existing file.
 
     Raises
     ------
@@ -79,12 +79,12 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
 
 
 def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
-    """Write a file, or a folder, beside where it goes, and move it there when it is whole.
+    """Write a file or folder beside its target, and move it there when it is complete.
 
     Parameters
     ----------
     write
-        Is called with a path of the same name; files beside that come along.
+        Called with a temporary path of the same name; files written beside it are moved, too.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def _zarr(run: Run, path: Path, at: float | None) -> None:
 
 
 def _csv(run: Run, path: Path, at: float | None) -> None:
-    """Write what is over time, one row for each sample; units stand in the header."""
+    """Write all variables over time as CSV, one row for each sample, with units in the header."""
     data = bounded(run.dataset)
     times = data["time"].values
     columns: dict[str, Any] = {}

@@ -21,7 +21,7 @@ SHIFTED = "shifted by "  # how a position begins where the clock was set back
 
 
 def shifted(position: str) -> tuple[float, str]:
-    """Return by how much times are shifted at a position, and the position of the source."""
+    """Return the shift of the times of rows in a position, and the position of the source."""
     if not position.startswith(SHIFTED):
         return 0.0, position
     shift, _, place = position.removeprefix(SHIFTED).partition(" ")
@@ -33,32 +33,32 @@ class Feed(Protocol):
 
     @property
     def done(self) -> bool:
-        """True if nothing more will come."""
+        """True if no more samples will come."""
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return the samples that are there, or after at most `wait` seconds none."""
+        """Return available samples, waiting for them at most `wait` seconds; may be empty."""
 
     def heard(self) -> bool:
-        """Return whether anything has come since this was asked last, be it of no use."""
+        """Return whether any row has come since the last call, usable or not."""
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return the counts of remarks since the last call.
 
-        Only of what would not be read again from `position(waiting)`: so nothing is counted twice
-        after a crash.
+        Only remarks on rows before `position(waiting)`: later rows are read again after a crash,
+        and their remarks would be counted twice.
         """
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return from where to go on if these samples are still to be taken."""
+        """Return the position of the source before these samples, which are still to be taken."""
 
     def acknowledge(self, ready: Ready) -> None:
-        """Hear that a sample has been taken for good, or never will be."""
+        """Acknowledge a sample that has been kept for good, or dropped."""
 
     def withdraw(self, last: float) -> None:
-        """Hear that nothing could be made of samples later than this time."""
+        """Accept samples later than this time again: those taken since then were withdrawn."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Close the source and release its resources."""
 
 
 class Gathered:
@@ -67,7 +67,7 @@ class Gathered:
     Parameters
     ----------
     source, intake
-        Where rows come from, and how they become samples.
+        Source of rows, and the intake that turns them into samples.
     """
 
     def __init__(self, source: Source, intake: Intake) -> None:
@@ -81,7 +81,7 @@ class Gathered:
 
     @property
     def done(self) -> bool:
-        """True when the source has ended and all its samples are out."""
+        """True when the source has ended and all its samples were returned."""
         return self._flushed
 
     def poll(self, wait: float) -> Sequence[Ready]:
@@ -114,7 +114,7 @@ class Gathered:
         return [*(token for ready in waiting for token in ready.tokens), *self.intake.waiting]
 
     def heard(self) -> bool:
-        """Return whether a row has come since this was asked last."""
+        """Return whether a row has come since the last call."""
         heard, self._heard = self._heard, False
         return heard
 
@@ -134,9 +134,9 @@ class Gathered:
         return list(found.values())
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return where the source stands if these samples are still to be taken.
+        """Return the position of the source before these samples, which are still to be taken.
 
-        With it what is added there to the times of rows, if that ever was anything.
+        It includes the shift of the clock there, if the clock was ever set back.
         """
         tokens = self._waiting(waiting)
         place = self.source.position(_given(tokens))
@@ -149,11 +149,11 @@ class Gathered:
         return f"{SHIFTED}{shift!r} {place}"
 
     def acknowledge(self, ready: Ready) -> None:
-        """Tell the source."""
+        """Acknowledge the rows of a sample to the source."""
         self.source.acknowledge(_given(ready.tokens))
 
     def withdraw(self, last: float) -> None:
-        """Tell the intake."""
+        """Withdraw samples later than a time from the intake."""
         self.intake.withdraw(last)
 
     def close(self) -> None:
@@ -162,12 +162,12 @@ class Gathered:
 
 
 def _given(tokens: Iterable[Any]) -> list[Any]:
-    """Return the rows of the source, without their numbers."""
+    """Return the tokens of the source, without the numbers of their rows."""
     return [token for _, token in tokens]
 
 
 class SampleFeed:
-    """Samples that are in order already: a table, or any iterable that raises `DataError`.
+    """Feed of samples that are in order already: a table, or any iterable of samples.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ class SampleFeed:
     names
         Sensors whose values an array z holds.
     after
-        Time of the last one that was taken before; those up to it are passed over.
+        Time of the last sample taken before; samples up to it are skipped.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class SampleFeed:
 
     @property
     def done(self) -> bool:
-        """True when there are no more."""
+        """True when all samples were returned."""
         return self._done
 
     def poll(self, wait: float) -> Sequence[Ready]:
@@ -204,25 +204,25 @@ class SampleFeed:
         return {**by_name(sample.z, self._names), **(sample.inputs or {})}
 
     def heard(self) -> bool:
-        """Samples that are there are never silent."""
+        """Return True: a table or iterable is never silent."""
         return True
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Nothing is refused: what is wrong raises."""
+        """Return no remarks: invalid samples raise `DataError` instead."""
         return ()
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """The time of the last sample is enough to go on."""
+        """Return an empty position: resuming needs only the time of the last sample."""
         return ""
 
     def acknowledge(self, ready: Ready) -> None:
-        """Nobody waits to hear it."""
+        """Do nothing: there is no source to acknowledge to."""
 
     def withdraw(self, last: float) -> None:
-        """The next one is later anyway."""
+        """Do nothing: the next sample is later anyway."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources to release."""
 
 
 class Paced:
@@ -231,11 +231,11 @@ class Paced:
     Parameters
     ----------
     feed
-        Where they come from.
+        The feed whose samples are replayed.
     pace
         Model time that passes in one second.
     clock, sleep
-        Seconds that pass, and how to let them pass.
+        Functions that return the time and wait, both in seconds.
     """
 
     def __init__(
@@ -254,11 +254,11 @@ class Paced:
 
     @property
     def done(self) -> bool:
-        """True when the last sample is out."""
+        """True when the last sample was returned."""
         return self.feed.done and not self._held
 
     def poll(self, wait: float) -> Sequence[Ready]:
-        """Return the samples whose time has come."""
+        """Return the samples that are due at the pace of the replay."""
         if not self._held:
             self._held.extend(self.feed.poll(wait))
         if not self._held:
@@ -276,7 +276,7 @@ class Paced:
         return found
 
     def heard(self) -> bool:
-        """A replay is heard as long as it holds samples."""
+        """Return whether rows have come, or samples are held until they are due."""
         return self.feed.heard() or bool(self._held)
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
@@ -284,15 +284,15 @@ class Paced:
         return self.feed.remarks([*waiting, *self._held])
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return from where to go on if these samples, and those held, are still to be taken."""
+        """Return the position of the source before these samples and those held."""
         return self.feed.position([*waiting, *self._held])
 
     def acknowledge(self, ready: Ready) -> None:
-        """Tell the feed."""
+        """Acknowledge a sample to the feed."""
         self.feed.acknowledge(ready)
 
     def withdraw(self, last: float) -> None:
-        """Tell the feed, unless later samples are held."""
+        """Withdraw from the feed samples later than a time, or than the last one held."""
         self.feed.withdraw(self._held[-1].t if self._held else last)
 
     def close(self) -> None:

@@ -1,23 +1,24 @@
-"""The journal of a run: what was taken and what was found, in one file that survives a kill.
+"""The journal of a run: samples, estimates and checkpoints in one file that survives a kill.
 
-An SQLite file in write-ahead mode. A sample is in it before the identifier sees it, an estimate
-with the next commit; a checkpoint of the identifier from time to time. After a crash at any moment
-the last checkpoint and the samples after it give the same numbers as if nothing had happened. One
-process writes, any number may read meanwhile.
+The file is an SQLite database in write-ahead mode. A sample is committed before the identifier
+sees it, an estimate with the next commit; a checkpoint of the identifier from time to time. After a
+crash at any moment the last checkpoint and the samples after it give the same numbers as if nothing
+had happened. One process writes; any number of processes may read at the same time.
 
-It is append-only: what was written is never changed, and only `thin` takes something away. Freed
-room is used again, so that a journal that is thinned stops growing.
+The journal is append-only: samples and estimates are never changed; only `thin` and withdrawals
+remove them. Freed pages are reused, so that a journal that is thinned stops growing.
 
-A process that is killed loses nothing. A power cut leaves the file whole, but may take the samples
-of the last moments: a sync for each of them would cost more than the step. A file that is followed
-brings them again; a broker that was told of them does not.
+A process that is killed loses nothing. A power cut leaves the file intact, but may lose the most
+recent samples: a sync to disk for each sample would cost more than its step. A file that is
+followed delivers them again; a broker to which they were acknowledged does not.
 
-Each record has a checksum, which is compared on each read, and numbers follow one another without
-gaps but those that the journal knows of: what is damaged or gone is told, and `salvage` reads the
-rest.
+Each record has a checksum, which is verified on each read, and records are numbered without gaps
+other than those that the journal has recorded: a damaged or missing record raises `RunError`, and
+`Run.salvage` reads the intact ones.
 
-After a write that fails (a full disk) a journal takes nothing more, so that no checkpoint can pass
-over what was lost. What was written before is there; `reopen`, or a new writer, goes on with it.
+After a failed write (a full disk) a journal accepts no further records, so that no checkpoint can
+skip lost samples. Records committed before are intact; `reopen`, or a new writer, continues from
+them.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ FORMAT = 2
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
-FEW = 64  # samples that are looked at to know a row again
+FEW = 64  # samples that are compared to recognise a repeated row
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LONGEST = 2000  # characters of the message of an event
 
@@ -97,9 +98,9 @@ ESTIMATES = (
 
 @dataclass(frozen=True, eq=False)
 class Taken:
-    """An accepted sample: its number, time, the values of all channels (NaN: missing).
+    """An accepted sample: its number, its time and the values of all channels (NaN: missing).
 
-    And the noise of its readings, by the names that `noise_channel` gives, if it has any.
+    The noise of its readings, if they have any, is held under the names of `noise_channel`.
     """
 
     id: int
@@ -109,7 +110,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened: kind, channel ('' for none), in words, and when (model time)."""
+    """An event of a run: model time, kind, channel ('' for none) and message."""
 
     t: float
     kind: str
@@ -118,7 +119,7 @@ class Event:
 
 
 class Journal:
-    """The journal of one run; `create` makes a new one, `open` takes one that is there.
+    """The journal of one run; `create` makes a new one, `open` opens an existing one.
 
     Attributes
     ----------
@@ -127,9 +128,9 @@ class Journal:
     channels
         Names of all channels of a sample, in the order in which they are kept.
     noise
-        Names of the noise of their readings, which a sample that has any keeps after them.
+        Names of the noise of each channel; samples with noise hold it after `channels`.
     layout
-        What the numbers of the records mean.
+        Names, units and coordinates of the numbers of the records.
 
     Raises
     ------
@@ -153,10 +154,11 @@ class Journal:
         self._stand()
 
     def _stand(self) -> None:
-        """Find the numbers of the last records."""
+        """Read the numbers of the last estimate and sample; raise `RunError` if some are lost."""
         self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
         self._current = self._last
         self._newest = max(self.accepted, *self._withdrawn(), 0)
+        # A checkpoint is written after its estimate, so one without an estimate is damage.
         kept = int(self._one("SELECT COALESCE(MAX(id), 0) FROM checkpoints"))
         if kept > self._last:
             text = f"the estimates after {self._last} are gone"
@@ -168,7 +170,7 @@ class Journal:
     def create(cls, path: Path | None, channels: Sequence[str], layout: Layout) -> Journal:
         """Make a new journal and be its writer; without a path in memory only.
 
-        The file appears whole or not at all: where it is, `open` can go on with it.
+        The file is written atomically: if it exists, `open` can continue it.
         """
         meta = {
             "format": str(FORMAT),
@@ -193,7 +195,7 @@ class Journal:
 
     @classmethod
     def open(cls, path: Path, *, write: bool = False) -> Journal:
-        """Open a journal: to go on with it, or to read while another process writes."""
+        """Open a journal, to continue it or to read it while another process writes."""
         if not path.is_file():
             raise RunError(f"{path}: there is no journal.")
         lock = locked(path) if write else None
@@ -201,7 +203,7 @@ class Journal:
             return cls(path, writer(path) if write else reader(path), lock)
 
     def close(self) -> None:
-        """Commit and let go."""
+        """Commit, close the file and release its lock."""
         try:
             if not self._failure:
                 self._write(self._db.commit)
@@ -227,7 +229,7 @@ class Journal:
             raise RunError(self._failure) from error
 
     def _fail(self, error: sqlite3.Error) -> None:
-        """Take nothing more: what was not committed is lost."""
+        """Roll back uncommitted records, and refuse further writes."""
         with suppress(sqlite3.Error):
             self._db.rollback()
         self._failure = told(self.path, error)
@@ -235,21 +237,23 @@ class Journal:
 
     @property
     def remedy(self) -> str:
-        """After what `reopen` may go on; empty if nothing has failed, or nothing would help."""
+        """Remedy after which `reopen` may succeed; empty without a failure or a known one."""
         return self._remedy if self._failure and self.in_place else ""
 
     def reopen(self) -> None:
-        """Go on after a write that failed, with what was committed before.
+        """Continue after a failed write, from the last commit.
 
         Raises
         ------
         RunError
-            It still cannot be written, or what is there is damaged.
+            The file still cannot be written, or its records are damaged.
         """
         with suppress(sqlite3.Error):
             self._db.close()
         try:
             self._db = writer(self.path)
+            # An immediate transaction takes the write lock, so a file that cannot be locked fails
+            # here, and not with the next sample.
             self._db.execute("BEGIN IMMEDIATE")
             self._db.rollback()
         except sqlite3.Error as error:
@@ -277,15 +281,16 @@ class Journal:
     # --- writing -------------------------------------------------------------------------------
 
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
-        """Keep a sample, for good: it is on disk when this returns.
+        """Insert a sample and commit: it survives a kill of the process once this returns.
 
         Parameters
         ----------
         t, values
             Time and values of the channels; NaN or absent: missing.
         position
-            Where its source stands after it, to go on from there.
+            Position of the source after the sample, to resume from.
         """
+        # Most samples have no noise; the length of a row tells readers whether it has.
         names = self.channels
         if not values.keys().isdisjoint(self.noise):
             names += self.noise
@@ -306,7 +311,7 @@ class Journal:
         self._execute(command, *values, checksum(table, *values))
 
     def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
-        """Keep samples with their estimates and the state after them: all of it, or nothing.
+        """Insert samples with their estimates and the state after them, in one transaction.
 
         Parameters
         ----------
@@ -314,7 +319,7 @@ class Journal:
             Values of the channels of each sample, with or without their noise after them, and its
             estimate.
         state
-            The identifier's.
+            State of the identifier after the last sample.
         """
         for row, record in rows:
             self._enter(record.t, row.tobytes(), "")
@@ -322,7 +327,7 @@ class Journal:
         self.checkpoint(state)  # commits
 
     def withdraw(self) -> None:
-        """Forget the last sample, of which nothing could be made."""
+        """Withdraw the last sample, which the identifier could not use."""
         self._forget(self._current)
         self._write(self._db.commit)
         self._current = self._last
@@ -330,13 +335,15 @@ class Journal:
     def _forget(self, number: int) -> None:
         for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
             self._execute(f"DELETE FROM {table} WHERE id = ?", number)
+        # The newest number is used again. A gap before later samples remains, and is recorded,
+        # because readers take an unrecorded gap for damage.
         if number == self._newest:
             self._newest -= 1
         else:
             self._execute("INSERT OR IGNORE INTO withdrawn VALUES (?)", number)
 
     def mark(self) -> int:
-        """Note, for good, that the last sample is tried again; return how often it has been."""
+        """Count and commit one more try of the last sample; return the number of tries."""
         self._execute(
             "INSERT INTO tries VALUES (?, 1) ON CONFLICT (id) DO UPDATE SET number = number + 1",
             self._current,
@@ -347,7 +354,7 @@ class Journal:
     def append(self, record: Record, /) -> None:
         """Keep the estimate of the last sample that `accept` or `samples` has returned.
 
-        One that was kept before a crash is found again, and stays as it is.
+        An estimate that was kept before a crash is left unchanged.
         """
         found = (record.numbers, record.innovation, record.withheld_error)
         self._insert(
@@ -365,11 +372,11 @@ class Journal:
         self._last = self._current
 
     def keep(self, snapshot: Snapshot) -> None:
-        """Keep the fields of the last sample, as long as it is the last."""
+        """Keep the fields of the last sample until `rewind` deletes them."""
         self._keep(snapshot, last=True)
 
     def _keep(self, snapshot: Snapshot, last: bool = False) -> None:
-        # Fields that are kept for good stay so when they are the last, too.
+        # Fields that are kept for good must not become temporary because they are the last, too.
         number = self._last if last else self._current
         stays = "WHERE last > excluded.last"
         conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
@@ -377,8 +384,9 @@ class Journal:
         self._insert("fields", number, int(last), packed(snapshot), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
-        """Keep the identifier's state after the last sample that was estimated."""
+        """Keep the identifier's state after the last estimated sample, and commit."""
         self._insert("checkpoints", self._last, state, conflict="ON CONFLICT (id) DO NOTHING")
+        # The older checkpoint is kept because `rewind` needs it if the newer one is damaged.
         self._execute(
             "DELETE FROM checkpoints WHERE id NOT IN "
             "(SELECT id FROM checkpoints ORDER BY id DESC LIMIT ?)",
@@ -387,30 +395,31 @@ class Journal:
         self._write(self._db.commit)
 
     def commit(self, position: str | None = None) -> None:
-        """Show readers what was written since the last sample was accepted.
+        """Commit, so that readers see all records since the last accepted sample.
 
         Parameters
         ----------
         position
-            Where the source stands now, if it has brought anything but samples since then.
+            Position of the source now, if it has delivered unusable rows since then.
         """
         if position is not None:
+            # With the number of the sample, since the position of any later sample supersedes it.
             stands = json.dumps([self.accepted, position])
             self._say("position", stands)
         self._write(self._db.commit)
 
     def _say(self, key: str, value: str) -> None:
-        """Note something about the journal itself."""
+        """Set a value of the header."""
         conflict = "ON CONFLICT (key) DO UPDATE SET value = excluded.value, crc = excluded.crc"
         self._insert("meta", key, value, conflict=conflict)
 
     def say_health(self, why: str) -> None:
-        """Note why the run is not well, for good; empty if it is."""
+        """Store and commit the reason why the run is not well; empty if it is."""
         self._say("health", why[:LONGEST].encode(errors="replace").decode())
         self._write(self._db.commit)
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
-        """Keep the verdict on the run so far, as `Verdict.to_dict` gives it."""
+        """Store the verdict on the run so far, as `Verdict.to_dict` returns it."""
         conflict = "ON CONFLICT (id) DO UPDATE SET said = excluded.said, crc = excluded.crc"
         self._insert("verdicts", 1, json.dumps(verdict), conflict=conflict)
 
@@ -432,7 +441,7 @@ class Journal:
         )
 
     def count(self, kind: str, channel: str = "", number: int = 1) -> None:
-        """Count something that is not worth an event each."""
+        """Add to the count of a kind of remark that does not deserve an event each time."""
         known = "SELECT number FROM counts WHERE kind = ? AND channel = ?"
         before = self._read(known, kind, channel)
         conflict = "ON CONFLICT (kind, channel) DO UPDATE SET number = excluded.number, "
@@ -443,7 +452,7 @@ class Journal:
     # --- reading -------------------------------------------------------------------------------
 
     def _meta(self) -> dict[str, str]:
-        """Return the header of the journal, if it is one."""
+        """Return the header; raise `RunError` if the file is no journal of this version."""
         found = self._read("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL")
         if {str(sql) for (sql,) in found} == set(SCHEMA):
             meta = dict(self._sound("meta", self._read("SELECT * FROM meta")))
@@ -452,7 +461,7 @@ class Journal:
         raise RunError(f"{self.path} is not a journal of this version of livepde: {AGAIN}.")
 
     def _sound(self, table: str, rows: Iterable[Sequence[Any]]) -> list[Any]:
-        """Return records without their checksums, once those fit."""
+        """Verify the checksums of records, and return the records without them."""
         found = []
         for *values, crc in rows:
             if checksum(table, *values) != crc:
@@ -464,11 +473,12 @@ class Journal:
         return {int(number) for (number,) in self._read("SELECT id FROM withdrawn")}
 
     def _follow(self, table: str, before: int, numbers: Iterable[int]) -> None:
-        """Refuse records that are gone: numbers follow one another, unless it is known why not."""
+        """Raise `RunError` if records are missing that were neither withdrawn nor thinned."""
         known: tuple[set[int], int, int] | None = None
         for number in numbers:
             for gone in range(before + 1, number):
-                # What is read after the records has the reason for all that was missing then.
+                # Withdrawals are read after the records, so that a concurrent writer has recorded
+                # by then the reason of every gap that was seen.
                 known = known or (self._withdrawn(), *self._thinning())
                 withdrawn, end, every = known
                 if not (gone in withdrawn or (gone < end and (table == "samples" or gone % every))):
@@ -476,19 +486,19 @@ class Journal:
             before = number
 
     def _thinning(self) -> tuple[int, int]:
-        """Return before which number one estimate of so many is kept, and of how many."""
+        """Return the number below which estimates are thinned, and the `every` of `thin`."""
         with sound(self.path):
             end, every = json.loads(self._meta().get("thinned", "[0, 1]"))
             return int(end), int(every)
 
     @property
     def health(self) -> str:
-        """Why the run is not well, as its writer has said last; empty if it is."""
+        """Reason why the run is not well, as last stored by its writer; empty if it is."""
         return self._meta().get("health", "")
 
     @property
     def in_place(self) -> bool:
-        """Whether the file that was opened is the one that has its name now."""
+        """Whether the path still names the opened file, not a deleted or replaced one."""
         if self._file is None:
             return True
         try:
@@ -504,12 +514,12 @@ class Journal:
 
     @property
     def estimated(self) -> int:
-        """Number of the last sample with an estimate; all before have one, or had it."""
+        """Number of the last estimated sample; earlier estimates may have been thinned."""
         return self._last
 
     @property
     def first(self) -> Taken | None:
-        """The first accepted sample, which describes the start; None before any."""
+        """The first accepted sample, from which the run begins; None before any."""
         return next(self._samples("ORDER BY id LIMIT 1"), None)
 
     @property
@@ -523,13 +533,14 @@ class Journal:
         return [*self._samples("ORDER BY id DESC LIMIT ?", count)][::-1]
 
     def between(self, low: float, high: float) -> list[tuple[float, dict[str, float]]]:
-        """Return the first samples from one time to another, at most a few."""
+        """Return the first few samples between two times."""
         start = self._number_at(low)
         found = self._samples("WHERE id >= ? ORDER BY id LIMIT ?", start, FEW)
         return [(one.t, one.values) for one in found if one.t <= high]
 
     def _number_at(self, t: float) -> int:
-        """Return the number of the first sample that is not earlier than a time: by halving."""
+        """Return the number of the first sample not earlier than a time, by bisection."""
+        # Times are sorted but have no index, so bisection by the primary key is the short way.
         low, high = 0, self._newest + 1
         while low < high:
             middle = (low + high) // 2
@@ -544,12 +555,14 @@ class Journal:
         """Return whether all samples later than a time can be withdrawn."""
         before = self._number_at(math.nextafter(t, math.inf)) - 1
         numbers = [n for (n,) in self._read("SELECT id FROM checkpoints WHERE id <= ?", before)]
+        # Without a checkpoint all samples are taken again from the first, unless they were thinned.
         return before > 0 and bool(numbers or not self._thinning()[0])
 
     def go_back(self, t: float) -> None:
-        """Withdraw all samples later than a time, with what came of them; for good."""
+        """Withdraw all samples later than a time with their estimates, fields and checkpoints."""
         first = self._number_at(math.nextafter(t, math.inf))
         later = self._read("SELECT id FROM samples WHERE id >= ? ORDER BY id DESC", first)
+        # From the newest on, so that their numbers can be used again and leave no gaps.
         for (number,) in later:
             self._forget(int(number))
         self._write(self._db.commit)
@@ -557,7 +570,7 @@ class Journal:
 
     @property
     def position(self) -> str:
-        """Where the source stood after the last accepted sample, or what came after it."""
+        """Position of the source after the last accepted sample and the unusable rows after it."""
         rows = self._sound("samples", self._read("SELECT * FROM samples ORDER BY id DESC LIMIT 1"))
         last, _, _, position = rows[0] if rows else (0, 0.0, b"", "")
         with sound(self.path):
@@ -565,9 +578,9 @@ class Journal:
             return str(later if after == last else position)
 
     def rewind(self) -> bytes | None:
-        """Return the last checkpoint, None if there is none.
+        """Return the last intact checkpoint, None if there is none.
 
-        `samples` then brings what has to be taken again.
+        `samples` then yields the samples after it, which have to be taken again.
         """
         numbers = [n for (n,) in self._read("SELECT id FROM checkpoints ORDER BY id DESC")]
         number, state = 0, None
@@ -575,15 +588,16 @@ class Journal:
             state = self._state(number)
             if state is not None:
                 break
+            # A damaged one is deleted, since its number may be needed for a new checkpoint.
             self._execute("DELETE FROM checkpoints WHERE id = ?", number)
         if state is None and numbers:
             first = self.first
             if self._thinning()[0] or first is None:
                 raise RunError(damaged(self.path, "no checkpoint is as it was"))
-            number = 0  # all is taken again
+            number = 0  # all samples are taken again
         if numbers and number < numbers[0]:
             LOG.warning("%s: the newest checkpoint is damaged: went back further", self.path)
-        self._execute("DELETE FROM fields WHERE last")  # there will be later ones
+        self._execute("DELETE FROM fields WHERE last")  # later samples will have others
         self._write(self._db.commit)
         self._last = self._current = int(number)
         return state
@@ -598,7 +612,9 @@ class Journal:
         return state if isinstance(state, bytes) else None
 
     def samples(self) -> Iterator[Taken]:
-        """Iterate over the samples after the last one that was estimated."""
+        """Iterate over the samples after the last estimated one."""
+        # One query for each sample: between two of them the caller writes estimates, and may
+        # withdraw a sample.
         while (
             found := next(self._samples("WHERE id > ? ORDER BY id LIMIT 1", self._current), None)
         ) is not None:
@@ -626,7 +642,7 @@ class Journal:
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
-        """Return the values of a sample by name: all channels, and the noise where given."""
+        """Return the values of a sample by name: all channels, and the noise of some."""
         values = dict(zip(self.channels, row, strict=False))
         noise = zip(self.noise, row[len(self.channels) :], strict=False)
         return values | {name: std for name, std in noise if not math.isnan(std)}
@@ -649,7 +665,7 @@ class Journal:
                 return
 
     def _estimate(self, row: Sequence[Any]) -> Record:
-        """Return an estimate with its fields, once both checksums fit."""
+        """Return an estimate with its fields, after verifying both checksums."""
         number = row[0]
         ((_, *content),) = self._sound("estimates", [row[:7]])
         fields = None
@@ -692,7 +708,7 @@ class Journal:
 
     @property
     def counts(self) -> dict[tuple[str, str], int]:
-        """(kind, channel) -> how often."""
+        """(kind, channel) -> number of remarks."""
         rows = self._sound("counts", self._read("SELECT * FROM counts ORDER BY kind, channel"))
         with sound(self.path):
             return {(str(kind), str(channel)): int(number) for kind, channel, number in rows}
@@ -700,11 +716,12 @@ class Journal:
     # --- bounded growth ------------------------------------------------------------------------
 
     def thin(self, before: float, every: int) -> None:
-        """Keep one in `every` estimates, and no samples or fields, from before a time.
+        """Keep one in `every` of the estimates before a time, and none of its samples and fields.
 
-        What is needed to go on after a crash is kept: the first sample, and all from the older
-        checkpoint on. Of events the last ones are kept.
+        All records needed for recovery after a crash are kept: the first sample, and all from the
+        older checkpoint on. Of events the last 10 000 are kept.
         """
+        # If the newer checkpoint is damaged, samples are taken again from the older one on.
         safe = self._one("SELECT COALESCE(MIN(id), 0) FROM checkpoints")
         recent = self._read("SELECT id FROM samples WHERE t >= ? ORDER BY id LIMIT 1", before)
         end = min(safe, recent[0][0]) if recent else safe
@@ -714,6 +731,7 @@ class Journal:
         self._execute(
             "DELETE FROM estimates WHERE id >= ? AND id < ? AND id % ?", self._thinned, end, every
         )
+        # Readers still expect an estimate at each multiple of `every`, so those gaps stay recorded.
         self._execute("DELETE FROM withdrawn WHERE id < ? AND id % ?", end, every)
         self._execute("DELETE FROM tries WHERE id < ?", end)
         self._execute(
@@ -725,7 +743,7 @@ class Journal:
 
 
 def _identity(path: Path) -> tuple[int, int]:
-    """Return by what a file is known, whatever its name."""
+    """Return the device and inode numbers, which identify a file whatever its name."""
     found = path.stat()
     return found.st_dev, found.st_ino
 

@@ -1,4 +1,4 @@
-"""The verdict of a run: that of its law, and findings from its dataset."""
+"""The verdict of a run: findings of its law and of its dataset."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ __all__ = ["doubts", "severities", "unexplained", "verdict", "verdict_table"]
 
 
 def verdict(data: xr.Dataset) -> Verdict:
-    """Return the verdict of a run: that of its law (`Estimate.verdict`), and what its dataset says.
+    """Return the verdict of a run: of its law (`Estimate.verdict`), and findings of its dataset.
 
-    That of a run that has ended stands in its dataset as a whole.
+    The law's verdict is read from the attribute `verdict` of the dataset.
     """
     stored = data.attrs.get("verdict")
     own = Verdict.from_dict(json.loads(stored)) if stored else Verdict.unjudged()
@@ -47,12 +47,12 @@ def verdict_table(found: Verdict) -> Table:
 
 
 def doubts(data: xr.Dataset) -> list[str]:
-    """Return what a user should know before he believes the estimates: all findings, each once."""
+    """Return all findings that speak against trusting the estimates, as sentences, each once."""
     return list(dict.fromkeys(finding.sentence for finding in verdict(data).findings))
 
 
 def severities(data: xr.Dataset) -> dict[str, Severity]:
-    """Return how grave each sentence of `doubts` is."""
+    """Return the severity of each sentence of `doubts`."""
     return {finding.sentence: finding.severity for finding in verdict(data).findings}
 
 

@@ -1,4 +1,4 @@
-"""The loop beside a running process: rows in, samples into the journal, estimates out."""
+"""The loop of a live run: rows from a source, samples into the journal, estimates to sinks."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from livepde.verdict import LEVELS
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 CHECKPOINT = 256  # samples between two checkpoints
-JUDGED = 50  # samples between two looks at the verdict, of which a change is an event
-LOOK = 0.5  # seconds between two looks at whether to stop
+JUDGED = 50  # samples between two evaluations of the verdict; a change is an event
+LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
 TRIES = 2  # times that a sample in whose step the process has ended is tried again
@@ -39,34 +39,34 @@ LOG = logging.getLogger("livepde.run")
 
 
 class Sink(Protocol):
-    """Where estimates go."""
+    """A destination of estimates."""
 
     def put(self, estimate: Estimate) -> None:
         """Take one estimate."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release its resources."""
 
 
 @dataclass(frozen=True)
 class Backlog:
-    """What happens when samples come faster than steps.
+    """Policy for samples that arrive faster than they are processed.
 
     Parameters
     ----------
     overflow
-        "queue": all wait, those beyond `length` where they come from; "merge": those beyond it
-        become one sample, with the mean of each channel at the last time; "drop": the oldest are
-        left out. What is merged or left out is counted.
+        "queue": all samples wait, those beyond `length` at their source; "merge": the oldest beyond
+        `length` become one sample, with the mean of each channel at the last time; "drop": the
+        oldest are dropped. Merged and dropped samples are counted.
     length
-        Samples that may wait.
+        Maximum number of waiting samples.
     """
 
     overflow: Literal["queue", "merge", "drop"] = "queue"
     length: int = 1000
 
     def relieved(self, waiting: deque[Ready]) -> list[Ready]:
-        """Shorten what waits, and return the samples that were merged with others or dropped."""
+        """Shorten the queue, and return the samples that were merged or dropped."""
         excess = len(waiting) - self.length
         if self.overflow == "queue" or excess <= 0:
             return []
@@ -78,20 +78,20 @@ class Backlog:
         return oldest
 
     def has_room(self, waiting: deque[Ready]) -> bool:
-        """Return whether more should be taken from the source."""
+        """Return whether more rows should be polled from the source."""
         return self.overflow != "queue" or len(waiting) < self.length
 
 
 @dataclass(frozen=True)
 class Retention:
-    """How much of the past a journal keeps.
+    """Retention policy of a journal.
 
     Parameters
     ----------
     span
-        Model time for which all is kept.
+        Duration, in model time, for which all records are kept.
     every
-        Of older estimates one in so many is kept, of older samples and fields none.
+        One in `every` older estimates is kept; older samples and fields are deleted.
     """
 
     span: float = math.inf
@@ -110,49 +110,49 @@ def _merged(samples: Sequence[Ready]) -> Ready:
 
 
 def _since(samples: Iterable[Ready]) -> float | None:
-    """Return the earliest time after which samples are to be taken back, None for none."""
+    """Return the earliest time after which samples must be withdrawn, None for none."""
     return min((s.since for s in samples if s.since is not None), default=None)
 
 
 class Live:
-    """A run that goes on until its source ends or it is told to stop.
+    """A live run, which continues until its source ends or it is stopped.
 
     Parameters
     ----------
     identifier
-        As it was when the run began; `resume` brings it to where it was.
+        The identifier in its initial state; `resume` restores the state from the journal.
     feed, journal, sinks
-        Where samples come from, what is kept, and where estimates go.
+        Source of samples, store of samples and estimates, and destinations of estimates.
     fields_every
-        Fields of every so many samples are kept.
+        Number of samples between two that keep their fields.
     backlog
-        What happens when samples come faster than steps.
+        Policy for samples that arrive faster than they are processed.
     retention
-        How much of the past is kept.
+        Retention policy of the journal.
     silence
-        Seconds without a row after which the source is said to be silent.
+        Seconds without a row after which the source is reported as silent.
     strict
         A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
         an event.
     begun, irregular
-        Samples that the feed has brought already, and what was worth counting until then.
+        Samples that the feed has delivered already, and remarks on irregular rows until then.
     waits
-        The feed may wait for samples: who reads the journal is shown the last estimate before.
-        Else it is shown with the next sample, in one transaction.
+        Whether the feed may wait for samples: estimates are then committed before waiting, for
+        readers of the journal; else with the next sample, in one transaction.
     patient
-        A journal that cannot be written (a full disk) is waited for, and the run is not well
+        Whether to wait for a journal that cannot be written (a full disk), with the run not well
         meanwhile; else the journal's `RunError` ends the run.
     stopping
-        Ends the run when it is set; it may be set already.
+        Event that ends the run when it is set; it may be set already.
     clock
-        Seconds that pass.
+        Function that returns the time in seconds.
 
     Attributes
     ----------
     ailments
-        Each returns why the run is not well, in one sentence, or nothing; the first that does is
-        what /health, the metrics, the log and the page say. The last is a verdict of "do not
-        trust", which is looked at every 50 samples.
+        Functions that return the reason why the run is not well, in one sentence, or an empty
+        string; /health, the metrics, the log and the page report the first reason. The last ailment
+        is a verdict of "do not trust", which is evaluated every 50 samples.
     """
 
     def __init__(
@@ -217,9 +217,9 @@ class Live:
         self._count(irregular)
 
     def resume(self) -> int:
-        """Take again what the journal holds after its last checkpoint; return how many samples.
+        """Take again the samples after the journal's last checkpoint; return their number.
 
-        A sample with which the process has ended again and again is set aside.
+        A sample in whose step the process has ended three times is set aside.
         """
         try:
             again = self._again(self.journal.estimated)
@@ -230,10 +230,11 @@ class Live:
         return again
 
     def _mend(self, error: RunError) -> int:
-        """Wait until the journal can be written again; return how many samples were taken again.
+        """Wait until the journal can be written again; return the number of samples taken again.
 
-        What it has lost is written again: estimates are computed from the last checkpoint on,
-        counts and events are still known. Raises the error where nothing helps, or nobody waits.
+        Lost records are written again: estimates are recomputed from the last checkpoint on, counts
+        and events are still in memory. Raises the error if it has no remedy, or the run is not
+        patient.
         """
         begun, again = self._clock(), None
         while again is None:
@@ -249,14 +250,17 @@ class Live:
                 raise error
             try:
                 self.journal.reopen()
-                self.journal.say_health(why)  # something is written before steps are taken again
-                again = self._again(math.inf)  # not marked: it was not the samples' fault
+                # A write comes first: if it fails, no steps are taken again in vain.
+                self.journal.say_health(why)
+                # The tries of samples are not counted: the disk has failed, not their steps.
+                again = self._again(math.inf)
                 self.journal.commit()
                 self._restore()
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
-        self._heard = self._taken = now = self._clock()  # meanwhile nobody has listened
+        # The source was not polled meanwhile, so that time is no silence of it.
+        self._heard = self._taken = now = self._clock()
         self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
         return again
 
@@ -274,12 +278,16 @@ class Live:
         while self._waiting and self._waiting[0].since is None:
             if self._waiting[0].t > self.journal.last:
                 return  # the next sample is kept together with this
-            self.feed.acknowledge(self._waiting.popleft())  # kept although that was not said
+            # The sample was committed although its write was reported as failed.
+            self.feed.acknowledge(self._waiting.popleft())
         if not self._waiting:
             self.journal.commit(self.feed.position(()))
 
     def _again(self, reached: float) -> int:
-        """Go back to the last checkpoint and take again what came after it, `reached` at most."""
+        """Go back to the last checkpoint and take again all samples after it; return their number.
+
+        Samples with numbers above `reached` have no estimate yet: their tries are counted.
+        """
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
@@ -291,12 +299,13 @@ class Live:
                 continue
             self._step(taken, again=True)
             if new:
-                self.journal.commit()  # its step did end
+                # The step has ended, so a later crash must not count as one of its tries.
+                self.journal.commit()
             again += 1
         return again
 
     def _read(self) -> Result:
-        """Return the result of what the journal holds."""
+        """Return the result that reads estimates from the journal."""
         who, kept = self.identifier, self.journal
         return Result(
             who.model,
@@ -309,11 +318,12 @@ class Live:
         )
 
     def run(self) -> None:
-        """Go on until the source ends or `stopping` is set; what was taken is kept then."""
+        """Run until the source ends or `stopping` is set, and keep a final checkpoint."""
         try:
             self._run()
         except BaseException:
-            with suppress(LivepdeError):  # what went wrong first is what is told
+            # The first error is the one to report, not one that follows from it.
+            with suppress(LivepdeError):
                 self._conclude()
             raise
         self._conclude()
@@ -328,7 +338,7 @@ class Live:
         self.journal.checkpoint(self.identifier.dump())
 
     def _settled(self) -> None:
-        """Keep the estimate and the fields of the end."""
+        """Keep the verdict and the fields of the final estimate."""
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
@@ -344,6 +354,7 @@ class Live:
                 ended = True
             except RunError as error:
                 self._mend(error)
+                # Steps that are taken again reach no sink, but the last estimate is news to them.
                 last = self.result.last
                 if last is not None and last.t > self._put_last:
                     self._put(last)
@@ -352,7 +363,7 @@ class Live:
         """Take samples until the source ends or `stopping` is set."""
         while not self.stopping.is_set():
             if self.waits and not self._waiting:
-                self._settle()  # who reads the journal sees all before it is waited for more
+                self._settle()  # readers see all estimates before the run waits for rows
             if self.backlog.has_room(self._waiting):
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
                 self._listen(self.feed.heard())
@@ -365,7 +376,9 @@ class Live:
         self._settle()
 
     def _settle(self) -> None:
-        """Keep what was irregular, and where the source stands, for good."""
+        """Commit the counts of irregular rows, and the position of the source."""
+        # The position moves in the transaction of the counts, since a crash between the two would
+        # let the same rows be read and counted again.
         remarks = self.feed.remarks(self._waiting)
         self._count(remarks)
         self.journal.commit(self.feed.position(self._waiting) if remarks else None)
@@ -375,12 +388,13 @@ class Live:
         if relieved:
             self._counts[self.backlog.overflow, ""] += len(relieved)
             self.journal.count(self.backlog.overflow, "", len(relieved))
+        # A merged sample has the tokens of all its rows, which are acknowledged with it.
         if self.backlog.overflow == "drop":
             for ready in relieved:
                 self.feed.acknowledge(ready)
 
     def _count(self, remarks: Iterable[Remark]) -> None:
-        """Count remarks; the first of each kind and channel is an event, with its words."""
+        """Count remarks; the first of each kind and channel becomes an event with its message."""
         self._uncounted.extend(remarks)
         while self._uncounted:
             remark = self._uncounted.popleft()
@@ -394,7 +408,7 @@ class Live:
             self.journal.count(remark.kind, remark.channel, remark.number)
 
     def _tell(self, kind: str, message: str, channel: str = "") -> None:
-        if len(message) > LONGEST:  # it may repeat what has come
+        if len(message) > LONGEST:  # a message may quote a whole row
             message = message[:LONGEST] + "..."
         event = Event(self.identifier.t, kind, channel, message)
         self._events.append(event)
@@ -405,9 +419,9 @@ class Live:
 
     @property
     def health(self) -> dict[str, Any]:
-        """What a watchdog should know: ok, or why not, in one sentence."""
+        """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
-        counts = self._counts.copy()  # who asks does so from another thread
+        counts = self._counts.copy()  # requests come from other threads
         why, verdict = self.why, None if last is None else last.verdict
         return {
             "ok": not why,
@@ -425,15 +439,15 @@ class Live:
 
     @property
     def why(self) -> str:
-        """Why the run is not well, in one sentence; empty if it is.
+        """Reason why the run is not well, in one sentence; empty if it is.
 
-        As long as it ails of the same the sentence stays as it was when that began.
+        While the same ailment lasts, the sentence is that of its beginning.
         """
         ailing, why = self._ailing()
         return self._unwell if ailing == self._told[0] else why
 
     def _ailing(self) -> tuple[int, str]:
-        """Return the number of the first ailment that there is, -1 for none, and what it says."""
+        """Return the index of the first active ailment and its reason; -1 and '' if all is well."""
         found = ((k, why) for k, ailment in enumerate(self.ailments) if (why := ailment()))
         return next(found, (-1, ""))
 
@@ -468,7 +482,7 @@ class Live:
         return self._doubt
 
     def _look(self) -> None:
-        """Say in the log, and to who reads the journal, what has changed of the run's health."""
+        """Log a change of the run's health, and store it for readers of the journal."""
         ailing, why = self._ailing()
         before, kind = self._told
         if ailing == before:
@@ -478,15 +492,16 @@ class Live:
         self.journal.say_health(why)
         if why:
             self._tell(self._told[1], why)
-        elif kind == "unwell":  # of the end of a silence it has been said that it is heard
+        elif kind == "unwell":  # "heard" has reported the end of a silence
             self._tell("well", "all is well again")
 
     def _take(self) -> None:
-        """Take the first of the samples that wait; it waits on if it cannot be kept."""
+        """Take the first waiting sample; it stays in the queue if the journal cannot keep it."""
         ready = self._waiting.popleft()
         try:
             if ready.since is not None:
                 self._go_back(ready.since)
+            # Counts, position and sample are one transaction, so that a crash keeps all or none.
             position = self.feed.position(self._waiting)
             self._count(self.feed.remarks(self._waiting))
             taken = self.journal.accept(ready.t, ready.values, position)
@@ -497,7 +512,7 @@ class Live:
         self._step(taken)
 
     def _go_back(self, t: float) -> None:
-        """Take back the samples later than a time, and stand where they had not come yet."""
+        """Withdraw the samples later than a time, and restore the state before them."""
         self.journal.go_back(t)
         self._again(self.journal.estimated)
 
@@ -511,7 +526,7 @@ class Live:
             self.busy = False
 
     def _estimate(self, taken: Taken) -> Estimate | None:
-        """Take a step; return None where the sample was refused or set aside."""
+        """Take a step; return None if the sample was refused or set aside."""
         before, begun = self.identifier.place, time.monotonic()
         try:
             estimate = self.identifier.step(taken.t, taken.values)
@@ -530,6 +545,7 @@ class Live:
         except Exception as error:
             if self.strict and numerical(error) is None:
                 raise
+            # A step that fails midway may have changed a part of the identifier.
             self.identifier.return_to(before)
             self._set_aside(taken.t, f"{type(error).__name__}: {error}")
         else:
@@ -537,12 +553,12 @@ class Live:
         return None
 
     def _withdraw(self) -> None:
-        """Forget the last sample; those that wait are later, and taken or refused in their turn."""
+        """Withdraw the last sample; waiting samples are later, and taken in their turn."""
         self.journal.withdraw()
         self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
 
     def _set_aside(self, t: float, why: str) -> None:
-        """Forget a sample with which a step cannot end; the stream goes on."""
+        """Withdraw a sample whose step fails, and report it; the stream goes on."""
         self._failed += 1
         self._failure = f"t = {t:g} was set aside: {why}"
         self._tell("aside", self._failure)
@@ -551,7 +567,7 @@ class Live:
         self._withdraw()
 
     def _hand_on(self, estimate: Estimate, again: bool) -> None:
-        """Tell of an estimate, and keep a checkpoint from time to time."""
+        """Hand an estimate to the sinks; judge it and keep a checkpoint at intervals."""
         if not again:
             self._put(estimate)
         if estimate.status.taken:
@@ -561,6 +577,7 @@ class Live:
             self._failure = str(estimate.status)
             self._tell(estimate.status.code, self._failure)
         self._steps += 1
+        # Counted from the start of the run, so that a resumed run judges the same samples.
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
         if self._steps % CHECKPOINT == 0:
@@ -569,7 +586,7 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _judge(self, estimate: Estimate) -> None:
-        """Tell of a verdict that is another one than before."""
+        """Store the verdict, and report a change of its level as an event."""
         verdict = estimate.verdict
         self.journal.judge(verdict.to_dict())
         grave = verdict.level == LEVELS[-1]
@@ -580,7 +597,7 @@ class Live:
             self._tell("verdict", f"{verdict.level}: {said}")
 
     def _put(self, estimate: Estimate) -> None:
-        """Hand an estimate to all sinks; one that fails is given up, the run goes on."""
+        """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""
         self._put_last = estimate.t
         for sink in list(self.sinks):
             try:

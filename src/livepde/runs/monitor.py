@@ -84,7 +84,7 @@ class Metrics:
 
 
 class _Health:
-    """What the health of a run says, as metrics of the moment in which it is asked."""
+    """Collector of metrics from the health of a run at the time of each request."""
 
     def __init__(self, health: Callable[[], Mapping[str, Any]]) -> None:
         self._health = health
@@ -127,9 +127,9 @@ class Monitor:
     address
         Where to listen.
     health
-        Returns what /health says as JSON; "ok" in it decides between the codes 200 and 503.
+        Returns the content of /health as JSON; its "ok" decides between the codes 200 and 503.
     metrics
-        What /metrics says.
+        The metrics that /metrics serves.
 
     Raises
     ------

@@ -23,12 +23,12 @@ FigureFactory: TypeAlias = Callable[[], Any]
 
 @dataclass(frozen=True)
 class Check:
-    """A number and what it must satisfy.
+    """A number and the bound that it must satisfy.
 
     Attributes
     ----------
     name
-        What is measured.
+        The measured quantity.
     value
         The number; NaN never satisfies anything.
     bound
@@ -98,12 +98,12 @@ class Table:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Everything an experiment has to show.
+    """Tables, checks, notes, dataset and figures of an experiment.
 
     Attributes
     ----------
     tables, checks, notes
-        What is printed, in this order.
+        Printed parts, in this order.
     dataset
         The run, as `Result.to_xarray()` gives it.
     figures
@@ -131,9 +131,9 @@ class Outcome:
 
 
 def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str]) -> T:
-    """Return what is computed from a run; where that fails something else, and a note says why.
+    """Return the value of a computation, or `otherwise` and a note with the reason if it fails.
 
-    A run has its data whatever one of its diagnostics makes of them. `OSError`, and so `RunError`
+    A run keeps its data even if one of its diagnostics fails. `OSError`, and so `RunError`
     (a directory that cannot be written), is raised.
     """
     try:

@@ -108,7 +108,7 @@ class PendingConnections:
         return True
 
     def _seen(self, visitor: socket.socket) -> bytes | None:
-        """Return what has come and stays there to be read, None if nothing has."""
+        """Return the received bytes without consuming them, None if none have come."""
         visitor.setblocking(False)
         try:
             return visitor.recv(LONGEST_HEADER + WHOLE, socket.MSG_PEEK)
@@ -143,7 +143,7 @@ class PendingConnections:
 
 
 def environ_of(content: bytes) -> dict[str, str]:
-    r"""Return what the header of a request says of who asks, in the names of WSGI.
+    r"""Return the query string and the headers of a request, under their names in WSGI.
 
     >>> environ_of(b"GET /health?token=a HTTP/1.1\r\nHost: localhost\r\n\r\n")
     {'QUERY_STRING': 'token=a', 'HTTP_HOST': 'localhost'}
@@ -170,7 +170,7 @@ def _whole(content: bytes) -> bool:
 
 
 def _answer(visitor: socket.socket, why: str) -> None:
-    """Say why a request is refused; who does not take it at once does not hear it."""
+    """Send the reason of a refusal with code 403, without waiting for a slow client."""
     text = f"{why}\n".encode()
     head = (
         "HTTP/1.1 403 Forbidden\r\nContent-Type: text/plain\r\n"

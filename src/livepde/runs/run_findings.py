@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 __all__ = ["findings_of", "input_findings"]
 
-MODEL_ERROR = 4.0  # ratio of innovations to what is expected of them, squared: twice as large
-LEFT = 1.0  # deviations between estimate and reference after the last replay
+MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
+LEFT = 1.0  # standard deviations between estimate and reference after the last replay
 BELIEVED = 0.5  # weight of the members of a bank that drift
 DRIFTING = 0.03  # share of the samples in which they are believed
 MOST_JUMPS = 5  # that get a sentence of their own
-WANDERS = 0.3  # scatter of an estimate over what it has learned: it follows the noise
+WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
-LEAVES = 1.0  # squared distance from the prior over what model and prior allow
+LEAVES = 1.0  # squared distance from the prior over the one that model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
@@ -41,18 +41,18 @@ INPUT_KINDS = {
 def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
     """Return the findings from the dataset of a run.
 
-    An unknown ends at a bound, or keeps more than 0.9 of its prior standard deviation: the data did
-    not tell. The gate has refused more than 2 % of the readings. The last replay ended more than
-    one standard deviation away from where it has to end. Guards had to give up samples or to
-    restart, or to hold unknowns that nothing excited. With gain='auto' the unknowns ended farther
-    from their prior than, with a right model, they do in one of a million cases. With a fixed gain
-    an estimate wanders, in the last half of a run, by more than 0.3 of what it has learned. In more
-    than 0.03 of the samples a bank believes that unknowns drift. Latent values were held where they
-    would have left their prior. Of the mean variance of a field more than a quarter is that of
-    modes that the law leaves out. Time step, mesh and straight lines between readings of inputs
-    have together shifted an unknown by more than two standard deviations. Something jumped. Where
-    no law has judged the innovations: their mean square, over the last 500 samples, is more than
-    four times what was expected.
+    A finding is: an unknown that ends at a bound, or keeps more than 0.9 of its prior standard
+    deviation, so that the data were not informative; a gate that refused more than 2 % of the
+    readings; a last replay whose estimate and reference are more than one standard deviation apart;
+    guards that gave up samples, restarted, or held unknowns that nothing excited; with gain='auto',
+    final unknowns farther from their prior than, with a correct model, in one of a million cases;
+    with a fixed gain, an estimate that scatters in the last half of a run by more than 0.3 of its
+    change since the first sample; a bank that favours drifting unknowns in more than 3 % of the
+    samples; latent values held at the limits of their prior; a field of whose mean variance more
+    than a quarter is that of modes that the law leaves out; time step, mesh and linear
+    interpolation of inputs that together shifted an unknown by more than two standard deviations;
+    a jump; and, if no law has judged the innovations, a mean square of the last 500 of more than
+    four times its expected value.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
 
 
 def _held(data: xr.Dataset) -> list[str]:
-    """Return whether latent values were held at their ends, `within` prior deviations away."""
+    """Return whether latent values were held at `within` prior standard deviations."""
     counts = note(data, "bounded")
     if counts is None or not (counts > 0.0).any():
         return []
@@ -171,7 +171,7 @@ def _held(data: xr.Dataset) -> list[str]:
 
 
 def _left_out(data: xr.Dataset) -> list[str]:
-    """Return how much of the interval of a field is that of modes that the law leaves out."""
+    """Return fields whose variance is to a large part that of modes the law leaves out."""
     found = []
     for name in str(data.attrs.get("fields", "")).split():
         if f"{name}_left_out" not in data:
@@ -250,7 +250,7 @@ def _guards(data: xr.Dataset) -> list[str]:
 
 
 def _rests(data: xr.Dataset) -> list[str]:
-    """Return when the gradient law has held q."""
+    """Return when the gradient law held the unknowns because nothing excited them."""
     noted = note(data, "at_rest")
     if noted is None:
         return []
@@ -282,7 +282,7 @@ def _lost(data: xr.Dataset) -> list[str]:
 
 
 def _drifts(data: xr.Dataset) -> list[str]:
-    """Return whether a bank has believed for long that unknowns drift: nobody has said so."""
+    """Return whether the members of a bank with drifting unknowns had most weight for long."""
     weights = note(data, "drifting")
     if weights is None:
         return []
@@ -299,7 +299,7 @@ def _drifts(data: xr.Dataset) -> list[str]:
 
 
 def _departure(data: xr.Dataset) -> list[str]:
-    """Return whether a law that has a prior, and no innovations to judge, has left it."""
+    """Return whether estimates have left the prior, for laws that do not judge innovations."""
     ratios = note(data, "departure")
     if ratios is None:
         return []
@@ -316,7 +316,7 @@ def _departure(data: xr.Dataset) -> list[str]:
 
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
-    """Return whether the discretisation has shifted the unknowns at the end, and by what."""
+    """Return findings on shifts of the final unknowns by discretisation errors."""
     labels = scalars(data)
     kinds = [f"{kind}_shift" for kind in ("discretisation", *REFINE)]
     names = [*kinds, *(f"{label}_{kind}" for label in labels for kind in kinds[1:])]

@@ -34,11 +34,11 @@ class JsonLinesSink:
             raise
 
     def _abandon(self) -> None:
-        """Let what the stream still holds go nowhere: it would fail again at the end."""
+        """Redirect the stream to the null device: flushing its buffer at exit would fail again."""
         nowhere = os.open(os.devnull, os.O_WRONLY)
         with suppress(OSError):
             os.dup2(nowhere, self._stream.fileno())
         os.close(nowhere)
 
     def close(self) -> None:
-        """The stream belongs to who opened it."""
+        """Do nothing: the caller closes the stream."""

@@ -100,7 +100,7 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
 
 
 def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
-    """Return what is short enough for a table: of very many channels one row for each role."""
+    """Return the errors of all channels, pooled by role if there are too many for a table."""
     if len(channels) <= MOST_ROWS:
         return dict(channels)
     roles: dict[str, list[str]] = {}
@@ -130,8 +130,8 @@ class Jump:
     t
         Time of the sample that raised it.
     moved
-        Numbers that have moved by more than three deviations between this alarm and the next one,
-        or the end: label -> value before and after, with the deviation after.
+        Numbers that have moved by more than three standard deviations between this alarm and the
+        next one, or the end: label -> value before and after, and the standard deviation after.
     """
 
     t: float
@@ -159,7 +159,7 @@ def jumps(data: xr.Dataset) -> list[Jump]:
 
 
 def _interval(data: xr.Dataset, label: str) -> str:
-    """Return the last 95 % interval as text, its ends to the second digit of the deviation."""
+    """Return the last 95 % interval as text, to the second digit of the standard deviation."""
     std = float(data[f"{label}_std"][-1])
     if not math.isfinite(std):
         return "–"
@@ -174,19 +174,20 @@ def _error(data: xr.Dataset, label: str) -> float:
 
 
 def _deviations(data: xr.Dataset, label: str) -> float:
-    """Return how many deviations lie between the last estimate and the reference."""
+    """Return the distance from the last estimate to the reference, in standard deviations."""
     distance = abs(float(data[label][-1]) - float(data[label].attrs["reference"]))
     std = float(data[f"{label}_std"][-1])
     return distance / std if std else math.inf
 
 
 def measures(data: xr.Dataset) -> dict[str, float]:
-    """Return every number of a run that a case may expect something of, by name.
+    """Return the numbers of a run for which a case may state expected bounds, by name.
 
-    Each scalar unknown by its label; behind it `.std`, its deviation, and where there is a
-    reference `.error`, relative to it, and `.deviations`, the distance from it in deviations;
+    Each scalar unknown by its label; with `.std` its standard deviation, and where there is a
+    reference with `.error` the relative error and with `.deviations` the distance from the
+    reference in standard deviations;
     `rmse` one-step, of all sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`,
-    `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to what is expected;
+    `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to their expected square;
     `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
     """
     found: dict[str, float] = {}
@@ -227,9 +228,9 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, errors of each channel, what the data have told, jumps, and the
-    verdict. Errors of all samples have learning in them; those of the second half compare with the
-    noise.
+    Estimates with references, estimated fields, errors of each channel, information gained from the
+    data, and jumps. Errors over all samples include the initial transient of learning; those of the
+    second half can be compared with the noise.
     """
     result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []

@@ -52,11 +52,11 @@ class Address:
     Parameters
     ----------
     host, port
-        Where; port 0: a free one.
+        Interface and port; port 0: a free one.
     token
-        What a visitor has to know: `?token=...` once, or the header `Authorization: Bearer ...`.
-        On this machine (a loopback address) none is asked for unless one is given; anywhere else
-        one is made if none is given.
+        Secret of each visitor: `?token=...` once, or the header `Authorization: Bearer ...`. On a
+        loopback address none is required unless one is given; on any other address one is
+        generated if none is given.
 
     Raises
     ------
@@ -99,20 +99,20 @@ class Server:
     Parameters
     ----------
     application, address
-        What is served where.
+        The application, and the address to listen on.
 
     Attributes
     ----------
     url
-        Where it is found, with the token.
+        Address of the server, with the token.
     shown
-        What may be printed or logged: with the token only if it was made here, so that nobody else
-        can know it.
+        Address to print or log: with the token only if it was generated here, since the user
+        cannot know it otherwise.
 
     Raises
     ------
     RunError
-        The port is taken, or what serves it is not installed.
+        The port is taken, or the package that serves it is not installed.
     """
 
     def __init__(self, application: WSGIApplication, address: Address) -> None:
@@ -160,7 +160,7 @@ class Server:
         self._server.serve()
 
     def _receive(self, connection: Any) -> None:
-        """Let a visitor wait until the request is there; who sends two at once gets one answer."""
+        """Hold a connection until its request is complete; close it on pipelined requests."""
         if connection.rfile.has_data():
             connection.close()
         else:
@@ -178,7 +178,7 @@ class Server:
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
-    """Return an application with our headers, and with a cookie for who knows the token."""
+    """Return an application with our headers, and a cookie for visitors with the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
         if why := _why_not(environ, address):  # should the header have been read otherwise before
@@ -228,7 +228,7 @@ def _same(given: str, token: str) -> bool:
 
 
 def _adding(start: StartResponse, more: list[tuple[str, str]]) -> Any:
-    """Return a beginning of an answer with more headers."""
+    """Return a `start_response` of WSGI that adds headers."""
 
     def begin(status: str, headers: list[tuple[str, str]], *rest: Any) -> Callable[[bytes], object]:
         return start(status, [*headers, *more], *rest)

@@ -44,7 +44,7 @@ POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals i
 
 @dataclass(frozen=True)
 class Clock:
-    """How the time column is read, and what of it is used.
+    """Conversion of the time column to model time, and the range of times used.
 
     Attributes
     ----------
@@ -60,11 +60,11 @@ class Clock:
     second
         One second in the model's unit of time.
     zone
-        Of dates that name none.
+        Time zone of dates that name none.
     format
-        Of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format.
+        Format of dates as text, as "%d.%m.%Y %H:%M"; empty: ISO format.
     decimal
-        Of numbers as text: "." or ",".
+        Decimal mark of numbers as text: "." or ",".
     """
 
     name: str

@@ -82,15 +82,15 @@ def read_csv(
     Parameters
     ----------
     columns
-        Channel -> where it comes from.
+        Channel -> its column.
     every
-        Keep every so many rows.
+        Number of rows of which one is kept.
     missing
         Numbers that mean a missing sample (-9999). Empty cells and NaN always do.
     separator
-        What stands between two fields, as "," or ";".
+        Field separator, as "," or ";".
     encoding
-        How the text is written, as "cp1252" or "utf-16".
+        Text encoding, as "cp1252" or "utf-16".
     skip
         Lines before the header.
 
@@ -260,7 +260,7 @@ def _likely(content: bytes, encoding: str) -> str:
 def _as_written(
     path: Path, separator: str, encoding: str, clock: Clock, known: str, skip: int
 ) -> str:
-    """Return what to say of how a file is written: what is known, and what else it lacks."""
+    """Return the options that a file seems to need, as text: the known one, and further ones."""
     seems = how_written(path, encoding)
     said = [known] if known else []
     others = "separator" not in known and len(seems.header) > 1

@@ -5,7 +5,7 @@ by a straight line. At the end of a record, where no next value is known, nothin
 identifier holds the last value and says so.
 
 A spike is a single value far off the cubic through two neighbours on each side of it. It is refused
-and leaves a gap. Where leaving out one value does not explain what is far off, the channel has
+and leaves a gap. If leaving out one value does not remove the large residuals, the channel has
 really changed, as an actuator does, and all values stay.
 """
 
@@ -35,7 +35,7 @@ LOCAL = 31  # residuals whose median is the local scale
 FEWEST = 8  # residuals from which a scale is taken
 RECENT = 64  # values of a channel that are kept to tell the scale of the next ones
 CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
-LEFT = 0.2  # of a residual that may be left without a spike; of that of a step 0.3 is left
+LEFT = 0.2  # share of a residual that may remain without a spike; of a step's 0.3 remains
 ROUNDING = 1e-12  # of the largest value of a channel: less is no residual
 ABOUT = 3  # values on each side that have to be plausible without a spike
 GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
@@ -45,14 +45,14 @@ Series = Sequence[tuple[float, float]]
 
 
 class _Residuals(NamedTuple):
-    """How far values lie off the cubic through two neighbours on each side.
+    """Residuals of values to the cubic through two neighbours on each side.
 
     Attributes
     ----------
     size
-        Residuals, shape (values - 4,), less where the neighbours are far away.
+        Residuals, shape (values - 4,), reduced where the neighbours are far away.
     weights
-        What each of the five values adds to them, shape (values - 4, 5).
+        Weights of the five values in each residual, shape (values - 4, 5).
     """
 
     size: Array
@@ -70,22 +70,26 @@ def _residuals(t: Array, x: Array) -> _Residuals:
             if j != i:
                 weights[:, i] *= (times[:, CENTRE] - times[:, j]) / (times[:, i] - times[:, j])
         weights[:, i] *= -1.0
-    # The error of a cubic grows with the product of the distances: beside a gap it says little.
+    # The error of a cubic grows with the product of the distances, so that a large residual beside
+    # a gap is no evidence of a spike.
     reach = np.abs(np.prod([times[:, CENTRE] - times[:, i] for i in others], axis=0))
     weights /= np.maximum(1.0, reach / np.median(reach))[:, None]
     return _Residuals((weights * values).sum(axis=1), weights)
 
 
 def _threshold(x: Array, size: Array, beyond: float) -> Array:
-    """Return above which size a residual is implausible: global and local scale."""
+    """Return the size above which residuals are implausible, from their global and local scale."""
     absolute = np.abs(size)
     local = np.full_like(absolute, np.median(absolute))
     if len(absolute) > LOCAL:  # where shorter, SciPy before 1.15.3 corrupts memory
-        half = LOCAL // 2  # at the ends the window lies inside: a spike does not fill it
+        # A window that is reflected at an end would count a spike there twice, so the ends take
+        # the median of the first and the last whole window.
+        half = LOCAL // 2
         local = median_filter(absolute, size=LOCAL)
         local[:half], local[-half:] = local[half], local[-half - 1]
     steps = np.abs(np.diff(x))
-    # Values that mostly repeat have a residual of zero: one step of their resolution is no spike.
+    # Most residuals of a coarsely resolved channel are zero, and then one step of its resolution
+    # would count as a spike.
     resolution = steps[steps > 0.0].min(initial=math.inf)
     return np.asarray(beyond * np.maximum(GAUSS * (np.median(absolute) + local), resolution))
 
@@ -98,18 +102,20 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     t, x
         Times and finite values, in order.
     beyond
-        How many robust standard deviations, the global and the local one together, a value lies off
-        the cubic through its neighbours.
+        Distance from the cubic through the neighbours above which a value is suspect, in robust
+        standard deviations: the sum of the global and the local one.
     """
     spikes = np.zeros(len(x), dtype=bool)
     if len(x) < FEWEST + NEIGHBOURS - 1:
         return spikes
-    x = x / (np.abs(x).max() or 1.0)  # no size of values overflows
+    # Weighted sums of very large values would overflow.
+    x = x / (np.abs(x).max() or 1.0)
     size, weights = _residuals(t, x)
     threshold = np.maximum(_threshold(x, size, beyond), ROUNDING)
     excess = np.abs(size) / threshold
+    # The largest residual comes first, because a spike raises the residuals of its neighbours, too.
     for row in np.argsort(-excess)[: int((excess > 1.0).sum())].tolist():
-        if excess[row] <= 1.0:  # explained, or found to be a change, in the meantime
+        if excess[row] <= 1.0:  # explained by a suspect before
             continue
         suspect = _suspect(size, weights, row)
         spikes[suspect] = _explains(t, x, suspect, LEFT * float(abs(size[row])))
@@ -119,12 +125,15 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
 
 
 def _suspect(size: Array, weights: Array, row: int) -> int:
-    """Return the value whose change makes the residuals about a row what they are."""
+    """Return the value whose change would best explain the residuals around a row."""
+    # The centre of the largest residual need not be the spike: uneven times may give a neighbour
+    # a larger weight. The pattern of all residuals that a value is part of tells them apart.
     best, most = row + CENTRE, -1.0
     for value in range(row, row + NEIGHBOURS):
         rows = np.arange(max(value - NEIGHBOURS + 1, 0), min(value + 1, len(size)))
         column = weights[rows, value - rows]
         match = abs(float(column @ size[rows])) / math.sqrt(float(column @ column))
+        # Rounding must not decide between values that match equally well.
         if match > most * (1.0 + 1e-9):
             best, most = value, match
     return best
@@ -132,7 +141,8 @@ def _suspect(size: Array, weights: Array, row: int) -> int:
 
 def _explains(t: Array, x: Array, suspect: int, largest: float) -> bool:
     """Return whether the values about a suspect have small residuals without it."""
-    if not CENTRE <= suspect < len(x) - CENTRE:  # it may as well be the first one of a change
+    # Without two values on each side a spike cannot be told from the start of a change.
+    if not CENTRE <= suspect < len(x) - CENTRE:
         return False
     first = max(suspect - ABOUT, 0)
     about = np.delete(np.arange(first, min(suspect + ABOUT + 1, len(x))), suspect - first)
@@ -159,7 +169,7 @@ def bridged(t: float, past: Series, later: Series) -> float:
 
 
 def is_spike(past: Series, now: tuple[float, float], later: Series, beyond: float) -> bool:
-    """Return whether a value is a spike, judged by at least two known ones after it."""
+    """Return whether a value is a spike; False with fewer than two known values after it."""
     if len(later) < CENTRE or not math.isfinite(beyond):
         return False
     t, x = np.array([*past, now, *later]).T
@@ -180,6 +190,8 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     if len(known) < 2:
         return new, gaps, spikes
     gaps[known[0] : known[-1]] = ~np.isfinite(new[known[0] : known[-1]])
+    # The first and the last interval keep the straight line: PCHIP takes its slopes from values on
+    # both sides, and `bridged` has to give the same on a stream.
     new[gaps] = np.interp(t[gaps], t[known], x[known])
     if len(known) >= 4:
         inner = gaps & (t > t[known[1]]) & (t < t[known[-2]])
@@ -190,10 +202,10 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
 def fill_table(
     table: Table, interpolated: Iterable[str], screened: Iterable[str], beyond: float = BEYOND
 ) -> Table:
-    """Return a finished record whose channels have no gaps between known values, and no spikes.
+    """Return a finished record without gaps between known values, and without spikes.
 
-    What was done is counted in its remarks as "interpolated" and "spike", what is left as
-    "missing".
+    Its remarks count interpolated values as "interpolated", refused ones as "spike" and remaining
+    gaps as "missing".
 
     Parameters
     ----------
@@ -233,8 +245,8 @@ class FillGaps:
     samples
         Largest number of samples that it waits for.
     spikes
-        How many robust standard deviations off its neighbours a value is refused; infinity: none is
-        looked for, and only samples with gaps wait.
+        Distance from its neighbours above which a value is refused, in robust standard deviations;
+        infinity: no spikes are sought, and only samples with gaps wait.
 
     Examples
     --------
@@ -272,8 +284,8 @@ class Filled(Iterable[Sample]):
     Attributes
     ----------
     counts
-        (kind, channel) -> how many values were "interpolated", how many refused as a "spike", and
-        how many "missing" ones were passed on as such, in the last iteration.
+        (kind, channel) -> number of values in the last iteration that were "interpolated", refused
+        as a "spike", or passed on as "missing".
     """
 
     def __init__(self, stage: FillGaps, stream: Iterable[Any]) -> None:
@@ -314,7 +326,7 @@ class Filled(Iterable[Sample]):
         return [pair for pair in found if math.isfinite(pair[1])]
 
     def _decided(self, waiting: deque[tuple[Sample, dict[str, float]]]) -> bool:
-        """Return whether the first sample that waits has waited enough."""
+        """Return whether the first waiting sample can be released."""
         stage, (first, values) = self.stage, waiting[0]
         expired = waiting[-1][0].t - first.t > stage.wait
         if expired or (stage.samples is not None and len(waiting) > stage.samples):
@@ -339,6 +351,7 @@ class Filled(Iterable[Sample]):
             value, kind = decided(t, values[name], list(past), later, self.stage.spikes)
             for each in kind:
                 self.counts[each, name] += 1
+            # The decided value, not the given one: a refused spike must not judge later values.
             if math.isfinite(value):
                 past.append((t, value))
             if kind:
@@ -350,7 +363,7 @@ class Filled(Iterable[Sample]):
 def decided(
     t: float, value: float, past: Series, later: Series, beyond: float = BEYOND
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the value that a sample takes of a channel, and what was done: kinds of remarks.
+    """Return the value of a channel for a sample, and the kinds of remarks on it.
 
     Parameters
     ----------
@@ -366,6 +379,7 @@ def decided(
         if not is_spike(past, (t, value), later, beyond):
             return value, ()
         kinds = ("spike",)
+    # Later values are not judged yet, so one of them may be a spike itself.
     found = bridged(t, past, _plausible(past, later, beyond))
     return found, (*kinds, "interpolated" if math.isfinite(found) else "missing")
 

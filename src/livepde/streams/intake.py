@@ -1,8 +1,8 @@
-"""Intake of rows into samples in order; late, missing, doubled and broken ones are counted.
+"""Intake of rows into ordered samples; late, missing, repeated and malformed rows are counted.
 
-A source brings rows, column -> value, each with a time; one row need not hold all channels. Rows of
-one moment make one sample. A sample is ready when a row has come that is later by more than `wait`:
-so long rows may come in any order.
+A source delivers rows, column -> value, each with a time; one row need not hold all channels. Rows
+of one moment make one sample. A sample is ready when a row has come that is later by more than
+`wait`; within that time rows may come in any order.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ __all__ = ["Habit", "Intake", "IntakeOutcome", "Past", "Policy", "Ready", "Remar
 
 @dataclass(frozen=True)
 class Habit:
-    """How one channel arrives.
+    """Arrival of one channel: waiting time, repeated values, interpolation and spikes.
 
     Parameters
     ----------
     wait
-        A sample without this channel waits so long for it, if that is longer than `Policy.wait`.
+        Time for which a sample waits for this channel, if longer than `Policy.wait`.
     repeated
-        Which value counts that comes twice for one moment; default that of the policy.
+        Which of two values for one moment is kept; default that of the policy.
     interpolated
         A sample without this channel takes a value interpolated from the next one, if that comes
         while the sample waits; it waits no longer then.
@@ -49,7 +49,7 @@ class Habit:
 
 @dataclass(frozen=True)
 class Policy:
-    """What becomes of rows that do not come one by one, in order and complete.
+    """Policy for rows that are late, incomplete, repeated, or ahead of the others.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ class Policy:
         the longest but one of the last steps, waits for the next one: it is refused, unless that
         is later still, and by at most `leap`.
     repeated
-        Which value of a channel counts that comes twice for one moment.
+        Which of two values of a channel for one moment is kept.
     channels
-        Channel -> what is special about it.
+        Channel -> its own options.
     """
 
     wait: float = 0.0
@@ -83,7 +83,7 @@ class Policy:
                 raise DataError(f"intake: repeated must be first or last; got {choice!r}.")
 
     def keeps(self, channel: str) -> Literal["first", "last"]:
-        """Return which of two values of a channel counts."""
+        """Return which of two values of a channel is kept."""
         return self.habit(channel).repeated or self.repeated
 
     def habit(self, channel: str) -> Habit:
@@ -91,9 +91,9 @@ class Policy:
         return self.channels.get(channel, PLAIN)
 
 
-STEPS = 16  # between rows, that have to be known to know what is usual
+STEPS = 16  # between rows, from which the usual step is known
 LONG = 100.0  # usual steps, after which a row is far ahead
-AGREE = 5  # rows too late that agree with each other are believed rather than the clock
+AGREE = 5  # late rows that agree with each other outweigh the clock before
 INSIST = (
     50  # of them, where no sample was taken at their times: they may be the backlog of a logger
 )
@@ -103,26 +103,25 @@ NAN = math.nan
 
 @dataclass(frozen=True)
 class Remark:
-    """Something about a row, a value or a sample that is worth counting.
+    """A countable irregularity of a row, a value or a sample.
 
     Attributes
     ----------
     kind
-        Not used: "malformed" (not what it should be), "invalid" (a value outside of what is
-        valid), "spike", "late", "leap" (a time too far ahead), "repeated", "outside" (not between
-        start and stop), "skipped" (a sample without what it must have); of a whole row "repeated"
-        means that it was taken before, with the same values. "clock": rows have shown that the
-        clock was wrong or set back. Used all the same:
-        "disordered" (came after a later one), "missing" (a sample without this channel),
-        "interpolated" (the same, and its value lies between known ones).
+        Not used: "malformed" (unreadable, or without a value), "invalid" (outside of the valid
+        range), "spike", "late", "leap" (a time too far ahead), "repeated", "outside" (not between
+        start and stop), "skipped" (a sample without a needed channel); a whole row is "repeated" if
+        it was taken before, with the same values. "clock": rows have shown that the clock was wrong
+        or set back. Used all the same: "disordered" (came after a later row), "missing" (a sample
+        without this channel), "interpolated" (the same, with a value between known ones).
     channel
-        Of the value; '' for a whole row.
+        Channel of the value; '' for a whole row.
     message
-        In words; of several the first's.
+        Description; of several remarks that of the first.
     number
-        How often.
+        Number of occurrences.
     row
-        Token of the row that it is about, the last one of a sample.
+        Token of its row; for a sample that of the last row.
     """
 
     kind: str
@@ -133,7 +132,7 @@ class Remark:
 
 
 def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
-    """Add a remark to those of its kind and channel: the first one's words, and their number."""
+    """Merge a remark into those of its kind and channel: first message, total number."""
     key = remark.kind, remark.channel
     same = found.get(key)
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
@@ -148,10 +147,10 @@ class Ready:
     t, values
         Time, and values of the channels that have come.
     tokens
-        What the source gave with the rows of the sample, to acknowledge them.
+        Tokens of the source for the rows of the sample, to acknowledge them.
     since
-        All samples later than this are wrong, and to be taken back before this one is taken: a
-        clock has been wrong. None: all are right.
+        Samples taken before that are later than this have wrong times, and must be withdrawn before
+        this one is taken. None: there are none.
     """
 
     t: float
@@ -162,9 +161,9 @@ class Ready:
 
 @dataclass
 class IntakeOutcome:
-    """What has become of a row: samples that are ready, remarks, tokens that are done with.
+    """Outcome of a row: ready samples, remarks, and tokens of rows that no sample uses.
 
-    `row` is the token of the row, which remarks are about unless they say so.
+    `row` is the token of the row, to which remarks refer by default.
     """
 
     ready: list[Ready] = field(default_factory=list)
@@ -179,18 +178,18 @@ class IntakeOutcome:
 
 
 class Past(Protocol):
-    """The samples that were taken: they tell a row that is late from a clock that is wrong."""
+    """The samples taken so far, which distinguish a late row from a wrong clock."""
 
     def between(self, low: float, high: float) -> Sequence[tuple[float, Mapping[str, float]]]:
-        """Return some of the samples from one time to another, nothing where none is kept."""
+        """Return some of the samples between two times, none where they were thinned."""
 
     def returns_to(self, t: float) -> bool:
-        """Return whether all samples later than a time can be taken back."""
+        """Return whether all samples later than a time can be withdrawn."""
 
 
 @dataclass(frozen=True)
 class _Held:
-    """A row that waits until others have shown whether its time is right."""
+    """A row that waits until later rows have confirmed or refuted its time."""
 
     t: float
     row: Mapping[str, Any]
@@ -204,16 +203,16 @@ class _Open:
 
 
 class Intake:
-    """Puts rows in order.
+    """Ordering of rows into samples.
 
     Parameters
     ----------
     columns
-        Channel -> where it comes from.
+        Channel -> its column.
     clock
-        How times are read.
+        Conversion of the time column.
     policy
-        What becomes of rows out of order.
+        Policy for rows out of order.
     missing
         Numbers that mean a missing value.
     origin
@@ -221,19 +220,19 @@ class Intake:
     dates
         Whether times are dates; default as in the first row.
     last
-        Time of the last sample that was taken before, to go on after it.
+        Time of the last sample taken in an earlier session; earlier rows are late.
     recent
-        Times and values of the last samples that were taken before, for channels that are
+        Times and values of the last samples of an earlier session, for channels that are
         interpolated or screened.
     shift
-        What is added to the times of rows: by so much the clock has been set back.
+        Offset that is added to the times of rows, because the clock was set back by it.
 
     Attributes
     ----------
     past
-        The samples that were taken, to know a clock that is wrong; None: what is late is late.
+        The samples taken so far, to detect a wrong clock; None: all late rows are refused.
     anchors
-        Token of the first row for which another shift holds, and the shift; oldest first.
+        Token of the first row with a new shift, and the shift; oldest first.
     """
 
     def __init__(
@@ -283,7 +282,7 @@ class Intake:
         return found + [one.token for one in held]
 
     def take(self, row: Mapping[str, Any], token: Any = None) -> IntakeOutcome:
-        """Take a row; return what becomes of it and of those before it."""
+        """Take a row; return the outcome of it and of rows that waited."""
         found = IntakeOutcome(row=token)
         try:
             t = self._time(row)
@@ -300,10 +299,11 @@ class Intake:
         return found
 
     def _judged(self, held: _Held, found: IntakeOutcome) -> bool:
-        """Return whether a row is used or waits; a leap and what is too late wait for others."""
+        """Return whether a row is used or waits; a leap and late rows wait for others."""
         if self._leaps(held.t):
             self._doubt(held, found)
             return True
+        # A row at the old pace shows that the one far ahead before it was wrong.
         if self._doubted is not None:
             self._refuse_leap(found)
         if self.past is not None and self._late(held.t):
@@ -317,11 +317,12 @@ class Intake:
 
     @property
     def _long(self) -> float:
-        """A hundred times the longest step but one; infinite if too few are known."""
+        """A hundred times the second longest step; infinite if too few steps are known."""
+        # The longest step may be a pause of the source, which must not count as usual.
         return LONG * sorted(self._steps)[-2] if len(self._steps) == STEPS else math.inf
 
     def _doubt(self, held: _Held, found: IntakeOutcome) -> None:
-        """Take a row that is too far ahead if the one before said so, too; else let it wait."""
+        """Take a row that is far ahead if the row before confirms it; else let it wait."""
         self._give_up(found)
         before = self._doubted
         if before is not None and 0.0 <= held.t - before.t <= self.policy.leap:
@@ -347,10 +348,11 @@ class Intake:
     def _pends(self, held: _Held, past: Past, found: IntakeOutcome) -> bool:
         """Return whether a row that is too late is used or waits for others that agree with it.
 
-        One that has been taken before is known by time and values: a source says again what it
-        has said. Others that follow one another say that the clock had been wrong, or was set
+        A row with time and values of a taken sample is a repetition, as a source sends after a
+        reconnect. Other late rows that follow one another show that the clock was wrong, or was set
         back.
         """
+        # Remarks on the values are made once the row is placed, so these are dropped.
         values = self._values(held.row, IntakeOutcome())
         near = past.between(held.t - self.policy.tolerance, held.t + self.policy.tolerance)
         if not values or any(_same(values, known) for _, known in near):
@@ -363,21 +365,24 @@ class Intake:
         if self._pending and not 0.0 <= held.t - self._pending[-1].t <= self._long:
             self._give_up(found)
         self._pending.append(held)
+        # Several rows of one moment are no more evidence than one.
         if len({one.t for one in self._pending}) >= AGREE:
             self._anchor(past, found)
         return True
 
     def _give_up(self, found: IntakeOutcome) -> None:
-        """Refuse the rows that were too late and have not convinced."""
+        """Refuse the late rows that wait: too few of them agree with each other."""
         pending, self._pending = self._pending, []
         for held in pending:
             if not self._placed(held, found):
                 found.spent.append(held.token)
 
     def _anchor(self, past: Past, found: IntakeOutcome) -> None:
-        """Believe rows that agree with each other, if that is what they say."""
+        """Correct the clock by late rows that agree: withdraw samples, or shift times."""
         first, count = self._pending[0].t, len({one.t for one in self._pending})
         earlier = [t for t in self._released if t < first]
+        # A clock that was wrong for a moment has spoilt few samples, which can be withdrawn. Before
+        # one that was set back all samples are right, and so times are shifted instead.
         wrong = len(self._released) - len(earlier) + len(self._open)
         if wrong <= AGREE and earlier and past.returns_to(earlier[-1]):
             text = (
@@ -386,6 +391,7 @@ class Intake:
             )
             self._go_back(earlier, found)
         elif count >= INSIST or self._covered(past):
+            # The true length of the pause is unknown, so the rows go on after one usual step.
             shift = self._newest + self._usual - first
             self.shift += shift
             text = (
@@ -393,6 +399,7 @@ class Intake:
                 f"set back by {shift:g}, which is added to all times from now on"
             )
             self._pending = [replace(one, t=one.t + shift) for one in self._pending]
+            # A position before this row belongs to the old shift, and one after it to the new one.
             self.anchors.append((self._pending[0].token, self.shift))
         else:
             return
@@ -404,12 +411,12 @@ class Intake:
 
     @property
     def _usual(self) -> float:
-        """The usual step of the rows, as those that wait have it."""
+        """The median step of the late rows that wait."""
         gaps = [b.t - a.t for a, b in pairwise(self._pending) if b.t > a.t]
         return float(median(gaps))
 
     def _covered(self, past: Past) -> bool:
-        """Return whether samples with these channels are as late as the rows that wait."""
+        """Return whether samples with their channels were taken in the span of the waiting rows."""
         named = {name for one in self._pending for name in self._values(one.row, IntakeOutcome())}
         return any(
             not all(math.isnan(known.get(name, NAN)) for name in named)
@@ -417,7 +424,7 @@ class Intake:
         )
 
     def _go_back(self, earlier: list[float], found: IntakeOutcome) -> None:
-        """Forget all that is later than the first row that waits."""
+        """Drop open samples, and mark released ones later than the first waiting row as wrong."""
         for sample in self._open.values():
             found.spent += sample.tokens
         self._open.clear()
@@ -425,13 +432,13 @@ class Intake:
         self._since = self._last = self._newest = earlier[-1]
 
     def withdraw(self, last: float) -> None:
-        """Hear that nothing could be made of samples later than this: others may still come."""
+        """Accept rows later than this time again: the samples after it were withdrawn."""
         self._last = self._newest = last
         while self._released and self._released[-1] > last:
             self._released.pop()
 
     def flush(self) -> IntakeOutcome:
-        """Release all samples that are still open: nothing more will come."""
+        """Release all open samples at the end of the source."""
         found = IntakeOutcome()
         self._refuse_leap(found)
         self._give_up(found)
@@ -463,7 +470,7 @@ class Intake:
         return moment is not None and bool(values)
 
     def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
-        """Return the values of a row that can be used."""
+        """Return the valid values of a row, NaN for missing and invalid ones."""
         values: dict[str, float] = {}
         for channel, column in self.columns.items():
             if not all(name in row for name in column.names):
@@ -482,7 +489,7 @@ class Intake:
         return values
 
     def _time(self, row: Mapping[str, Any]) -> float | None:
-        """Return the time of a row, None if it is outside of what is used."""
+        """Return the model time of a row, None if it is not between start and stop."""
         t, dates = row_time(row, self.clock, before=self._dates)
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
@@ -491,17 +498,18 @@ class Intake:
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
         self._dates = dates
+        # The first row within the bounds sets t = 0 for all later ones.
         if self.origin is None:
             self.origin = _microseconds(t / self.clock.second) if dates else 0.0
         if not dates:
             return t + self.shift
         moment = t - self.origin * self.clock.second + self.shift
         if moment <= self._last and is_naive(row.get(self.clock.name), self.clock):
-            moment += self.clock.repeated_hour(t)  # the second time that the clocks show it
+            moment += self.clock.repeated_hour(t)  # the second pass at the end of summer time
         return moment
 
     def _moment(self, t: float) -> float | None:
-        """Return the moment that a time belongs to, None if that is past."""
+        """Return the moment that a time belongs to, None if its sample was released."""
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
@@ -519,12 +527,14 @@ class Intake:
                 found.remark("repeated", channel, text)
                 if self.policy.keeps(channel) == "first":
                     continue
+            # An empty cell of a second row must not erase a value that has come.
             if math.isnan(known) or not math.isnan(value):
                 sample.values[channel] = value
 
     def _release(self, found: IntakeOutcome) -> None:
-        """Let go, in order, of the samples that are complete or have waited long enough."""
+        """Release, in order, the samples that are complete or have waited long enough."""
         for t in sorted(self._open):
+            # Samples leave in order, so one that still waits holds back those after it.
             if not self._ripe(t):
                 return
             sample = self._open.pop(t)
@@ -572,7 +582,7 @@ class Intake:
             if "interpolated" in kinds and habit.interpolated:
                 text = f"t = {t:g}: between the values before and after"
                 found.remark("interpolated", channel, text, sample.tokens[-1])
-            elif kinds:
+            elif kinds:  # a spike of a channel that is not interpolated leaves a gap
                 value = NAN
             if kinds:
                 sample.values[channel] = value
@@ -583,16 +593,17 @@ class Intake:
         return [pair for pair in values if math.isfinite(pair[1])]
 
     def _ripe(self, t: float) -> bool:
-        """Return whether nothing that a sample may wait for can still come."""
+        """Return whether a sample is complete, or has waited long enough for the rest."""
         values, policy = self._open[t].values, self.policy
         absent = [channel for channel in self.columns if self._awaited(t, channel, values)]
         if policy.wait == 0.0 and not absent:
             return True
         waits = [policy.wait, *(policy.habit(channel).wait for channel in absent)]
+        # The times of rows decide, not the seconds that pass: a replay gives the same samples.
         return t + policy.tolerance + max(waits) < self._newest
 
     def _awaited(self, t: float, channel: str, values: Mapping[str, float]) -> bool:
-        """Return whether a sample lacks a channel that may still come, or be interpolated."""
+        """Return whether a sample waits for a channel that may still come, or be interpolated."""
         habit = self.policy.habit(channel)
         if not (habit.interpolated and max(self.policy.wait, habit.wait) > 0.0):
             return channel not in values
@@ -600,14 +611,14 @@ class Intake:
 
 
 def _same(values: Mapping[str, float], known: Mapping[str, float]) -> bool:
-    """Return whether a sample has these values, as far as it has any of them."""
+    """Return whether a sample has the same values in all channels that both have, if any."""
     pairs = [(value, known.get(name, NAN)) for name, value in values.items()]
     both = [(a, b) for a, b in pairs if not (math.isnan(a) or math.isnan(b))]
     return bool(both) and all(a == b for a, b in both)
 
 
 def _microseconds(stamp: float) -> float:
-    """Return seconds since 1970 as a date has them, so that a date gives the same again."""
+    """Return seconds since 1970 rounded to microseconds, as a date stores them."""
     try:
         return since_1970(origin_at(stamp))
     except (ValueError, OverflowError, OSError):

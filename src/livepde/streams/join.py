@@ -25,7 +25,7 @@ def join_tables(
     needed: Collection[str],
     where: str,
 ) -> Table:
-    """Return all rows of several tables in order of time; what a table lacks there is missing.
+    """Merge the rows of several tables in order of time; absent channels are missing values.
 
     The result begins with the first row in which a sensor has a value and before which every
     table has begun. Other channels without a value in that row have the one that a line between
@@ -34,13 +34,13 @@ def join_tables(
     Parameters
     ----------
     second
-        In the unit of time.
+        One second in the unit of time.
     sensors
         Channels that are not interpolated.
     needed
         Channels without which a row is left out.
     where
-        For messages.
+        Name of the data, for messages.
 
     Raises
     ------

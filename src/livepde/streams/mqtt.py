@@ -34,17 +34,17 @@ log = logging.getLogger("livepde.mqtt")
 
 @dataclass(frozen=True)
 class Broker:
-    """How to reach a broker.
+    """Connection to a broker: address, session, login and encryption.
 
     Parameters
     ----------
     host, port
-        Where it listens.
+        Address of the broker.
     client_id
-        Name of the session: the broker keeps what comes while nobody listens under this name. Two
+        Name of the session, for which the broker queues messages while the client is offline. Two
         runs need two names.
     username, password
-        If it asks for them; the password is never written anywhere.
+        Login, if the broker requires one; the password is never written anywhere.
     tls
         Encrypt, with the certificates that the system trusts.
     ca_file
@@ -52,7 +52,7 @@ class Broker:
     session
         Seconds for which the broker keeps the session of a client that is away.
     ahead
-        Messages that it may send before the first of them is acknowledged, at most 65535. A message
+        Messages that the broker may send before the first is acknowledged, at most 65535. A message
         is acknowledged when its sample is in the journal.
     """
 
@@ -172,16 +172,15 @@ class _Peer:
         raise NotImplementedError
 
     def _disconnected(self, reason: int) -> None:
-        """Hear that the connection is lost."""
+        """Handle a lost connection."""
 
 
 @dataclass(eq=False, slots=True)
 class _Delivery:
-    """A message that is to be acknowledged: its number, content, and on which connection it came.
+    """A message to acknowledge: its number, the hash of its content, and its connection.
 
-    The broker gives the numbers, and after a reconnect brings what was not acknowledged again under
-    the same ones. On another connection than that on which it came an acknowledgement would be that
-    of another message.
+    The broker assigns the numbers, and after a reconnect repeats unacknowledged messages with the
+    same numbers. An acknowledgement on a later connection would refer to another message.
     """
 
     number: int
@@ -191,7 +190,7 @@ class _Delivery:
 
 
 def _check_filter(topic: str) -> None:
-    """Refuse a topic to listen to that no broker takes."""
+    """Refuse a topic filter that is not valid in MQTT."""
     levels = topic.split("/")
     signs = [level for level in levels if "+" in level or "#" in level]
     alone = all(sign in ("+", "#") for sign in signs)
@@ -203,7 +202,7 @@ def _check_filter(topic: str) -> None:
 
 
 def _check_overlap(one: str, other: str) -> None:
-    """Refuse two topics that bring some messages twice."""
+    """Refuse two topic filters that match the same message."""
     for level, against in zip_longest(one.split("/"), other.split("/")):
         if "#" in (level, against):
             break
@@ -216,7 +215,7 @@ def _check_overlap(one: str, other: str) -> None:
 
 
 class MqttSource(_Peer):
-    """Rows from topics; what was not taken for good is brought again, also after a restart.
+    """Rows from topics; unacknowledged messages are delivered again, also after a restart.
 
     A message is a row (a JSON object, column -> value), or for a topic with a column of its own a
     number, alone or as {"value": 1.5, TIME: ...}. A number without a time has that of its arrival;
@@ -225,7 +224,7 @@ class MqttSource(_Peer):
     Parameters
     ----------
     broker
-        How to reach it.
+        Connection to the broker.
     topics
         Topic -> column of its numbers; None: its messages are rows. "+" and "#" as usual.
     time
@@ -234,7 +233,7 @@ class MqttSource(_Peer):
     Attributes
     ----------
     dropped
-        Messages without acknowledgement (QoS 0) that came faster than they were taken.
+        Number of messages without acknowledgement (QoS 0) that were lost, as they came too fast.
     """
 
     def __init__(self, broker: Broker, topics: Mapping[str, str | None], time: str) -> None:
@@ -378,11 +377,11 @@ class MqttSource(_Peer):
                 )
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """The broker remembers what was acknowledged."""
+        """Return an empty position: the broker keeps unacknowledged messages itself."""
         return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Tell the broker which messages it may forget; while it is away, when it is back."""
+        """Acknowledge messages to the broker; while it is offline, after the reconnect."""
         with self._lock:
             for token in tokens:
                 known = None if token is None else self._deliveries.get(token.number)
@@ -393,7 +392,7 @@ class MqttSource(_Peer):
                     self._confirm(known)
 
     def close(self) -> None:
-        """Disconnect; the broker keeps what comes from now on."""
+        """Disconnect; the broker queues later messages for the session."""
         self._leave()
 
 

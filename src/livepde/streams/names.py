@@ -30,7 +30,7 @@ def is_data(path: Path) -> bool:
 
 
 def hint(name: str, known: list[str]) -> str:
-    """Return the end of a sentence: the name that is nearest, or what there is."""
+    """Return the end of a sentence: the closest name, or all known names."""
     close = difflib.get_close_matches(name, known, n=1)
     if close:
         return f"; did you mean '{close[0]}'?"

@@ -194,21 +194,21 @@ class OpcuaSource:
         return rows
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """Nothing can be asked for again."""
+        """Return an empty position: the server does not repeat values."""
         return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Nothing waits to hear it."""
+        """Do nothing: the server does not wait for acknowledgements."""
 
     def close(self) -> None:
-        """Take leave of the server."""
+        """Disconnect from the server."""
         with suppress(RuntimeError):  # the loop has closed by itself: nothing is left to stop
             self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(PATIENCE)
 
 
 class _Changes:
-    """What a subscription calls."""
+    """Handler of the notifications of a subscription."""
 
     def __init__(self, source: OpcuaSource) -> None:
         self.columns: dict[Any, str] = {}

@@ -9,7 +9,7 @@ samples, each as soon as it has come:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         smoothed.std, smoothed.d_rate
 
-What smoothing takes from the noise it may add as a lag: that of each stage is stated.
+Smoothing reduces the noise, but may add a lag, which is stated for each stage.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ RESOLUTION = 1e-9  # offsets that differ by less than this share of the width ha
 
 
 class Weights(ABC):
-    """What a smoother remembers, and how it weighs it: z~_k = sum_j w_kj z_j, sum_j w_kj = 1."""
+    """Memory and weights of a smoother: z~_k = sum_j w_kj z_j, sum_j w_kj = 1."""
 
     @abstractmethod
     def add(self, t: float, z: Array) -> tuple[Array, Array, Array]:
@@ -45,7 +45,7 @@ class Weights(ABC):
         variance
             sum_j w_kj^2: variance of its noise, per variance of the raw noise.
         change
-            sum_j (w_kj - w_k-1,j)^2: that of z~_k - z~_k-1; NaN for the first.
+            sum_j (w_kj - w_k-1,j)^2: variance of z~_k - z~_k-1, per the same; NaN for the first.
         """
 
 
@@ -56,10 +56,10 @@ class Smoother(ABC):
     Parameters
     ----------
     noise
-        Standard deviation of the raw noise: one number, or one for each channel. Default: learned
-        from all samples so far, from how far a value lies off the straight line between its two
-        neighbours (Gasser, Sroka and Jennen-Steinmetz 1986). That knows no signal but its
-        curvature, and takes the noise as independent from sample to sample.
+        Standard deviation of the raw noise: one number, or one for each channel. Default: estimated
+        from all samples so far, by the residuals of values to the straight line between their two
+        neighbours (Gasser, Sroka and Jennen-Steinmetz 1986). Only the curvature of the signal
+        biases the estimate, which assumes noise that is independent from sample to sample.
     channels
         Names of the channels to smooth, for samples by name; default all of the first sample that
         are not inputs of it. Inputs and other channels pass unchanged, without the lag.
@@ -91,7 +91,7 @@ class Smoother(ABC):
 
 
 class Smoothed(Iterable[Sample]):
-    """A smoothed stream. After each sample it tells about that sample.
+    """A smoothed stream, with the noise level of the last sample.
 
     A missing value stays missing: smoothing does not invent data.
 
@@ -99,15 +99,15 @@ class Smoothed(Iterable[Sample]):
     ----------
     std
         Standard deviation of the noise of the smoothed channels, sigma sqrt(sum_j w_kj^2), shape
-        (channels,): what the observation has to be told as `noise`.
+        (channels,); the value of `noise` for the observation.
     d_rate
         The noise part of d~ = (d_alpha^delta)_t for each channel, the root mean square of the rate
         of the smoothed noise,
 
             sigma sqrt(sum_j (w_kj - w_k-1,j)^2) / (t_k - t_k-1),
 
-        shape (channels,), NaN for the first sample. What the lag adds, the rate of z~ - z without
-        noise, is not in it.
+        shape (channels,), NaN for the first sample. The contribution of the lag, the rate of z~ - z
+        without noise, is not included.
     sigma
         Standard deviation of the raw noise, given or estimated, shape (channels,).
     """

@@ -26,8 +26,8 @@ __all__ = ["Follow", "Lines", "Row", "Rows", "Source", "drained", "json_row"]
 T = TypeVar("T")
 
 LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
-BATCH = 100  # rows that a poll brings at most
-HEAD = 4096  # bytes at the start of a file by which it is known again
+BATCH = 100  # most rows of one poll
+HEAD = 4096  # bytes at the start of a file that identify it
 NAP = 0.05  # seconds between looks at a file that does not grow
 
 
@@ -40,9 +40,9 @@ class Row:
     values
         Column -> value.
     token
-        By which the source knows it again.
+        Token by which the source identifies the row.
     broken
-        Why there are no values; '' if there are.
+        Reason why there are no values; '' if there are.
     """
 
     values: Mapping[str, Any]
@@ -51,7 +51,7 @@ class Row:
 
 
 class Source(Protocol):
-    """Brings rows as they come; used from one thread."""
+    """A source of rows as they arrive; used from one thread."""
 
     @property
     def done(self) -> bool:
@@ -61,17 +61,17 @@ class Source(Protocol):
         """Return the rows that are there, or after at most `wait` seconds none."""
 
     def position(self, waiting: Iterable[Any]) -> str:
-        """Return from where to go on, if the rows with these tokens are still to be taken.
+        """Return the position before the rows with these tokens, which are still to be taken.
 
-        A source that is made with it brings those rows and all that follow; '' if the source itself
+        A source created with it delivers those rows and all later ones; '' if the source itself
         remembers, or cannot go back.
         """
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Hear which rows have been taken for good."""
+        """Acknowledge rows that have been kept for good, by their tokens."""
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Release its resources."""
 
 
 def json_row(text: str | bytes, token: Any = None) -> Row:
@@ -99,7 +99,7 @@ def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
 
 
 def _line(file: io.BufferedReader) -> bytes:
-    """Return the next line; of one that is too long no more than tells so."""
+    """Return the next line; a line that is too long is cut after its limit."""
     line = piece = file.readline(LONGEST + 1)
     while len(piece) > LONGEST and not piece.endswith(b"\n"):
         piece = file.readline(LONGEST + 1)

@@ -165,7 +165,7 @@ def tabulated(
     missing: Iterable[float] = (),
     where: str = "data",
 ) -> Table:
-    """Return channels of columns that are in memory already.
+    """Return a table of channels from columns in memory.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def tabulated(
     columns, clock, every, missing
         As for `read_csv`.
     where
-        For messages: what the columns come from.
+        Name of the data, for messages.
 
     Raises
     ------

@@ -96,31 +96,32 @@ class AbsoluteNoise(Noise):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Twin:
-    """A process with known truth that yields `Sample`s, apart from the estimator.
+    """A simulated process with known truth that yields `Sample`s, independent of the estimator.
 
     Parameters
     ----------
     model, observation
-        As the estimator has them.
+        Model and observation of the estimator.
     q_true
         The exact parameter: a number, a function of x, coefficients, or a mapping by name.
     times
-        Sample times, increasing; the first is the initial time and its sample describes the start.
+        Sample times, increasing; the first is the initial time, with the sample of the initial
+        state.
     u_true
         Formula of the exact state, u(x, t); for several components a mapping of names to those.
     u0
         Initial state, if there is no formula: a number, a function of x, or coefficients. Without
         both that of q_true, where the model says one (`initial`).
     truth
-        Where the exact data come from.
+        Origin of the exact data.
 
         "discrete"
-            The model itself, with q_true, by `scheme` and `dt_max`: what the estimator's own
-            scheme would compute. No truncation error (the "inverse crime", which alone shows what
-            the law can do).
+            The model itself, with q_true, by `scheme` and `dt_max`: the same discrete solution as
+            that of the estimator, without truncation error (the "inverse crime", which isolates the
+            performance of the law).
         "analytic"
-            The formula u_true, projected onto the state space. The data then contain what the
-            estimator's scheme gets wrong.
+            The formula u_true, projected onto the state space. The data then deviate from the
+            estimator's scheme by its discretisation error.
         "fine"
             The model `fine` (a finer mesh, other elements) with steps of at most `fine_dt`.
             Sensors that are `portable` (`Points`, `Averages`, ...) see the fine state itself; for a
@@ -134,14 +135,14 @@ class Twin:
     noise
         `RelativeNoise`, `AbsoluteNoise` or None. The same seed gives the same noise.
     seed
-        Of the noise.
+        Seed of the noise.
     inputs
         t -> values of the model's input channels; they are sent with the samples.
 
     Raises
     ------
     ConfigurationError
-        A truth that cannot be made from what was given.
+        A truth that needs other arguments than those given.
 
     Examples
     --------
