@@ -292,7 +292,7 @@ class UnknownSpec(Spec):
 
 
 class CorrelatedSpec(Spec):
-    """An error of a sensor that fades within `time`, with the deviation `std`."""
+    """An error of a sensor that fades within `time`, with the standard deviation `std`."""
 
     time: Quantity
     std: Quantity
@@ -507,7 +507,7 @@ class OutputSpec(Spec):
 
 
 class VariantSpec(Spec):
-    """The case with other values: what 'python -m benchmarks cases' runs beside it."""
+    """A variant of the case with other values, run by 'python -m benchmarks cases'."""
 
     name: Name
     set: dict[str, Any] = Field(default_factory=dict)

@@ -46,7 +46,8 @@ def in_parts(
     run
         Function of the rows of a part; both are sent to workers, where their paths must be valid.
     jobs
-        Number of parallel processes; -1 for one on each processor. Dask takes all workers of its cluster.
+        Number of parallel processes; -1 for one on each processor. Dask uses all workers of its
+        cluster.
     backend
         Backend of joblib; None: that of the surrounding `joblib.parallel_config`, else loky.
     told
