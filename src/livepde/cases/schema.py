@@ -528,7 +528,7 @@ Law: TypeAlias = Annotated[
 
 
 class BoundarySpec(Spec):
-    """A boundary: its value, or what passes through it; each a number, a channel or an unknown."""
+    """A boundary: its value, or the flux through it; each a number, a channel or an unknown."""
 
     value: Quantity | None = None
     flux: Quantity | None = None

@@ -74,7 +74,7 @@ class Backlog:
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
         elif waiting:
-            # A dropped sample may demand the withdrawal of earlier ones, which the next one inherits.
+            # A dropped sample may demand that earlier ones are withdrawn; the next inherits that.
             waiting[0] = replace(waiting[0], since=_since([*oldest, waiting[0]]))
         return oldest
 
