@@ -131,9 +131,9 @@ class Estimate:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether the estimates are to be believed, by all samples so far.
+        """Verdict on the trustworthiness of the estimates, by all samples so far.
 
-        It is found when it is first read, and takes about a millisecond.
+        It is computed on first access, which takes about a millisecond.
         """
         labels = self.space.labels
         shifted = [*discretised(self.notes, labels), *held_inputs(self.notes, labels)]
@@ -342,7 +342,7 @@ class Result:
         return Snapshot(ordered, told, _correlation(estimate), left_out)
 
     def _profiles(self, estimate: Estimate) -> dict[str, Array]:
-        """Return values and deviations of all fields at the vertices."""
+        """Return values and standard deviations of all fields at the vertices."""
         found: dict[str, Array] = {}
         belief = estimate.belief
         for name, block in self.model.state_space.fields.items():
@@ -368,11 +368,11 @@ class Result:
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
-        law with covariance also `_left`, the share of the prior deviation of a number that is left;
-        `_modes`, of how many modes of a field the data have told, and `_left_out`, the share of the
-        modes that the law leaves out in its mean variance, over `snapshot`; and `correlation` of
-        the last numbers, over (`unknown`, `other`). The attribute `verdict` is what
-        `Verdict.to_dict` gives, as JSON.
+        law with covariance also `_left`, the remaining share of the prior standard deviation of a
+        scalar; `_modes`, the number of modes of a field that the data determine, and `_left_out`,
+        the share of its mean variance in modes that the law leaves out, over `snapshot`; and
+        `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
+        result of `Verdict.to_dict`, as JSON.
         """
         records, last = RecordArrays.of(self.records), None
         if self.last is not None and self._settled is not None:
@@ -388,7 +388,7 @@ class Result:
         return data
 
     def smoothed(self) -> xr.Dataset:
-        """Return a dataset of what unknowns and state were, given all samples of the run.
+        """Return a dataset of unknowns and state over time, given all samples of the run.
 
         Names as in `to_xarray`; intervals are those given all samples. The samples are taken again
         at least twice: see `Identifier.smoothed`.
@@ -477,7 +477,7 @@ def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[s
 
 
 def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
-    """Return the variables with the ends of 95 % intervals, unless they are +- 1.96 deviations."""
+    """Return variables with the ends of 95 % intervals, if those are not mean +- 1.96 std."""
     if unknown.symmetric:
         return {}
     low, high = unknown.interval(values, std)
@@ -485,7 +485,7 @@ def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, A
 
 
 def _correlation(estimate: Estimate) -> Array | None:
-    """Return how the estimates of numbers are correlated."""
+    """Return the correlation matrix of the scalar unknowns."""
     labels, factor = estimate.space.labels, estimate.belief.q_factor
     if factor is None or len(labels) < 2:
         return None

@@ -200,7 +200,7 @@ def _steps(table: Measured, equation: Equation) -> Iterator[str]:
 
 
 def _alternative(equation: Equation, inputs: set[str]) -> str:
-    """Return the unknown that a case begins with where it needs one of several.
+    """Return the initial choice among alternative unknowns of an equation.
 
     The first whose inputs the table has, or else the last, which needs the least.
     """
@@ -241,7 +241,7 @@ def _inputs(found: list[FoundChannel]) -> Iterator[str]:
 
 
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
-    """Yield the lines of [channels], with what may be said in them."""
+    """Yield the lines of [channels], with comments on their options."""
     yield f'# Drop what is no {equation.state.text}. role = "withheld": only scored.'
     for name, quantity in equation.quantities.items():
         yield f'# In place of at = ...: quantity = "{name}", the {quantity.text}.'

@@ -134,7 +134,7 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
 
 
 def positions_of(frame: Frame, channels: Mapping[str, ChannelSpec]) -> dict[str, float]:
-    """Return the deviation of the position of each sensor that states one."""
+    """Return the standard deviation of the position of each sensor that states one."""
     unit = frame.equation.length_unit
     return {
         name: frame.positive(item.at_std, unit, f"channels.{name}.at_std")

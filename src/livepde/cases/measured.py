@@ -183,7 +183,7 @@ def unit_in(name: str, unit: str, *patterns: re.Pattern[str]) -> str:
 
 
 def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
-    """Return column -> what most of its cells are: "number", "date", "hour" or "text"."""
+    """Return column -> kind of most of its cells: "number", "date", "hour" or "text"."""
     header, rows = written.header, written.rows
     if not rows:
         raise SampleError(f"{table}: holds no rows beside its header.")

@@ -51,8 +51,8 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     """Return where one more point sensor would reduce the posterior most.
 
     The criterion is the posterior variance over the prior variance, averaged over the unknowns (of
-    a field its mean over the domain; a sum over modes or over units would prefer what happens to be
-    many or large). The candidates are the vertices of the mesh, at most 400; the new sensor has the
+    a field its mean over the domain; a sum would depend on the number of modes and on the choice of
+    units). The candidates are the vertices of the mesh, at most 400; the new sensor has the
     median noise of the others, and measures whenever one of them does.
 
     Linearised at the prior, the information of sensors adds up: with Y the sensitivity of a reading

@@ -191,6 +191,7 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
             raise _without_input(
                 frame, name, f"the {known.text}" if known else "the equation reads it"
             )
+    # A constant that nothing reads is refused, since it may be the one a user believes to act.
     for name in constants:
         if name not in model.inputs:
             text = "the equation does not read it with these unknowns; leave it out."

@@ -294,7 +294,7 @@ class UnknownSpec(Spec):
 
 
 class CorrelatedSpec(Spec):
-    """An error of a sensor that fades within `time`, with the deviation `std`."""
+    """An error of a sensor that fades within `time`, with the standard deviation `std`."""
 
     time: Quantity
     std: Quantity
@@ -509,7 +509,7 @@ class OutputSpec(Spec):
 
 
 class VariantSpec(Spec):
-    """The case with other values: what 'python -m benchmarks cases' runs beside it."""
+    """A variant of the case with other values, run by 'python -m benchmarks cases'."""
 
     name: Name
     set: dict[str, Any] = Field(default_factory=dict)
@@ -530,7 +530,7 @@ Law: TypeAlias = Annotated[
 
 
 class BoundarySpec(Spec):
-    """A boundary: its value, or what passes through it; each a number, a channel or an unknown."""
+    """A boundary: its value, or the flux through it; each a number, a channel or an unknown."""
 
     value: Quantity | None = None
     flux: Quantity | None = None

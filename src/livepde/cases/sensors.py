@@ -50,7 +50,7 @@ INTERPOLATED = ("interpolate", "interpolate-exact")
 
 
 def columns_of(frame: Frame) -> dict[str, Column]:
-    """Return channel -> where it comes from in the data."""
+    """Return channel -> its column in the data."""
     found = {}
     for name, channel in frame.spec.channels.items():
         unit = frame.unit(name)
@@ -191,7 +191,7 @@ def _part(
 
 
 def _reconstruction(frame: Frame) -> Reconstruction:
-    """Return how the observed part is reconstructed: what law.tikhonov says."""
+    """Return the reconstruction of the observed part, by the key law.tikhonov."""
     law = frame.spec.law
     given = law.tikhonov if isinstance(law, GradientSpec) else False
     if given is False:

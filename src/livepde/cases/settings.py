@@ -134,7 +134,7 @@ def _key(name: str) -> str:
 
 
 def _text(value: str) -> str:
-    """Return a basic string: what TOML escapes, and nothing else."""
+    """Return a basic string of TOML, with only the characters escaped that need it."""
     escapes = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
     shown = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08x}") for c in value)
     return f'"{"".join(shown)}"'

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 __all__ = ["Data", "limits_of", "policy_of", "publishers_of", "source_of", "source_text"]
 
 LOG = logging.getLogger("livepde.run")
-LEAP = "30 d"  # a process that was away for longer needs a second row that says so
+LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 
 Data: TypeAlias = str | Iterable[str] | Source | None  # a file, lines of JSON, or the case's own
 
 
 def source_of(frame: Frame, data: Data, position: str) -> Source:
-    """Return where the rows of a case come from, from a position on."""
+    """Return the source of the rows of a case, from a position on."""
     spec = frame.spec.data
     if isinstance(data, Iterable) and not isinstance(data, str):
         return Lines(data)
@@ -73,7 +73,7 @@ def publishers_of(frame: Frame) -> list[Sink]:
 
 
 def source_text(frame: Frame) -> str:
-    """Return in words where the rows of a case come from."""
+    """Return a description of the source of the rows of a case."""
     spec = frame.spec.data
     if spec.mqtt is not None:
         topics = ", ".join([*spec.mqtt.rows, *spec.mqtt.columns])
@@ -124,7 +124,7 @@ def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
 
 
 def policy_of(frame: Frame) -> Policy:
-    """Return the policy for rows that are late, doubled or incomplete."""
+    """Return the policy for rows that are late, repeated or incomplete."""
     spec, unit = frame.spec.intake, frame.equation.time_unit
 
     def duration(value: float | str, key: str) -> float:

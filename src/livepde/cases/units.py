@@ -119,7 +119,8 @@ def convert(value: float | str, unit: str, where: str, *, difference: bool = Fal
     where
         File and key, for the message.
     difference
-        A difference of two values, such as a deviation: the zero of temperature scales drops out.
+        A difference of two values, such as a standard deviation: the offset of temperature scales
+        drops out.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Look at a case before it runs: model, data, and what its sensors can tell."""
+"""Check of a case before a run: model, data, and identifiability by its sensors."""
 
 from __future__ import annotations
 

@@ -209,7 +209,7 @@ def _read(path: Path) -> list[Member]:
 def _each(
     run: Runs, rows: Sequence[Member], jobs: int, backend: Backend | None
 ) -> tuple[list[Ended], list[str], pd.DataFrame]:
-    """Run all members; return how they ended, notes on lost workers, and the summary.
+    """Run all members; return their outcomes, notes on lost workers, and the summary.
 
     The summary is written also if an error or Ctrl-C ends the command.
     """

@@ -132,19 +132,19 @@ class _Heartbeat:
         LOG.info("t = %g: %s", estimate.t, shown or estimate.status.code)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: there are no resources to release."""
 
 
 def _observers(
     case: Case, how: Beside, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
 ) -> list[Sink]:
-    """Start what looks at the run, and return the sinks that it needs."""
+    """Start servers and outputs of a live run, and return their sinks."""
     from livepde.runs.web import Address
 
     if how.page is not None:
         from livepde.dashboard import check_installed
 
-        Address.read(how.page, 0, how.token)  # what is wrong with it is said before all else
+        Address.read(how.page, 0, how.token)  # an invalid address is reported before all else
         check_installed()
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:

@@ -32,7 +32,7 @@ __all__ = [
 
 
 class EngineName(StrEnum):
-    """What solves large systems."""
+    """Solvers of large systems."""
 
     own = "own"
     petsc = "petsc"

@@ -46,7 +46,7 @@ def in_parts(
     run
         Function of the rows of a part; both are sent to workers, where their paths must be valid.
     jobs
-        Number of parallel processes; -1 for one on each processor. Dask takes all workers of its
+        Number of parallel processes; -1 for one on each processor. Dask uses all workers of its
         cluster.
     backend
         Backend of joblib; None: that of the surrounding `joblib.parallel_config`, else loky.
@@ -121,7 +121,7 @@ def _configure(backend: Backend, stack: ExitStack) -> None:
             raise ConfigurationError(
                 "--backend ray needs Ray: pip install ray, here and on its nodes."
             ) from error
-        register_ray()  # type: ignore[no-untyped-call,unused-ignore]
+        register_ray()
     if backend is Backend.dask:
         try:
             import distributed

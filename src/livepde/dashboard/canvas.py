@@ -82,7 +82,7 @@ def empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figure
 
 
 def over_time(data: xr.Dataset, ylabel: str, at: float | None) -> tuple[go.Figure, TimeAxis]:
-    """Return a figure over time with what happened: jumps, and the time that is looked at."""
+    """Return a figure over time with marks at jumps and at the selected time."""
     axis = when_axis(data)
     figure = empty("" if axis.dates else labelled("time", axis.unit), ylabel)
     figure.update_xaxes(type="date" if axis.dates else "linear")
@@ -119,7 +119,7 @@ def band(
     name: str,
     opacity: float = 0.2,
 ) -> None:
-    """Fill what lies between two lines."""
+    """Fill the area between two lines."""
     shared: dict[str, Any] = {
         "mode": "lines",
         "line": {"width": 0, "color": colour},

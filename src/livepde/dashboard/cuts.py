@@ -1,7 +1,7 @@
 """Fields on meshes as pictures: maps of plane domains, surfaces and slices of solid ones.
 
-What depends on the mesh only is found once: matrices that take values at the vertices to values
-where they are drawn.
+Results that depend on the mesh only are cached: matrices that interpolate values at the vertices to
+the drawn points.
 """
 
 from __future__ import annotations

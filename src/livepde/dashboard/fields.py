@@ -23,7 +23,7 @@ OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to b
 
 
 def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], str]:
-    """Return what draws a field, and how to read it."""
+    """Return the function that draws a field, and a hint for its caption."""
     if "z" in data.coords:
         hint = f" Surface, seen through, and three cuts at {cut:.0%} of its size: drag to turn."
         return partial(field_solid, cut=cut), hint

@@ -204,7 +204,7 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
 
 
 def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
-    """Draw the share of the prior deviation that is left of each unknown."""
+    """Draw the remaining share of the prior standard deviation of each unknown."""
     known = dict(reversed(open_shares(data, at).items()))
     figure = empty("prior standard deviation left [%]", height=max(170, 90 + 26 * len(known)))
     shares = [100.0 * left for left in known.values()]

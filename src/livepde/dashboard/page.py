@@ -102,7 +102,7 @@ def _skeleton() -> Any:
 
 
 def _timebar() -> Any:
-    """Return what looks back, and moves the cuts through solids."""
+    """Return the slider that selects the time, and that of the cuts through solids."""
     return html.Div(
         [
             html.Label("Look back", htmlFor="slider", id="slider-label"),

@@ -57,16 +57,16 @@ NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of cell.
+    """A kind of mesh cell.
 
     Attributes
     ----------
     dimension, role
-        Of the mesh, and what UGRID calls such a cell.
+        Dimension of the mesh, and name of such a cell in UGRID.
     edges
         Corners to which the edges lead from the first one, in an order that turns right-handed.
     turned
-        The corners of a cell that turns the other way, in the right order.
+        Order of the corners that corrects a cell of the opposite orientation.
     """
 
     dimension: int

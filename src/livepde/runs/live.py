@@ -74,6 +74,7 @@ class Backlog:
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
         elif waiting:
+            # A dropped sample may demand that earlier ones are withdrawn; the next inherits that.
             waiting[0] = replace(waiting[0], since=_since([*oldest, waiting[0]]))
         return oldest
 
@@ -175,6 +176,7 @@ class Live:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.identifier = identifier
+        # A journal without an intact checkpoint is taken again from this state.
         self._begun = identifier.dump()
         self.feed = feed
         self.journal = journal
@@ -269,6 +271,7 @@ class Live:
         for event in self._events:
             self.journal.note(event)
         written = Counter(self.journal.counts)
+        # Committed counts have survived, so only the difference is written again.
         lost = self._counts - written
         lost.pop(("aside", ""), None)  # counted when it was set aside again
         self._counts = written + lost
@@ -365,6 +368,7 @@ class Live:
             if self.waits and not self._waiting:
                 self._settle()  # readers see all estimates before the run waits for rows
             if self.backlog.has_room(self._waiting):
+                # Samples at hand must not wait for the source; an idle run still checks `stopping`.
                 self._waiting.extend(self.feed.poll(0.0 if self._waiting else LOOK))
                 self._listen(self.feed.heard())
             self._relieve()
@@ -543,6 +547,7 @@ class Live:
         except RunError:  # of the journal
             raise
         except Exception as error:
+            # A failure of the numerics belongs to this sample; any other is an error in the code.
             if self.strict and numerical(error) is None:
                 raise
             # A step that fails midway may have changed a part of the identifier.

@@ -11,7 +11,7 @@ __all__ = ["configure"]
 
 
 def configure(kind: str = "text", level: int = logging.INFO) -> None:
-    """Write what livepde says to standard error; of other libraries only warnings.
+    """Configure logging to standard error: messages of livepde, and warnings of other libraries.
 
     The loggers are livepde.run, livepde.mqtt and livepde.opcua. An event of the run has the fields
     kind, channel and t in JSON.
@@ -21,12 +21,12 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     kind
         "text", or "json": one object for each line, with the time in UTC.
     level
-        From which level on.
+        Lowest level of the messages of livepde.
 
     Raises
     ------
     RunError
-        What writes JSON is not installed.
+        The package python-json-logger is not installed.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -44,5 +44,5 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
         handler.setFormatter(lines)
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("livepde").setLevel(level)
-    # It tells of each lost connection with a traceback; livepde.opcua says so in one line.
+    # asyncua logs each lost connection with a traceback; livepde.opcua logs it in one line.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)

@@ -23,8 +23,8 @@ class Metrics:
     """Estimates as Prometheus metrics; a sink of a run.
 
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
-    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds what its
-    run's health says: `livepde_ok`, `livepde_unwell{why}`, `livepde_silent`,
+    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds the
+    health of its run: `livepde_ok`, `livepde_unwell{why}`, `livepde_silent`,
     `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
     `livepde_remarks_total{kind, channel}`.
 

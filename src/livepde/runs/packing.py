@@ -30,7 +30,7 @@ def packed(snapshot: Snapshot) -> bytes:
 
 
 def unpacked(content: bytes) -> Snapshot:
-    """Return a snapshot from what `packed` returned; raises one of many errors if it is not."""
+    """Return the snapshot in the bytes of `packed`; raises one of many errors on other bytes."""
     text, body = content.split(b"\0", 1)
     head = json.loads(text)
     sizes = [*head["profiles"].values()]

@@ -31,9 +31,10 @@ class PendingConnections:
     Parameters
     ----------
     serve
-        Takes a connection of cheroot whose request is there.
+        Function that serves a connection of cheroot whose request has arrived.
     refusal
-        Header of a request, as `environ_of` gives it -> why it is refused; empty: it is not.
+        Function of the header of a request, as `environ_of` returns it, that returns the reason of
+        a refusal; empty: the request is served.
     timeout
         Seconds that reading and writing may take where a connection is served.
     """

@@ -45,7 +45,7 @@ CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", R
 
 
 def digits(value: float, std: float) -> tuple[str, str]:
-    """Return value and deviation as text, both to the second digit of the deviation.
+    """Return value and standard deviation as text, both to the second digit of the latter.
 
     >>> digits(2.7344, 0.0261)
     ('2.734', '0.026')
@@ -183,8 +183,8 @@ def _deviations(data: xr.Dataset, label: str) -> float:
 def measures(data: xr.Dataset) -> dict[str, float]:
     """Return the numbers of a run for which a case may state expected bounds, by name.
 
-    Each scalar unknown by its label; with `.std` its standard deviation, and where there is a
-    reference with `.error` the relative error and with `.deviations` the distance from the
+    Each scalar unknown by its label; with `.std` its standard deviation, and if it has a
+    reference, with `.error` the relative error and with `.deviations` the distance from the
     reference in standard deviations;
     `rmse` one-step, of all sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`,
     `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to their expected square;
@@ -283,13 +283,13 @@ def tables(data: xr.Dataset) -> list[Table]:
 
 
 def _left_out(data: xr.Dataset, name: str) -> str:
-    """Return the share of the mean variance of a field that is of modes that the law leaves out."""
+    """Return the share of a field's mean variance in modes that the law leaves out, as text."""
     share = float(data[f"{name}_left_out"][-1]) if f"{name}_left_out" in data else math.nan
     return shown(100 * share, ".2g", " %")
 
 
 def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
-    """Return how much the data have told of each unknown."""
+    """Return the table of remaining shares of the prior standard deviation of each unknown."""
     rows: list[tuple[Any, ...]] = []
     for label in labels:
         attrs, left = data[label].attrs, data.get(f"{label}_left")
@@ -320,7 +320,7 @@ def _share(left: float) -> str:
 
 
 def _traded(data: xr.Dataset, label: str) -> list[str]:
-    """Return the numbers of which the data tell only a combination with this one."""
+    """Return the unknowns of which the data determine only a combination with this one."""
     if "correlation" not in data or data["correlation"].dims != ("unknown", "other"):
         return []
     names = [str(name) for name in data["unknown"].values]
@@ -329,7 +329,7 @@ def _traded(data: xr.Dataset, label: str) -> list[str]:
 
 
 def _jumped(data: xr.Dataset) -> Table:
-    """Return when something jumped, and what moved then."""
+    """Return the table of jumps: times, and unknowns that moved."""
     rows: list[tuple[Any, ...]] = []
     for jump in jumps(data):
         at = when(data, jump.t)

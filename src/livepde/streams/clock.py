@@ -238,7 +238,7 @@ def _known_formats() -> Iterator[str]:
 
 
 def guessed_format(text: str) -> str:
-    """Return in which format a text may be a date; empty if none is known.
+    """Return the format in which a text may be a date; empty if none is known.
 
     >>> guessed_format("01.04.2025 12:00"), guessed_format("noon")
     ('%d.%m.%Y %H:%M', '')
@@ -256,7 +256,7 @@ def origin_at(stamp: float) -> datetime:
 
 
 def since_1970(origin: datetime) -> float:
-    """Return the seconds since 1970 of what `origin_at` returned."""
+    """Return the seconds since 1970 of a date in UTC without a zone, as of `origin_at`."""
     return origin.replace(tzinfo=UTC).timestamp()
 
 

@@ -37,7 +37,7 @@ BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .
 
 @dataclass(frozen=True)
 class Written:
-    """How a CSV file seems to be written, and how it begins.
+    """The detected format of a CSV file, and its first rows.
 
     Attributes
     ----------
@@ -46,8 +46,8 @@ class Written:
     skip
         Lines before the header: titles.
     time_formats
-        In which its dates may be written, if they are not in ISO format: more than one where the
-        order of day, month and year cannot be known.
+        Possible formats of its dates, if they are not in ISO format: more than one if the order of
+        day, month and year is ambiguous.
     header, rows
         Cells of the header, and of the first rows.
     """

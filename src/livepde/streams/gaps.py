@@ -394,7 +394,7 @@ def _plausible(past: Series, later: Series, beyond: float) -> Series:
 
 
 def _with(sample: Sample, values: Mapping[str, float]) -> Sample:
-    """Return a sample with other values of some channels, where they stood before."""
+    """Return a sample with other values of some channels, in z or inputs as before."""
     inputs = None if sample.inputs is None else dict(sample.inputs)
     if not isinstance(sample.z, Mapping):
         return Sample(sample.t, sample.z, {**(inputs or {}), **values})

@@ -308,6 +308,7 @@ class Intake:
             self._refuse_leap(found)
         if self.past is not None and self._late(held.t):
             return self._pends(held, self.past, found)
+        # A row in order interrupts a sequence of late ones, which is too short to be believed.
         self._give_up(found)
         return self._placed(held, found)
 
@@ -425,6 +426,7 @@ class Intake:
 
     def _go_back(self, earlier: list[float], found: IntakeOutcome) -> None:
         """Drop open samples, and mark released ones later than the first waiting row as wrong."""
+        # Open samples are later than the late rows, so they have times of the wrong clock, too.
         for sample in self._open.values():
             found.spent += sample.tokens
         self._open.clear()
@@ -442,6 +444,7 @@ class Intake:
         found = IntakeOutcome()
         self._refuse_leap(found)
         self._give_up(found)
+        # With an infinite newest time no sample waits any longer.
         self._newest = math.inf
         self._release(found)
         return found
@@ -484,6 +487,7 @@ class Intake:
             if value < low or value > high:
                 text = f"{value:g} is not between {low:g} and {high:g}"
                 found.remark("invalid", channel, text)
+                # Missing, not absent: the channel has come, and the sample must not wait for it.
                 value = math.nan
             values[channel] = value
         return values
@@ -568,6 +572,7 @@ class Intake:
         """Interpolate gaps of a sample, and refuse its spikes, where later values are known."""
         for channel in self.columns:
             habit = self.policy.habit(channel)
+            # A sample that does not wait is released before any later value has come.
             waited = max(self.policy.wait, habit.wait) > 0.0
             if not (waited and (habit.interpolated or habit.screened)):
                 continue

@@ -115,7 +115,7 @@ class Broker:
 
 
 class _Peer:
-    """A client that comes back when the broker does; what happens to it is logged."""
+    """A client that reconnects to its broker, and logs losses of the connection."""
 
     def __init__(self, broker: Broker, suffix: str = "") -> None:
         self._broker = broker

@@ -31,21 +31,21 @@ class OpcuaSource:
     """Rows from nodes of a server, one for each change of a value.
 
     A row has the time at which the server's source saw the change, as a date. A value whose status
-    is not good is a broken row. A value that does not change is not sent: nothing comes then. What
-    changes while the server cannot be reached is not seen; it is asked for again until it is back.
+    is not good is a broken row. A constant value is sent only once. Changes while the server cannot
+    be reached are lost; the source tries to reconnect until the server is back.
 
     Parameters
     ----------
     url
-        Where it listens: opc.tcp://HOST:PORT/...
+        Address of the server: opc.tcp://HOST:PORT/...
     columns
         Node -> column, as {"ns=2;s=T_05": "T_05"}.
     time
         Name of the time column.
     interval
-        Seconds between two looks of the server at its values.
+        Sampling interval of the server, in seconds.
     username, password
-        If it asks for them; the password is never written anywhere.
+        Login, if the server requires one; the password is never written anywhere.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class OpcuaSource:
             runner.run(self._stay())
 
     async def _stay(self) -> None:
-        """Listen, and come back when the server does."""
+        """Listen, and reconnect when the connection is lost."""
         from asyncua.ua.uaerrors import UaError
 
         while not self._stop.is_set():
@@ -176,7 +176,7 @@ class OpcuaSource:
 
     @property
     def done(self) -> bool:
-        """A server never says that nothing more will come."""
+        """False: the data of a server never end."""
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
@@ -185,7 +185,7 @@ class OpcuaSource:
         Raises
         ------
         DataError
-            The connection has broken down in a way that was not foreseen.
+            The thread of the connection has ended by an unforeseen error.
         """
         broken = not self._thread.is_alive()  # asked first: its last rows come before the error
         rows = drained(self._rows, wait)

@@ -202,7 +202,7 @@ class Smoothed(Iterable[Sample]):
 
 
 class _NoiseLevel:
-    """Standard deviation of white noise from values beside the line between their neighbours."""
+    """Standard deviation of white noise, by residuals to the line between the neighbours."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         # The last two values of each channel and their times, the older one first.
@@ -212,7 +212,7 @@ class _NoiseLevel:
         self.counts = np.zeros(shape)
 
     def add(self, t: float, z: Array) -> Array:
-        """Take one sample and return the deviation so far, NaN where it is not known yet."""
+        """Take one sample and return the standard deviation so far, NaN where it is unknown."""
         present = np.isfinite(z)
         share = (self.t[1] - self.t[0]) / (t - self.t[0])
         rest = self.z[1] - (1.0 - share) * self.z[0] - share * z
@@ -325,8 +325,8 @@ class WindowAverage(_WindowSmoother):
     """The mean over the samples of (t - width, t].
 
     Exact for constants. Lag: t_k minus the mean of their times, half the width for equidistant
-    samples; a linear trend comes late by that much. The deviation of the noise falls with the root
-    of the number of samples.
+    samples; a linear trend is delayed by it. The standard deviation of the noise falls with the
+    root of the number of samples.
 
     >>> stage = WindowAverage(3.0, noise=1.0)([(0, [0.0]), (1, [1.0]), (2, [2.0]), (3, [3.0])])
     >>> [float(sample.z[0]) for sample in stage], stage.std.round(3).tolist()

@@ -114,10 +114,9 @@ def _names(cells: list[str]) -> list[str]:
 class Follow:
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
-    A line counts when it is ended. A file that is replaced by another (logs are rotated so) is read
-    to its end before the new one; one that has become shorter is read from its start: samples that
-    are known are late then. What still waited of a file that has lost its name is not found again
-    after a crash.
+    A line is read once its end has been written. A file that is replaced by another (rotated logs)
+    is read to its end before the new one; one that has become shorter is read again from its start,
+    where known samples are late. Unread rows of a file that was renamed are lost after a crash.
 
     Parameters
     ----------
@@ -128,7 +127,7 @@ class Follow:
     follow
         Wait for more at the end of the file.
     position
-        As the method `position` returned it. In another file than that it was of, all is read.
+        Return value of the method `position`. Another file is read from its start.
     """
 
     def __init__(

@@ -47,21 +47,21 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "
 
 @dataclass(frozen=True)
 class Column:
-    """Where a channel comes from: value = factor * (mean of the columns) + offset.
+    """Columns and scale of a channel: value = factor * (mean of the columns) + offset.
 
     Several columns are averaged; where one of them is missing, so is the channel.
 
     Attributes
     ----------
     valid
-        A value outside is missing.
+        Range of valid values; a value outside is missing.
     needed
-        A sample without this channel is left out.
+        Whether samples without this channel are left out.
     decimal
-        Of numbers as text: "." or ",".
+        Decimal mark of numbers as text: "." or ",".
     noise_of
-        Channel whose readings have this standard deviation; "": none. One that is not positive
-        makes the reading missing; where it is missing itself, that of the sensor counts.
+        Channel whose readings have this standard deviation; "": none. A value that is not
+        positive makes the reading missing; a missing one is replaced by that of the sensor.
     """
 
     names: tuple[str, ...]

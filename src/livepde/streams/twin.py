@@ -53,7 +53,7 @@ class RelativeNoise(Noise):
     Every channel takes the same share of the mean square, whatever its unit:
     std_k = level ||z||_Z / sqrt(sensors · weights_kk). In R^k with the Euclidean norm that is
     level times the root mean square of z; for the slopes of Hermite elements it is about 1/h times
-    the deviation of the values, as if they had been taken by differences of them.
+    the standard deviation of the values, as if slopes were differences of values.
     """
 
     level: float
