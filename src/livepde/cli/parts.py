@@ -121,7 +121,7 @@ def _configure(backend: Backend, stack: ExitStack) -> None:
             raise ConfigurationError(
                 "--backend ray needs Ray: pip install ray, here and on its nodes."
             ) from error
-        register_ray()
+        register_ray()  # type: ignore[no-untyped-call,unused-ignore]
     if backend is Backend.dask:
         try:
             import distributed
