@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and never where a link leads."""
+"""Atomic writes: a file appears complete or not at all, and a link at its path is not followed."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ PARTIAL = ".partial"  # how the name of a file ends that is being written
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a new file of its own beside a path, which takes the name when all went well.
+    """Yield a new temporary file beside a path, renamed to it if the block raises nothing.
 
-    Nobody else can have made it, nor a link of its name: it is made exclusively, with a random
-    name. What stands at the path, a link also, is replaced itself.
+    The file is created exclusively (O_EXCL) under a random name, so that neither a file nor a link
+    of another process can be opened in its place. An existing file or symbolic link at the path is
+    itself replaced.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{PARTIAL}")
     os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
@@ -32,7 +33,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes, *, sync: bool = False) -> None:
-    """Write a file; with `sync` it is on disk before it has its name."""
+    """Write a file atomically; with `sync` its content is flushed to disk before the rename."""
     with replacing(path) as partial, partial.open("wb") as file:
         file.write(content)
         if sync:

@@ -3,7 +3,7 @@
 ::
 
     LivepdeError
-    ├── ConfigurationError          what was built or asked for does not fit together
+    ├── ConfigurationError          parts or options that do not fit together
     │   ├── SpaceError              mesh, element, inner product, prior
     │   ├── ModelError              weak forms and their arguments
     │   │   └── NameClashError      a name that stands for two things in a run's dataset

@@ -53,15 +53,15 @@ class Identifier:
     model
         The process.
     observation
-        What the assimilated sensors see.
+        Observation by the assimilated sensors.
     law
-        How estimates are updated.
+        Update law of the estimates.
     q0, u0
-        Where to start: numbers, functions of x, coefficients, or for several unknowns a mapping.
-        q0 defaults to the prior mean, u0 to what the model says (`initial`), else zero.
+        Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
+        q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
     t0
         Initial time. A first sample at exactly t0 describes the start and takes no step; a law
-        may learn from it what is unknown there.
+        may update the unknowns of the initial state by it.
     withheld
         Sensors that are never assimilated, only scored.
     scheme, dt_max
@@ -74,15 +74,16 @@ class Identifier:
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
     hold
-        Whether inputs are held between samples at what the later one brings, as an actuator that
-        is set anew at each sample leaves them; else they change linearly.
+        True: zero-order hold, inputs have the value of the later sample over the whole interval, as
+        for an actuator that is set anew at each sample; False: they change linearly.
     input_noise
         Channel of the model -> standard deviation of its noise, independent from sample to sample:
         it makes the state less certain, for laws that have a covariance.
     u0_from
-        Channel -> how u0 changes with its reading at t0, as u0 is given (a function of x, say): for
-        a u0 that was made of readings. Their noise is that of the start then, and they are not
-        assimilated once more. A pair (how, standard deviation): the noise of this reading.
+        Channel -> derivative of u0 in its reading at t0, in a form as that of u0 (a function of x,
+        say): for a u0 that was made of readings. Their noise becomes the uncertainty of u0, and
+        they are not assimilated once more. A pair (derivative, standard deviation) states the noise
+        of this reading.
 
     Raises
     ------
@@ -191,7 +192,7 @@ class Identifier:
         return dict(given)
 
     def initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
-        """Return the readings that u0 was made of; the way u0 changes with them as coefficients."""
+        """Return the readings that u0 was made of, each with the derivative of u0 in it."""
         known = {*self.observed.names, *self.model.channels}
         for name in u0_from:
             if name not in known:
@@ -321,9 +322,9 @@ class Identifier:
         self._state, self._inputs = state, inputs
 
     def _stepped(self, interval: Interval) -> tuple[Any, Report]:
-        """Return state and report after a sample; the state of before where numbers fail.
+        """Return state and report after a sample; the state before it after a numerical failure.
 
-        Numbers fail where an operation raises, and where what the law believes then is not finite,
+        A numerical failure is an operation that raises, or a belief of the law that is not finite,
         be it only the squares of its numbers.
         """
         before, t0, t1 = self._state, interval.t0, interval.t1
@@ -351,12 +352,12 @@ class Identifier:
 
     @property
     def place(self) -> tuple[Any, ...]:
-        """Where it stands, for `return_to`; holds what a step does not change."""
+        """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
         ledgers = self._withheld, self._gaps
         return self._state, self._t, self._z, self._inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
-        """Stand again where it stood, as if nothing had been taken since then."""
+        """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
         self._withheld, self._gaps = ledgers
 
@@ -381,7 +382,7 @@ class Identifier:
         return self.problem.physical(self.latent_belief())
 
     def _reader(self) -> Callable[[], Belief]:
-        """Return a function that gives what the law believes now, of the physical parameter."""
+        """Return a function that gives the current belief of the law, of the physical parameter."""
         read, problem = self.law.reader(self._work, self._state), self.problem
         return read if self.model.latent.plain else lambda: problem.physical(read())
 
@@ -419,7 +420,7 @@ class Identifier:
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
-        """Return the variance of what withheld sensors are predicted to show, without noise."""
+        """Return the variance of the predicted values of withheld sensors, without their noise."""
         if self.withheld is None or belief.u_factor is None or belief.q_factor is None:
             return np.zeros(self._withheld.last.shape)
         H_u, H_q = self.withheld.jacobian(belief.u, belief.q, moment)
@@ -463,10 +464,10 @@ class Identifier:
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
     def settled(self, estimate: Estimate) -> Estimate:
-        """Return the last estimate with parameter and state after what the law does in parts.
+        """Return the last estimate with parameter and state after the law's work in parts.
 
-        For the end of a run: of a replay in slices, say. The identifier does not change: the next
-        sample finds it as it was.
+        For the end of a run: such work is a replay in slices, say. The identifier does not change:
+        the next sample finds it as it was.
         """
         state = self.law.settled(self._work, self._state)
         if state is self._state:
@@ -477,16 +478,16 @@ class Identifier:
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return predicted readings if nothing more is measured; nothing is learned.
 
-        Unknowns that evolve go on as their prior says, and deviations grow with them.
+        Unknowns that evolve follow their prior, and standard deviations grow with them.
 
         Parameters
         ----------
         times
-            Later than the last sample and increasing; the first may be its time, for what the
-            sensors show now.
+            Later than the last sample and increasing; the first may be the time of this sample, for
+            the readings at present.
         inputs
-            Channel -> its value, or one for each time. What is missing (left out, NaN) holds its
-            last value; the position of a moving sensor only at the time of the last sample.
+            Channel -> its value, or one for each time. A missing value (left out, NaN) is the last
+            one held; the position of a moving sensor only at the time of the last sample.
 
         Raises
         ------
@@ -546,8 +547,8 @@ class Identifier:
         stream
             (t, z), (t, z, inputs), or `Sample` items.
         on_estimate
-            Called with each estimate before the next sample is asked for: a controller, say. What
-            it returns is ignored, what it raises ends the run.
+            Called with each estimate before the next sample is asked for: a controller, say. Its
+            return value is ignored; an exception ends the run.
         progress
             Show a bar with rate and time left.
         total
@@ -588,7 +589,7 @@ class Identifier:
         Returns
         -------
         smoothed
-            As `Result.to_xarray` of the run, without innovations and notes. What is constant has
+            As `Result.to_xarray` of the run, without innovations and notes. A constant unknown has
             one value at all times: the last one.
 
         Raises
@@ -670,7 +671,7 @@ class Identifier:
         self.restore(checkpoint.read(path), str(path))
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from what `dump` returned; `where` names it in messages. Raises as `load`."""
+        """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         mine = self._fingerprint()
         for key, value in mine.items():
@@ -707,7 +708,7 @@ class Identifier:
 
 
 def _quiet() -> np.errstate:
-    """Return a context in which NumPy does not warn: what overflows is found in the result."""
+    """Return a context in which NumPy does not warn: an overflow is detected in the result."""
     return np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 

@@ -94,7 +94,7 @@ class Model:
         The field u, or a mapping of names to fields on one mesh, which forms see as u.c, v.c and so
         on; Dirichlet values may be numbers, functions g(x, t) or channels.
     parameter
-        What is unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
+        The unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
     A
         Integrand (q, u, v, x), linear in v; for a mapping of unknowns `q.name`. Whether it is
         linear in q is found out; all of the residual may stand here.
@@ -464,7 +464,7 @@ class Model:
 
     @cached_property
     def homogeneous(self) -> bool:
-        """True if every Dirichlet value is the number 0: what is zero there stays so."""
+        """True if every Dirichlet value is the number 0: zero boundary values stay zero."""
         fields = [block.field for block in self.state_space.fields.values()]
         values = [value for field in fields for value in field.boundary_values]
         return all(isinstance(value, int | float) and value == 0.0 for value in values)

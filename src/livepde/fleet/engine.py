@@ -45,14 +45,14 @@ class Factors:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What is believed of all members, of the physical parameter; see `livepde.laws.Belief`.
+    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`.
 
     Attributes
     ----------
     q, u
         Shapes (members, m) and (members, n).
     q_std
-        Deviations of q, or None if the law has none.
+        Standard deviations of q, or None if the law has no covariance.
     factors
         Covariances; None where members step separately, each with its own.
     """
@@ -64,7 +64,7 @@ class Beliefs:
 
 
 class FleetEngine(Protocol):
-    """Steps all members. A state is a value: what was returned is not changed any more."""
+    """Abstract stepper of all members. A state is a value: a returned state never changes."""
 
     def subset(self, which: IntArray) -> FleetEngine:
         """Return a stepper of some members, by number."""
@@ -79,11 +79,11 @@ class FleetEngine(Protocol):
         ...
 
     def step(self, state: State, span: Span) -> tuple[State, MemberReports]:
-        """Return the state at the end of a span; that of a failed member is the old one."""
+        """Return the state at the end of a span, with that before it for members that failed."""
         ...
 
     def settled(self, state: State) -> State:
-        """Return the state after what the law does in parts; see `Law.settled`."""
+        """Return the state after the work that the law spreads over samples; see `Law.settled`."""
         ...
 
     def believed(self, state: State, k: int) -> Belief:

@@ -26,20 +26,20 @@ MEMBER = "member"  # dimension of the dataset
 
 @dataclass(frozen=True, eq=False)
 class FleetEstimate:
-    """What is known of all members at one time.
+    """Estimates of all members at one time.
 
     Attributes
     ----------
     t
         Time of the sample.
     members
-        Their names.
+        Names of the members.
     beliefs
-        Coefficients of parameter and state, and how well they are known.
+        Coefficients of parameter and state, and their covariances.
     innovation, withheld_error
         As for `Estimate`, shapes (members, sensors) and (members, withheld).
     statuses
-        How the step went for each member; unless ok, its q and u are those of its last good step.
+        Status of the step of each member; unless ok, its q and u are those of its last good step.
     steps
         Substeps taken, shape (members,).
     notes
@@ -49,7 +49,7 @@ class FleetEstimate:
     space
         The unknowns.
     belief
-        Number of a member -> what the law believes of it.
+        Function: number of a member -> its belief under the law.
     """
 
     t: float
@@ -109,7 +109,7 @@ class FleetEstimate:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """What is kept of an estimate: numbers, and no state."""
+    """Record of an estimate: numbers, and no state."""
 
     t: float
     parameters: Mapping[str, tuple[Array, Array]]

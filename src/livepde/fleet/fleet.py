@@ -162,7 +162,7 @@ class Fleet:
 
     @property
     def observed(self) -> Observed:
-        """What the assimilated sensors see."""
+        """Observation by the assimilated sensors."""
         return self._one.observed
 
     @property
@@ -326,9 +326,9 @@ class Fleet:
         return replace(estimate, beliefs=beliefs, belief=lambda k: self._believed(state, k))
 
     def identifier(self, member: str | int) -> Identifier:
-        """Return an identifier that goes on from where a member is, by name or number.
+        """Return an identifier that goes on from the state of a member, by name or number.
 
-        The fleet does not notice what becomes of it.
+        Steps of this identifier do not change the fleet.
         """
         k = member if isinstance(member, int) else self.members.index(member)
         state = None if self._state is None else self._engine.member(self._state, k)
@@ -477,7 +477,7 @@ class Fleet:
 
     @cached_property
     def fingerprint(self) -> dict[str, Any]:
-        """What a fleet must have in common with one whose state it takes over."""
+        """Properties that a fleet must share with the one whose checkpoint it takes over."""
         return {
             "format": FORMAT,
             "law": type(self.law).__name__,
@@ -515,7 +515,7 @@ class Fleet:
         self.restore(checkpoint.read(path), str(path))
 
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
-        """Continue from what `dump` returned; `where` names it in messages. Raises as `load`."""
+        """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         for key, value in self.fingerprint.items():
             if header.get(key) != value:

@@ -20,7 +20,7 @@ __all__ = ["FleetRecords"]
 
 @dataclass(frozen=True, eq=False)
 class _MemberRow:
-    """What is kept of an estimate, each array over members."""
+    """Record of an estimate, each array over members."""
 
     t: float
     numbers: Array
@@ -105,7 +105,7 @@ class FleetRecords:
         return (row.record(k) for row in self._rows)
 
     def clear(self) -> None:
-        """Let go of what was written."""
+        """Drop the rows, once they are written."""
         self._rows.clear()
         self.size = 0
 

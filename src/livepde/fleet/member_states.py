@@ -43,7 +43,7 @@ class OwnStates:
         return checkpoint.flatten(tuple(self._states))
 
     def restored(self, leaves: Mapping[str, Array]) -> OwnStates:
-        """Return what `leaves` gave; raises KeyError or ValueError if they do not fit."""
+        """Return the states from their `leaves`; raises KeyError or ValueError if they misfit."""
         other = OwnStates((self._template,), 0)
         each = range(len(self._states))
         other._states = [checkpoint.rebuild(self._template, leaves, f"state.{k}") for k in each]
@@ -124,7 +124,7 @@ class JoinedStates:
         return {"rows": self._rows, LOG: self._log, **self._leaves}
 
     def restored(self, leaves: Mapping[str, Array]) -> JoinedStates:
-        """Return what `leaves` gave; raises KeyError or ValueError if they do not fit."""
+        """Return the states from their `leaves`; raises KeyError or ValueError if they misfit."""
         other = JoinedStates(self._template, self._count)
         other._rows, other._log = leaves["rows"].astype(np.int64), leaves[LOG]
         other._leaves = {path: leaves[path] for path in self._leaves}

@@ -1,4 +1,4 @@
-"""Any law, member by member, with what is computed once computed once for all."""
+"""Any law, member by member, with its precomputed parts shared by all members."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["Separately"]
 
 
 class Separately:
-    """Steps members one after the other; the state is a tuple of the states of the law."""
+    """Stepper of members one after the other; the state is a tuple of the states of the law."""
 
     def __init__(self, law: AnyLaw, work: Any, problem: Problem) -> None:
         self.law = law

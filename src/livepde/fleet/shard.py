@@ -225,9 +225,9 @@ class Shard:
         return self._fleet.subset(which, state, samples)
 
     def identifier(self, member: str) -> Identifier:
-        """Return an identifier that goes on from where a member is; for forecasts and fields.
+        """Return an identifier that goes on from the state of a member; for forecasts and fields.
 
-        The shard does not notice what becomes of it.
+        Steps of this identifier do not change the shard.
         """
         # A copy, as states of the shard are written in place.
         return copy.deepcopy(self._subset(np.array([self._places[member]])).identifier(0))
@@ -247,7 +247,7 @@ class Shard:
         return checkpoint.packed(header, leaves)
 
     def load(self, content: bytes) -> None:
-        """Continue from what `dump` returned, with identical numbers, at its offset.
+        """Continue from the bytes of `dump`, with identical numbers, at its offset.
 
         The shard must be built as the one that was dumped.
 

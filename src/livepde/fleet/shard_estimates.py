@@ -30,12 +30,12 @@ class ShardEstimates:
     offset
         Place of the first sample in the log.
     member, t
-        Of each sample: name, and time as it was given, shape (samples,).
+        Name of the member, and time as it was given, of each sample, shape (samples,).
     q, q_std
         Coefficients of the parameter and their standard deviations, shape (samples, m); NaN in rows
         that were refused, and where the law has no covariance.
     innovation
-        Measurements less what was expected, shape (samples, sensors).
+        Measured minus predicted values, shape (samples, sensors).
     status
         "ok", "refused", or why the step failed, as `Status.code`.
     message

@@ -1,4 +1,4 @@
-"""One sample of every member: predict, refuse what is implausible, update, keep the statistics."""
+"""One sample of every member: predict, gate outliers, update, keep the innovation statistics."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fad
 
 @dataclass(frozen=True, eq=False)
 class MemberReports:
-    """What a step tells beside the new state.
+    """Report of a step of all members, beside the new state.
 
     Attributes
     ----------
     statuses
-        How it went for each member.
+        Status of the step of each member.
     predicted
-        What was expected of each sensor, shape (members, sensors).
+        Predicted value of each sensor, shape (members, sensors).
     steps
         Substeps taken, shape (members,).
     notes
@@ -75,12 +75,12 @@ class MemberReports:
 
 @dataclass(frozen=True, eq=False)
 class Assimilation:
-    """How a sample was assimilated.
+    """Outcome of the assimilation of a sample.
 
     Attributes
     ----------
     predicted
-        What was expected of each sensor, shape (members, sensors).
+        Predicted value of each sensor, shape (members, sensors).
     steps
         Substeps taken.
     status
@@ -134,7 +134,7 @@ def assimilate(
 def assimilate_at_once(
     filter_: Filter, x: FilterState, span: Span, options: UpdateOptions
 ) -> FilterState:
-    """Update by what was measured at the end of a span, to which the state belongs."""
+    """Update a state that belongs to the end of a span by the measurements there."""
     return _absorbed(filter_, x, span, options, 0)[0]
 
 
@@ -209,7 +209,7 @@ def _judged(
     predicted: Array,
     span: Span,
 ) -> FilterState:
-    """Return the state before an update with what the verdict keeps of the sample."""
+    """Return the state before an update, with the sample added to the sums of the verdict."""
     prior = filter_.problem.model.latent.prior
 
     def q() -> Array:
@@ -243,9 +243,9 @@ def _far(x: FilterState, e: Array, used: Mask, gate: float) -> Mask | None:
 def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:
     """Return evidence and noise level after a sample.
 
-    The level is found by expectation maximisation sample by sample: under the right one the mean
-    square of what an update leaves of a sample, with the variance that is left of its prediction,
-    is that of the noise, also while the unknowns are uncertain.
+    The noise level is found by expectation maximisation, sample by sample: under the right level
+    the mean square of the residual after an update, plus the posterior variance of the prediction,
+    is the variance of the noise, also while the unknowns are uncertain.
     """
     left = made.left
     logs = (np.log(noise) * used).sum(axis=1)

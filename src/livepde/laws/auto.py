@@ -90,11 +90,11 @@ class AutoLaw(Law[Bank, AutoState]):
     modes
         As for `SensitivityLaw`.
     noise
-        Standard deviation of the measurement noise; default what the observation says. The law
-        raises it where the innovations say so, and never lowers it: whoever states more than the
-        sensors have means the errors of the model, which look like little noise and are none.
-        Without either the level is free, and its first guess comes from differences of the first 12
-        samples, which are assimilated then.
+        Standard deviation of the measurement noise; default the noise of the observation. The law
+        raises this level where the innovations call for more, and never lowers it: a stated level
+        above the noise of the sensors is taken to allow for model errors, which look like little
+        noise and are none. Without any stated level it is free, and its first guess comes from
+        differences of the first 12 samples, which are assimilated then.
     replay
         Of the members whose unknowns stay; see `Replay`.
     gate, gate_patience, shadows
@@ -313,10 +313,11 @@ class AutoLaw(Law[Bank, AutoState]):
         return changed(state, members=members, weights=normalised(weights))
 
     def _woken(self, work: Bank, state: AutoState, alarm: bool) -> AutoState:
-        """Return the state with all drifts awake; what slept begins as a copy of the leader.
+        """Return the state with all drifts awake; sleeping members begin as copies of the leader.
 
-        After an alarm what was measured before tells of other unknowns: no replay goes back beyond
-        it, and the member with the wide prior, as it were anew, allows for a jump.
+        After an alarm the earlier measurements belong to other values of the unknowns: no replay
+        goes back beyond the alarm, and the member with the wide prior, begun again from an inflated
+        covariance, allows for a jump.
         """
         filters = work.filters(state.tick, state.noise)
         filter_ = filters.filter
@@ -453,7 +454,8 @@ class AutoLaw(Law[Bank, AutoState]):
         first = (each[0].prior_factor, each[0].rest)
         q_factor, u_factor = [], []
         for w, b in zip(np.sqrt(weights), each, strict=True):
-            # The differences of the means are no deviations that correlation inflates.
+            # The inflation by correlated innovations widens each member's own covariance; the
+            # spread of the means is added as it is.
             if b.q_factor is not None and b.u_factor is not None:
                 q_factor.append(w * np.column_stack([b.q_factor, b.q - q]))
                 u_factor.append(w * np.column_stack([b.u_factor, b.u - u]))
@@ -463,8 +465,8 @@ class AutoLaw(Law[Bank, AutoState]):
 def _tick(state: AutoState, interval: Interval) -> float:
     """Return the usual time between the first samples: a geometric mean, then fixed.
 
-    The time before the first of them does not count: what is as uncertain as the prior gains
-    nothing then.
+    The time before the first sample does not count: an unknown with the variance of its prior gains
+    no variance by drift.
     """
     h = interval.t1 - interval.t0
     if state.count < 2:

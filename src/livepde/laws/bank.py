@@ -32,14 +32,14 @@ SAME = 0.01  # divergence per coordinate, in nats, of members that say the same
 
 @dataclass(frozen=True)
 class Candidate:
-    """What a member of the bank assumes.
+    """Hypothesis of a member of the bank on the unknowns.
 
     Attributes
     ----------
     drift
         Variance of a gained from one sample to the next, relative to the prior's.
     scale
-        Factor on all prior deviations.
+        Factor on all prior standard deviations.
     chance
         Weight before the first sample, not normalised.
     """
@@ -58,7 +58,7 @@ CANDIDATES = (
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """What is computed once: the filter of all members, and what each candidate assumes.
+    """Parts computed once: the filter of all members, and the hypotheses of the candidates.
 
     Attributes
     ----------

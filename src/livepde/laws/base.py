@@ -44,14 +44,14 @@ REMEDIES = {
 
 @dataclass(frozen=True)
 class Status:
-    """How a step went.
+    """Status of a step: success or the kind of failure.
 
     Attributes
     ----------
     code
         "ok", "not_converged", "not_finite", "singular" or "departed".
     detail
-        What happened, empty if all is well.
+        Description of the failure; empty if the code is "ok".
     """
 
     code: str = "ok"
@@ -69,7 +69,7 @@ class Status:
 
     @property
     def remedy(self) -> str:
-        """What to do about it."""
+        """Remedy for this status, as a sentence."""
         return REMEDIES[self.code]
 
     @classmethod
@@ -98,7 +98,7 @@ class InitialReading(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A model and what is observed of it: where the two meet.
+    """An identification problem: the model and the sensors that observe its state.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Belief:
-    """What a law believes at one time.
+    """Estimates of a law at one time, with their covariance.
 
     Attributes
     ----------
@@ -170,8 +170,8 @@ class Belief:
         Square root of the covariance of q before the first sample, shape (m, k), its columns
         orthonormal in Q.
     rest
-        Standard deviation of each coefficient of q in the modes that the law leaves out, which stay
-        as the prior has them: independent of q_factor, shape (m,). None: 0.
+        Standard deviation of each coefficient of q in the modes that the law leaves out, which keep
+        their prior: independent of q_factor, shape (m,). None: 0.
     """
 
     q: Array
@@ -282,15 +282,15 @@ class Notes(Mapping[str, Value]):
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What a step tells beside the new state.
+    """Report of a step, beside the new state.
 
     Attributes
     ----------
     status
-        How it went; unless ok, the state is the one before.
+        Status of the step; unless ok, the state is the one before.
     predicted
-        What the law expected of each sensor before it used the sample, shape (sensors,); for a law
-        that has no such prediction, the output of its estimate.
+        Value of each sensor as predicted before the sample was used, shape (sensors,); for a law
+        without such a prediction, the output of its estimate.
     steps
         Substeps taken.
     notes
@@ -356,7 +356,7 @@ State = TypeVar("State")
 
 
 class Law(ABC, Generic[Work, State]):
-    """An update law: frozen configuration; what evolves is an explicit state value.
+    """An update law: a frozen configuration; the evolving part is an explicit state value.
 
     A law of your own is one class with these four methods. The state is a frozen dataclass of
     arrays and numbers: saving it is checkpointing. Identifiers share a law, and copies of an
@@ -400,9 +400,9 @@ class Law(ABC, Generic[Work, State]):
         """Return the state at the end of the interval; the old one if the step failed."""
 
     def settled(self, work: Work, state: State) -> State:
-        """Return the state after what `step` does in parts and has not ended; here the same.
+        """Return the state after the work that `step` has spread over samples; here the same state.
 
-        For the estimate at the end of a run: the run goes on from the state that it had.
+        For the estimate at the end of a run; the run itself goes on from the state that it had.
         """
         return state
 
@@ -411,9 +411,9 @@ class Law(ABC, Generic[Work, State]):
         return False
 
     def suspended(self, work: Work, state: State) -> State:
-        """Return the state without what `step` does in parts and has not ended; here the same.
+        """Return the state without work that `step` spreads over samples; here the same state.
 
-        For a forecast: it goes on from the estimate of now, as the next step does.
+        For a forecast, which goes on from the current estimate, as the next step does.
         """
         return state
 
@@ -443,9 +443,9 @@ class Law(ABC, Generic[Work, State]):
         return f"{type(self).__name__} steps one at a time"
 
     def finite(self, work: Work, state: State) -> bool:
-        """Return whether what is believed is finite, with its squares; here it is computed.
+        """Return whether the belief and its squares are finite; here the belief is computed.
 
-        A law whose belief is not cheap overrides this by the arrays that it is made of.
+        A law whose belief is not cheap overrides this by a test of the arrays behind it.
         """
         belief = self.belief(work, state)
         return finite(belief.q, belief.u, belief.q_factor, belief.u_factor)
@@ -457,8 +457,8 @@ class Law(ABC, Generic[Work, State]):
     def reader(self, work: Work, state: State) -> Callable[[], Belief]:
         """Return a function that gives `belief` when an estimate is read; here it is found at once.
 
-        Estimates are kept, and with them what such a function holds: a law overrides this where
-        that is not much more than the belief itself, and never changes afterwards.
+        Estimates are kept, and with them the data that such a function holds: a law overrides this
+        where these data are not much larger than the belief itself and never change afterwards.
         """
         belief = self.belief(work, state)
         return lambda: belief

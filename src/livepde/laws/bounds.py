@@ -209,7 +209,7 @@ class ExactBound(Damping):
     constants
         Of the model.
     p_bound
-        What ||p||_V^ stays below; 0 for full observation. The user's knowledge.
+        Upper bound of ||p||_V^, known to the user; 0 for full observation.
     c1
         As in `ResidualDamping`.
     floor
@@ -277,8 +277,8 @@ class NoisyBound(Damping):
     """The lower bound on mu for noisy data, ass:mu_nu (c1 = 0) and ass:mu_noisy.
 
     The paper's bound holds the true r. Online, ||r||_X <= ||r_alpha||_X + ||d||_X and
-    ||r||_VX~ >= ||r_alpha||_VX~ - ||d||_VX~ stand in for it, so the rule asks for at least what the
-    paper does, as long as the residual stands out of the noise. Where it does not, no theta
+    ||r||_VX~ >= ||r_alpha||_VX~ - ||d||_VX~ stand in for it, so the rule asks for at least the pull
+    of the paper, as long as the residual stands out of the noise. Where it does not, no theta
     satisfies the bound (condition (cond_d) fails as well), and the rule returns `theta_max`.
 
     Parameters

@@ -17,11 +17,12 @@ def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
     The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), with the prior inside: in
     units of the prior of this time P is the covariance of the filter, F = P^-1 - 1 the information
     of the samples, and lambda the square of `Innovations.inflation`, the factor by which a mean of
-    the innovations scatters more than the filter expects. A direction of which the share p of the
-    prior variance is left gets the variance p (p + lambda (1 - p)), and never more than its prior:
-    what no sensor sees is as well known as before, however wrong the sensors are.
+    the innovations scatters more than the filter expects. A direction with the remaining share p of
+    its prior variance gets the variance p (p + lambda (1 - p)), and never more than its prior: an
+    unobserved direction keeps its variance, however wrong the sensors are.
 
-    What is uncertain of the state beside the unknowns has no prior: it counts `lambda` times.
+    The uncertainty of the state beside the unknowns has no prior: its variance counts `lambda`
+    times.
     """
     inflation = x.innovations.inflation
     if (inflation == 1.0).all():

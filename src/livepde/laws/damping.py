@@ -1,7 +1,7 @@
 """Damping rules: how strongly the estimate is pulled to the observed state.
 
 The paper writes mu R M (r / ||r||_V~). At r = 0 that is 0/0, so a rule returns
-theta = mu / ||r||_V~, which multiplies R M r. A rule may use only what is known online.
+theta = mu / ||r||_V~, which multiplies R M r. A rule may use only quantities known online.
 """
 
 from __future__ import annotations

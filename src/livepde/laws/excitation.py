@@ -8,8 +8,9 @@ from sample to sample, and an excitation that is resolved in time is not: with t
     (a_k, a_{k-1}) / (|a_k| |a_{k-1}|)
 
 is about 1 for an excitation, and 0 for noise. For a process faster than the samples it may be 0,
-too. So |a|^2 must have fallen, and what is left of it must be noise. Noise is what the estimate u^
-does not follow from one sample to the next: with b_k of (A(w_k) e, p) - (A(u^_k) e, p) the mean of
+too. So |a|^2 must have fallen, and the rest of it must be noise. Noise is the change from one
+sample to the next that the estimate u^ does not follow: with b_k of (A(w_k) e, p) - (A(u^_k) e, p)
+the mean of
 
     |b_k - b_{k-1}|^2 / (|a_k|^2 + |a_{k-1}|^2)
 
@@ -91,7 +92,7 @@ class ExcitationGate:
         Parameters
         ----------
         a, followed
-            What the probes see at w and at the estimate, shape (PROBES,).
+            Values of the probes at w and at the estimate, shape (PROBES,).
         """
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
@@ -112,13 +113,13 @@ class ExcitationGate:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationLevel:
-    """How far what excites q is more than noise.
+    """Statistics of the excitation of q, to tell it from noise.
 
     Attributes
     ----------
     last, left, size
-        What the probes have seen in the last sample, and what of it the estimate did not follow,
-        shape (PROBES,); and the square of the first.
+        Values of the probes in the last sample, and their difference from those at the estimate,
+        shape (PROBES,); and the squared norm of the values.
     correlation, energy, correlated
         Fading means: of the correlation of successive samples, of the square, and of the product
         with the sample before, in which noise and outliers have little part.
@@ -146,8 +147,8 @@ class ExcitationLevel:
 class Probes:
     """(A(w) e_k, p_k) for fixed random pairs: e_k in the unit balls of Q, p_k = R p_k.
 
-    p_k minimises a Dirichlet integral under a white load, among what R leaves as it is: what is
-    rough in w, as noise is, does not outweigh the rest then.
+    p_k minimises a Dirichlet integral under a white load, in the range of R: so the rough parts of
+    w, such as noise, do not outweigh the smooth ones.
     """
 
     def __init__(self, model: Model, split: Split) -> None:

@@ -50,7 +50,7 @@ BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
 class Update(NamedTuple):
-    """What an update was made of, with W as above.
+    """Matrices and vectors of an update, with W as in the docstring of this module.
 
     Attributes
     ----------
@@ -117,26 +117,27 @@ class FollowedErrors(Protocol):
 class Filter:
     """Predicts and updates, linear about the point of a `FilterState`.
 
-    Overflow is no error here: callers look at what is not finite.
+    Overflow is no error here: callers check that the results are finite.
 
     Attributes
     ----------
     problem, stage, sensors, reduction
-        Model and sensors; the implicit stage of all members; what sensors see; the unknowns.
+        Model and sensors; the implicit stage of all members; the observation operator of all
+        members; the reduced coordinates of the unknowns.
     noise
         Standard deviation of each sensor, shape (sensors,).
     rank, scale
         A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
         coefficients of the state then: the square root of the mass of each.
     drift
-        Prior variances gained per unit of time by unknowns that stay else, one for each member
-        number, shape (numbers,), or (1,) for all.
+        Prior variances gained per unit of time by unknowns without an evolution of their own, one
+        for each member number, shape (numbers,), or (1,) for all.
     fading
-        Time after which what the state knows of the unknowns has faded to 1/e.
+        Time constant with which the cross-covariance of state and unknowns decays.
     judge
-        Keeps the sums that a verdict is drawn from; None: there is none.
+        Keeps the sums behind the verdict; None: there is no verdict.
     shadows
-        What follows the discretisation error; None: nothing does.
+        Estimator of the discretisation error beside the filter; None: the error is not followed.
     """
 
     problem: Problem
@@ -180,9 +181,9 @@ class Filter:
         return q
 
     def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
-        """Return the state whose unknowns have moved for a time h; those of u have not.
+        """Return the filter state with the unknowns predicted over a time h; u stays as it is.
 
-        What they gain is in new rows of the square root, in the same order for every h.
+        Their process noise stands in new rows of the square root, in the same order for every h.
         """
         if not self.moves or h == 0.0:
             return x
@@ -209,9 +210,9 @@ class Filter:
         )
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
-        """Return the state at the end of a span, substeps, and why it failed or None.
+        """Return the state at the end of a span, the number of substeps, and the failure or None.
 
-        What unknowns gain in one substep is independent of what they gain in the next.
+        The process noise of the unknowns is independent from substep to substep.
         """
         end, taken, failure = self.carried(x, span)
         if failure is None and self.problem.input_noise:
@@ -236,7 +237,7 @@ class Filter:
         return x, taken, None
 
     def _faded(self, x: FilterState, span: Span) -> FilterState:
-        """Return the state without what has faded of the past in a span."""
+        """Return the state after the exponential decay of U over a span."""
         if math.isinf(self.fading):
             return x
         return changed(x, U=np.exp(-(span.t1 - span.start) / self.fading) * x.U)
@@ -288,7 +289,7 @@ class Filter:
 
     @staticmethod
     def update(x: FilterState, Y: Array, d: Array) -> tuple[FilterState, Update]:
-        """Return the state after a sample, and what it tells of the noise.
+        """Return the state after a sample, and the matrices of the update.
 
         Parameters
         ----------
@@ -316,11 +317,11 @@ class Filter:
     def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
 
-        Members in `kept`, shape (members,), keep theirs.
+        Members in `kept`, shape (members,), keep their linearisation point.
 
-        Bounds (`Reduction.ends`) hold for linearisation points and for what is reported, not for
-        the linear filter: what lies beyond them stays in da and du, so that nothing the data said
-        is lost.
+        Bounds (`Reduction.ends`) hold for linearisation points and for reported estimates, not for
+        the linear filter: an excess beyond them stays in da and du, so that no information of the
+        data is lost.
         """
         estimate = self.estimate(x)
         within = self.reduction.bounded(estimate)
@@ -340,10 +341,11 @@ class Filter:
         return changed(x, u=u, q=estimate, du=du, da=da)
 
     def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:
-        """Return the state with `size` prior deviations added to the uncertainty of each unknown.
+        """Return the state with the covariance of each unknown inflated.
 
-        Independent of what is known of u: that is as well known as before. With `chosen`, shape
-        (k,), of these coordinates only.
+        An independent error of `size` prior standard deviations is added to each reduced
+        coordinate; the covariance of u stays as it is. With `chosen`, shape (k,), to these
+        coordinates only.
         """
         members, _, k = x.C.shape
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
@@ -390,7 +392,7 @@ class Filter:
 
 
 class MeanFilter(Filter):
-    """The filter without covariance: what it expects, and nothing of how uncertain that is."""
+    """The filter without covariance: it predicts the mean alone."""
 
     @classmethod
     def of(cls, filter_: Filter) -> MeanFilter:
@@ -399,7 +401,7 @@ class MeanFilter(Filter):
         return cls(**(parts | {"judge": None, "shadows": None}))
 
     def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
-        """Return the state whose unknowns have moved for a time h as they are expected to."""
+        """Return the filter state with the mean of the unknowns predicted over a time h."""
         if not self.moves or h == 0.0:
             return x
         F = self.reduction.transition(h)
@@ -414,8 +416,8 @@ def _extended(rows: Array, count: int) -> Array:
 def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
     """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), W^T Y d, and d^T (I + Y^T Y)^-1 d.
 
-    R = W^-1, W^T Y d and the root of the last come as [R c; 0 s] from a QR factorisation of
-    [I 0; Y^T d]: nothing is squared before.
+    R = W^-1, c = W^T Y d and the square root s of the last come as [R c; 0 s] from a QR
+    factorisation of [I 0; Y^T d]: no matrix is squared, which would halve the digits.
     """
     members, r, sensors = Y.shape
     stacked = np.zeros((members, r + 1, r + sensors))  # transposed: LAPACK counts down the columns

@@ -20,7 +20,7 @@ NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not j
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """What a filter knows of each member after the samples so far.
+    """State of a filter for each member, after the samples so far.
 
     Attributes
     ----------
@@ -29,7 +29,8 @@ class FilterState:
     u, q
         Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
     du, da
-        Estimated deviations of u and of the reduced unknowns a, (members, n) and (members, k).
+        Estimated differences of u and of the reduced unknowns a from the linearisation point,
+        (members, n) and (members, k).
     U, C
         Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
         As long as nothing moves, r = k.
@@ -48,13 +49,13 @@ class FilterState:
     evidence
         Logarithm of the likelihood of all samples so far, each given those before, (members,).
     kept
-        What the last stage has left to the next.
+        Warm-start data of the last stage for the next one.
     causes, ledger
-        What the verdict is drawn from: by how much possible causes of misfit have moved the
-        estimate, as coordinates on the rows of the square root, (members, r, columns), and running
-        sums; see `livepde.verdict`. The filter itself never reads them.
+        Data of the verdict: the shifts of the estimate by possible causes of misfit, as coordinates
+        on the rows of the square root, (members, r, columns), and running sums; see
+        `livepde.verdict`. The filter itself never reads them.
     shadows
-        What is known of the discretisation error.
+        Estimated discretisation error.
     """
 
     member: IntArray
@@ -101,5 +102,5 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
 
 
 def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter without what only its verdict needs."""
+    """Return a filter state without the data that only its verdict needs."""
     return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)

@@ -24,7 +24,7 @@ __all__ = ["GradientLaw", "GradientState"]
 
 @dataclass(frozen=True, eq=False)
 class GradientState:
-    """Estimates u^ and q^, and what the next step begins with.
+    """Estimates u^ and q^, and the initial data of the next step.
 
     Attributes
     ----------

@@ -41,7 +41,7 @@ MOST_STAGES = 8  # kept for different sets of present sensors
 
 @dataclass(frozen=True, eq=False)
 class GradientParts:
-    """What is computed once for a problem, and the rules around the method.
+    """Parts computed once for a problem, and the rules around the method.
 
     Attributes
     ----------
@@ -52,7 +52,8 @@ class GradientParts:
     observed, metric
         Rules for u_alpha and for the metric of Q.
     gate, probes
-        When q is held, and what tells; None: never.
+        The excitation gate that holds q, and the probes that measure the excitation; None: q is
+        never held.
     memory
         Pattern of the information, for `StageTerms`.
     """
@@ -165,8 +166,8 @@ class StageSequence:
     def equation_error(self) -> Array:
         """Return R^T eps at the end, the equation error of the data, a dual vector, shape (n,).
 
-        That is what r stands up to in the last stage, -theta R^T M_op r - R^T M r', and what the
-        iteration has left.
+        It balances the terms of r in the last stage, -theta R^T M_op r - R^T M r', up to the
+        remaining residual of the iteration.
         """
         if self._last is None:
             return np.zeros(self.coupled.terms.n)

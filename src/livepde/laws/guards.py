@@ -14,32 +14,33 @@ __all__ = ["Guards", "Scale"]
 
 @dataclass(frozen=True)
 class Guards:
-    """What `SensitivityLaw` does when its own assumptions fail; inert as long as they hold.
+    """Safeguards of `SensitivityLaw` against failure of its assumptions; inert while they hold.
 
     *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
-    deviations, and beyond half a standard deviation of what it leaves, is assimilated by
-    Gauss-Newton steps over its interval, each at most one prior deviation long, until reference
-    and estimate agree within that half (a law with a `Replay` does so anyway). Where they do not
-    converge the sample counts with ten times its noise, and so on; after `temperings` of that it
-    is not used. Notes: "iterated", "tempered", "held".
+    standard deviations, and by more than half a posterior standard deviation, is assimilated by
+    Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
+    reference and estimate agree within half a posterior standard deviation (a law with a `Replay`
+    does so anyway). Where the steps do not converge, the sample is taken again with ten times its
+    noise, and so on; after `temperings` such attempts it is not used. Notes: "iterated",
+    "tempered", "held".
 
-    *Runaway.* A step that fails, or a prediction that misses the data by more than `runaway` times
-    all that any sensor has ever varied (each in units of its noise): the law goes back to before
-    the last samples, adds one prior deviation to what is uncertain there, and carries the state on
-    without those samples; if that fails as well, with the prior. Note: "restarted". If nothing
-    helps a failed step is reported as such and changes nothing; "runaway" notes a prediction that
-    stays away.
+    *Runaway.* A step fails, or a prediction misses the data by more than `runaway` times the
+    largest range that any sensor has ever shown (each in units of its noise). The law then goes
+    back to before the last samples, inflates the covariance there by one prior standard deviation,
+    and propagates the state without those samples; if that fails as well, it starts again from the
+    prior. Note: "restarted". If nothing helps, a failed step is reported as such and changes
+    nothing; "runaway" notes a prediction that still misses the data.
 
     Parameters
     ----------
     reach
-        Prior deviations that a sample moves an unknown at most, unless iterated.
+        Largest move of an unknown by one sample without iteration, in prior standard deviations.
     iterations
         At most this many Gauss-Newton steps for a sample.
     temperings
         How often a sample whose steps do not converge is taken again with ten times its noise.
     runaway
-        How many times the largest range of the sensors a prediction misses one at least.
+        Smallest innovation of a runaway, as a multiple of the largest range of the sensors.
     past
         A restart goes back by this many samples at least, if there are so many, and by less than
         twice as many.
@@ -62,14 +63,17 @@ class Guards:
                 raise LawError(f"Guards: {name} must be at least {least}; got {value}.")
 
     def within_reach(self, change: Array) -> Mask:
-        """Return which members a sample moves by so little, in prior deviations (members, k)."""
+        """Return which members a sample moves by at most `reach`, shape (members,).
+
+        `change` is that of the reduced unknowns, in prior standard deviations, (members, k).
+        """
         near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
         return near
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """How far the values of each sensor have been apart, and its first innovation.
+    """Range of the values of each sensor so far, and its first innovation.
 
     Attributes
     ----------
@@ -94,10 +98,11 @@ class Scale:
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
     def beyond(self, d: Array, noise: Array) -> Array:
-        """Return the largest innovation as a multiple of what was there before, or of the noise.
+        """Return the largest innovation as a multiple of the largest range so far, or of the noise.
 
-        Counted in the noise of each sensor, against the sensor that has varied most: one that a
-        wave has not reached yet knows nothing of its size. Shape (members,).
+        All ranges and innovations are in units of the noise of their sensor. The range is that of
+        the sensor that has varied most: the range of a sensor that a wave has not reached yet says
+        nothing about the size of the wave. Shape (members,).
         """
         ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
         unseen = np.isnan(self.first) | np.isnan(self.low)

@@ -21,10 +21,10 @@ PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed 
 def first_guess(z: Array) -> Array | None:
     """Return a first guess of the noise of each sensor, or None as long as there is none.
 
-    Differences of order p of white noise of size 1 have the size sqrt(binomial(2 p, p)), while what
-    is smooth fades with the order: the one that leaves least counts. Medians, because signals
-    change most at the start. What is left of the signal makes the guess too large, which the law
-    mends.
+    Differences of order p of white noise of size 1 have the size sqrt(binomial(2 p, p)), while
+    those of a smooth signal fade with the order: the order with the smallest result counts. Medians
+    are taken, because signals change most at the start. The remainder of the signal makes the guess
+    too large, which the law corrects.
 
     Parameters
     ----------

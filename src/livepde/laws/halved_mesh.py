@@ -27,7 +27,7 @@ class HalvedMesh:
     Attributes
     ----------
     model, observed, stage
-        The process, what is observed of it, and its implicit stage.
+        The process, its observation, and its implicit stage.
     P, unknowns
         Prolongation of the state, shape (N, n), and of the latent parameter, shape (M, m).
     at
@@ -71,7 +71,7 @@ class HalvedMesh:
 
     @cached_property
     def G(self) -> sp.csr_array | Array | None:
-        """What the sensors see of the state, shape (sensors, N), if that is always the same."""
+        """Observation matrix of the state, shape (sensors, N), if it is constant; else None."""
         observation = self.observed.observation
         if type(self.observed) is not Observed or observation.directs or observation.inputs:
             return None
@@ -82,14 +82,15 @@ class HalvedMesh:
         return np.asarray((self.P @ u.T).T)
 
     def begun(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
-        """Return the initial state there minus that of the mesh, shape (N,).
+        """Return the initial state on the halved mesh minus that of the given mesh, shape (N,).
 
         Parameters
         ----------
         given
-            The initial state as a user gave it; coefficients say nothing of what is between them.
+            The initial state as a user gave it; given coefficients do not define values at the new
+            nodes, so that the difference is zero then.
         moment
-            None before any: nothing is known then.
+            Time and inputs of the start; None if not known yet, and the difference is zero then.
         q, u
             Latent parameter and initial state, shapes (m,) and (n,).
         """

@@ -18,36 +18,37 @@ comes from the step itself, about -h M^{-1} eps/PULL, and the stage solves
     H (q - c)/PULL = A(w)^T r + (b - J c - S G_Q (c - q0))/PULL
 
 from c, q before the step, with the normal equations J q = b of the data so far. These are kept
-exactly: the equation error eps that a step has left is told by its r, and y = A q - eps is what the
-data say that A q should be,
+exactly: the remaining equation error eps of a step follows from its r, and y = A q - eps is the
+value of A q according to the data,
 
     J <- J + h A^T R D^{-1} R^T A,        b <- b + h A^T R D^{-1} R^T y.
 
-So a step need not be exact: what filter, pull and iteration leave undone, and what a change of S
-asks for, is in b - J c - S G_Q (c - q0), and the next step does it. Without b, by the drive A^T r
-alone, q and J disagree on rough functions by the ratio of D to M, and when S falls q jumps by that.
+So a step need not be exact: the remaining errors of filter, pull and iteration, and the correction
+for a change of S, are in b - J c - S G_Q (c - q0), and the next step makes them good. Without b, by
+the drive A^T r alone, q and J disagree on rough functions by the ratio of D to M, and when S falls
+q jumps by that.
 
-S is the power of the equation error that is left, as far as q sees it,
+S is the power of the remaining equation error, as far as q sees it,
 
     power(eps) = mean of h ||A^T D^{-1} eps||_{Q*}^2 / mean of trace(G_Q^{-1} A^T R D^{-1} R^T A),
     S          = (power(eps_k) power(eps_k - eps_{k-1})/2)^{1/2}.
 
 Of white noise both powers are S. An error that goes on counts, too, the less the slower it changes:
-so what mesh, time step, smoothing and a wrong P u leave in the equation holds q back as noise does,
-and a wrong q hardly. (By the first alone, a q far from its prior was never learned: its own error
-is all noise. By the second alone, q left its prior for some samples at first. By what turns back,
--(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}), which is noise alone but of either sign, S was zero as
+so the equation errors of mesh, time step, smoothing and a wrong P u hold q back as noise does, and
+a wrong q hardly. (By the first alone, a q far from its prior was never learned: its own error is
+all noise. By the second alone, q left its prior for some samples at first. By the reversals,
+-(eps_k - eps_{k-1}, eps_{k-1} - eps_{k-2}), which are noise alone but of either sign, S was zero as
 soon as errors went on.) The same is done with the diagonal of G_Q in the place of G_Q, and the
-larger S is taken: the first is what smooth functions see of the error, the second what rough ones
-do, where derivatives of noisy data are far larger. (With the first alone 1 % of noise moved q by
-1.3 times what the prior allows.) Means weigh a sample at time t by t^FORGETS: they forget the
+larger S is taken: the first measures the error against smooth functions, the second against rough
+ones, where derivatives of noisy data are far larger. (With the first alone 1 % of noise moved q to
+1.3 times the bound of the prior.) Means weigh a sample at time t by t^FORGETS: they forget the
 start, and of exact data S vanishes. The first sample moves nothing: it tells S.
 
 J and b fade in two kinds of rows. Those that see nothing but the data, with tests within omega, are
 weighed by the information that had been given up to a sample: the first ones, least smoothed, count
 less and less, and where nothing is excited nothing fades. The others hold fluxes of P u, which was
-wrong at first, and are weighed by t^4; since P u goes on to be wrong by what the data cannot tell,
-S is not taken below a small share of their J.
+wrong at first, and are weighed by t^4; since P u keeps an error that the data do not determine, S
+is not taken below a small share of their J.
 
 H is renewed when S or the trace of J have changed by more than `AGED`, or J along the last step has
 grown by more than `STEEPER`. In between a step is one of quasi-Newton's, and factors serve on.
@@ -56,16 +57,16 @@ Every number above is a ratio of quantities with the same units: scaling u, q (w
 scales the estimate with them. Nothing refers to the mesh or to the sampling interval but the noise
 itself.
 
-Whether q may be where it is says the prior. If all of this holds, q - q0 is Gaussian with the
-covariance that the data have taken from that of the prior, so that ||q - q0||_Q^2 is a sum of
+The prior says whether q is plausible. If all of this holds, q - q0 is Gaussian, and its covariance
+is that of the prior less the remaining one after the data, so that ||q - q0||_Q^2 is a sum of
 chi-squares with weights of at most 1, whose sum k is at most m and at most trace(G_Q^{-1} J)/S,
 with a J that has not faded. It is more than k + 2 sqrt(k s) + 2 s with a probability below exp(-s)
 only (Laurent and Massart 2000). A q beyond that is not believed: the step holds q, which is a
 failed status, and the data go on to tell J, b and S.
 
-What S does not know is a bias that q takes up without a trace: smoothing that takes too much or too
-little leaves an equation error that moves with w, as a wrong q does. What helps is smoothing
-without it (`livepde.laws.smoothing`).
+S does not contain a bias that q absorbs without a trace: smoothing that takes too much or too
+little leaves an equation error that moves with w, as a wrong q does. The remedy is smoothing
+without this bias (`livepde.laws.smoothing`).
 """
 
 from __future__ import annotations
@@ -128,8 +129,8 @@ class Information:
     force
         A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m).
     power
-        Means of the power of forces and of half that of their changes, of what smooth functions see
-        and of what rough ones do, shape (2, 2).
+        Means of the power of forces and of half that of their changes, each measured against smooth
+        and against rough functions, shape (2, 2).
     seen
         Means of the traces that they are relative to, shape (2,).
     elapsed, samples
@@ -190,7 +191,7 @@ def trace_probes(space: HilbertSpace) -> Array:
 
 
 def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
-    """Return the square root of an operator times x, on what is orthogonal to some of its modes.
+    """Return the square root of an operator times x, on the orthogonal complement of some modes.
 
     By Lanczos' method.
     """
@@ -363,7 +364,7 @@ class InformationMetric(MetricRule[Information]):
         return replace(state, spread=S, held=J, weighed=total)
 
     def departure(self, state: Information, q: Array) -> float:
-        """Return ||q - q0||_Q^2 over what a right model exceeds with a chance below `CHANCE`."""
+        """Return ||q - q0||_Q^2 over its critical value under the model, at the level `CHANCE`."""
         away = q - state.origin
         told = float(self.model.Q.free.sum())
         if state.given < told * state.spread:

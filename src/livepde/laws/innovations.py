@@ -1,4 +1,4 @@
-"""Whether the innovations are what the filter expects: white, and of the expected size."""
+"""Statistics of the normalised innovations: white and of unit variance for a right model."""
 
 from __future__ import annotations
 
@@ -109,14 +109,14 @@ class Innovations:
     def inflation(self) -> Array:
         """Factor on standard deviations, at least 1, shape (members,).
 
-        By how much a mean of the innovations is less certain than one of white noise of the stated
-        size. The larger of two variances: `persistence`, and ratio (1 + rho)/(1 - rho), of errors
-        that follow a first-order autoregression.
+        Ratio of the standard deviation of a mean of the innovations to that of a mean of white
+        noise of the stated size: the square root of the larger of two variances, `persistence`, and
+        ratio (1 + rho)/(1 - rho), of errors that follow a first-order autoregression.
 
         Both scatter about 1 where the model is right, and the larger one lies above 1 more often
-        than not. So each counts by what it exceeds chance: see `_beyond_chance`. Their standard
-        errors are those for white noise: of N values the mean square has the variance 2/N, the
-        correlation 1/N; and `SLOW` values make one independent value of `slow`, of which each
+        than not. So only the excess of each beyond chance counts: see `_beyond_chance`. Their
+        standard errors are those for white noise: of N values the mean square has the variance 2/N,
+        the correlation 1/N; and `SLOW` values make one independent value of `slow`, of which each
         sensor has one from the start.
         """
         count, weight = self.sums[:, 0], self.sums[:, 1]
@@ -162,7 +162,7 @@ def _beyond_chance(variance: Array, error: Array) -> Array:
     """Return variances, shrunk towards 1 as far as their standard error explains the excess.
 
     1 + x (1 - (c/x)^2) where the excess x is larger than c = `SIGNIFICANT` standard errors, else 1:
-    nothing is lost of what is far beyond chance.
+    an excess far beyond chance is kept in full.
     """
     excess, chance = variance - 1.0, SIGNIFICANT * error
     beyond = excess > chance

@@ -36,8 +36,9 @@ def with_input_noise(
     """Return the state after a span with one more row for each noisy channel.
 
     The error of a channel is taken as constant in a span and as independent from one to the next:
-    its integral over many has the variance of the straight lines between readings. Where a state
-    follows its boundary within a span it is more than what the lines give, by up to a quarter.
+    its integral over many spans has the variance of the straight lines between readings. Where a
+    state follows its boundary within a span, the variance is larger than that of the lines by up to
+    a quarter.
     The row is the difference to the state whose input is one standard deviation off, exact where
     the model is affine in it.
 
@@ -88,8 +89,8 @@ def initial_rows(
     """Return the uncertainty of a u0 made of readings: rows of U and of C.
 
     With u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise of each
-    reading is a row of its own, and what the sensors see of the unknowns, an offset say, stands in
-    the rows of those unknowns. So the readings tell nothing more of them.
+    reading is a row of its own, and the effect of the unknowns on the sensors, an offset say,
+    stands in the rows of those unknowns. So the readings tell nothing more of them.
 
     Parameters
     ----------

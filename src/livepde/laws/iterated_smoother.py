@@ -3,8 +3,8 @@
 A plain update leaves a second-order error that a state with long memory never forgets. While the
 unknowns are as uncertain as their prior that error counts, so the first samples are assimilated
 again, about trajectories of the unknowns that are found by damped Gauss-Newton steps: the iterated
-Kalman smoother of Bell (1994). It accepts only what makes the samples and the prior together more
-probable, and serves unknowns that stay and unknowns that move.
+Kalman smoother of Bell (1994). It accepts a step only if it makes the samples and the prior
+together more probable, and serves unknowns that stay and unknowns that move.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def iterate_starts(
 def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[SensitivityState, float]:
     """Return one member about its most probable trajectory, and how far that has moved it, or NaN.
 
-    The start ends where samples have told all directions of unknowns that stay, and a trajectory
-    through their estimate leaves it where it is.
+    The move is in standard deviations of the unknowns. The start ends where the samples have halved
+    the variance of constant unknowns in all directions, and an iteration hardly moves the estimate.
     """
     count, moved, shares = int(state.assimilated[0]), math.nan, _shares(state.start, state.now)
     if shares[0] < HALF:
@@ -166,7 +166,7 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
 
 
 def _shares(before: FilterState, now: FilterState) -> Array:
-    """Return shares of the variance of the unknowns of one member that are left, rising."""
+    """Return the remaining shares of the variance of the unknowns of one member, ascending."""
     earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
     found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
     return found
@@ -274,12 +274,12 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
 
 
 def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
-    """Return the squared increment of a trajectory in a time h, in units of what it gains.
+    """Return the squared increment of a trajectory in a time h, in units of its process noise.
 
     Parameters
     ----------
     gained
-        Variance that each coordinate gains in that time, shape (k,).
+        Variance of the process noise of each coordinate in that time, shape (k,).
     """
     increment = after - filter_.reduction.transition(h) @ before
     return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())

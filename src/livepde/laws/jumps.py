@@ -32,7 +32,7 @@ class Watch:
         Samples since the start, and samples that are not looked at yet, shape (members,).
     usual
         Statistics of the innovations, with which new ones are compared: none counts for more than
-        `LARGEST` times the usual size, so that a jump hardly changes by what it is measured.
+        `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
     """
 
     squares: Array
@@ -68,16 +68,16 @@ class Watch:
 class Jumps:
     """Watch for sudden changes of the unknowns, and let them move when there is one.
 
-    The innovations of the last 1, 2, 4, ... samples, normalised by what is expected of them and by
-    their usual size and correlation, are compared with the chi-square distribution. After an alarm
-    the law goes back to where the innovations most likely became too large, adds `size` prior
-    standard deviations to the uncertainty of the unknowns that may jump, and takes the samples
-    since again: so it learns anew without a restart, and what was known of the state and of the
-    other unknowns before the jump is kept.
+    The innovations of the last 1, 2, 4, ... samples, normalised by their expected standard
+    deviation and by their usual size and correlation, are compared with the chi-square
+    distribution. After an alarm the law goes back to where the innovations most likely became too
+    large, adds `size` prior standard deviations to the uncertainty of the unknowns that may jump,
+    and takes the samples since again: so it learns anew without a restart, and keeps the estimates
+    of the state and of the other unknowns from before the jump.
 
     The usual size and correlation are those of the last 500 samples that were looked at, with the
     first `settle`; after these none counts for more than three times the usual size. So a jump
-    hardly changes by what the next one is measured.
+    hardly changes the yardstick of the next one.
 
     Parameters
     ----------
@@ -86,12 +86,12 @@ class Jumps:
     window
         Longest number of samples, a power of two.
     size
-        What an alarm adds, in prior deviations.
+        Standard deviation that an alarm adds to the unknowns, as a multiple of that of the prior.
     settle
         So many samples after the start, and after an alarm, are not looked at.
     unknowns
         Names of the unknowns that may jump; default all. A material constant that is not among them
-        keeps what is known of it.
+        keeps its estimate and its covariance.
     """
 
     probability: float = 1e-5

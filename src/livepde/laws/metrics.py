@@ -1,7 +1,7 @@
 """The metric of Q in which q learns: a constant gain, or the information that the data have given.
 
-The second line (est_exact_q) reads q' = gain G_Q^{-1} A(w)^T r in coefficients. A rule says what
-stands for G_Q/gain in each stage, and carries what it needs for that from sample to sample.
+The second line (est_exact_q) reads q' = gain G_Q^{-1} A(w)^T r in coefficients. A rule gives the
+operator in the place of G_Q/gain for each stage, and carries its statistics from sample to sample.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MetricStep = Callable[[Array, float], Metric]
 
 @dataclass(frozen=True)
 class NoState:
-    """The state of what carries nothing from sample to sample."""
+    """Empty state of a rule that carries nothing from sample to sample."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ __all__ = ["Gain", "NormalEquations", "ProjectedRows", "SelectedRows", "diagonal
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """What one sample adds to the normal equations, per unit of time.
+    """Contribution of one sample to the normal equations, per unit of time.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class Gain:
 
 
 class NormalEquations(ABC):
-    """What samples of one set of sensors add to the normal equations."""
+    """Abstract contributions of samples of one set of sensors to the normal equations."""
 
     @abstractmethod
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:

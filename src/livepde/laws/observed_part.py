@@ -61,7 +61,7 @@ class ObservedPath(ABC):
 
 
 class ObservedPart(ABC, Generic[State]):
-    """Abstract rule for u_alpha; what evolves is an explicit state."""
+    """Abstract rule for u_alpha; its evolving part is an explicit state."""
 
     @abstractmethod
     def init(self) -> State:

@@ -102,7 +102,7 @@ def _iterated(
 ) -> tuple[FilterState, dict[str, float]]:
     """Return the filter after a sample that may have moved it too far, and notes.
 
-    Too far is cured by a replay of this one sample from where the interval began.
+    The cure of an excessive move is a replay of this one sample from the start of its interval.
     """
     before = state.now
     if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
@@ -147,7 +147,7 @@ def _rescued(
 ) -> tuple[SensitivityState, Report]:
     """Return one member and report after a sample that may have failed or be far off.
 
-    Whatever led there is not used again: the state is only carried on from the past.
+    A restart does not use the last samples again: the older state is propagated without them.
     """
     noise = np.sqrt(state.now.level)[:, None] * work.filter.noise_of(interval)
     z = interval.z1[None]
@@ -203,8 +203,8 @@ def _watched(
 ) -> tuple[SensitivityState, Report]:
     """Return one member and report after the test for a jump.
 
-    After an alarm the samples since the jump are taken again, from before it: the state has
-    gone astray with them, and what was measured before does not belong to the unknowns of now.
+    After an alarm the samples since the jump are taken again, from before it: the state has gone
+    astray with them, and earlier measurements do not belong to the present values of the unknowns.
     """
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, replace(report, notes={**report.notes, "jump": 0.0})

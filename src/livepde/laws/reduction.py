@@ -117,7 +117,7 @@ class Reduction:
 
     @property
     def stay(self) -> list[tuple[str, int]]:
-        """Coordinates of unknowns that stay, with what they are called: numbers before fields."""
+        """Labels and coordinates of the constant unknowns: numbers before modes of fields."""
         numbers, modes = [], []
         for (name, item), evolution in zip(
             self.problem.model.latent.parts.items(), self.evolutions, strict=True
@@ -166,8 +166,8 @@ class Reduction:
     def gained(self, h: float, variance: Array, drift: Array) -> Array:
         """Return the variance that coordinates gain in a time h, shape (members, k).
 
-        What drifts gains the less the closer its variance is to that of the prior: it may move, but
-        without data it is not less certain than at first.
+        A drifting unknown gains the less, the closer its variance is to that of the prior: without
+        data it is never less certain than at first.
 
         Parameters
         ----------
@@ -222,10 +222,10 @@ class Reduction:
 
     @cached_property
     def ends(self) -> tuple[Array, Array]:
-        """Least and largest latent parameters: bounds, and what is too far from the prior, (m,).
+        """Least and largest latent parameters, shapes (m,): bounds, and a range about the prior.
 
-        Too far is by more than `within` prior deviations (of a field those of each coefficient in
-        the modes; what no mode moves is free).
+        The range is `within` prior standard deviations to each side (of a field, those of each
+        coefficient in the modes; a coefficient that no mode moves is free).
         """
         latent = self.problem.model.latent
         deviation = np.linalg.norm(self.Phi, axis=1)
@@ -285,7 +285,7 @@ class Reduction:
         Parameters
         ----------
         start
-            One at that time; what no mode sees is taken from it.
+            A latent parameter at the earlier time: its part outside the modes is kept, shape (m,).
         drift
             As for `gained`.
         """

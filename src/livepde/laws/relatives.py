@@ -1,9 +1,9 @@
 """Two older laws that the paper's method grew out of, through the same coupled stage.
 
 Boiger and Kaltenbacher call their method "strongly motivated" by both. Neither article could be
-read for this module; what is implemented is stated as equations below, after what Boiger and
-Kaltenbacher say of them: Baumeister et al. observe all of
-the state, Kügler demands a monotone C and evaluates it at the estimate.
+read for this module; the implemented equations are stated below, after the description by Boiger
+and Kaltenbacher: Baumeister et al. observe all of the state, Kügler demands a monotone C and
+evaluates it at the estimate.
 
                   C evaluated at          pull                      q^' = gain A(.)* r, r
     paper         u_alpha + P u^          mu R M r / ||r||_V~       R u^ - u_alpha
@@ -101,8 +101,8 @@ class BaumeisterLaw(_Relative):
 
     with a coercive operator A_0 that draws u^ to the measured state; both equations are solved
     together in one implicit step. It is (est_exact_q), (est_exact_u) for R = I, P = 0, with the
-    coercive A_0 in the place of mu M / ||r||_V~: what Boiger and Kaltenbacher added is P u^ where
-    nothing is measured, and a pull whose size mu adapts.
+    coercive A_0 in the place of mu M / ||r||_V~: Boiger and Kaltenbacher added P u^ where nothing
+    is measured, and a pull whose size mu adapts.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class BaumeisterLaw(_Relative):
     ------
     LawError
         From `prepare`: some of the state is not observed. A sample that lacks sensors is no error:
-        what they do not see is estimated as by the paper's law.
+        the part of the state without a reading is estimated as by the paper's law.
     """
 
     A_0: Any = h1_form

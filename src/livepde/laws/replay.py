@@ -29,8 +29,8 @@ class Replay:
     step takes much longer than others; shorter ones are taken at once, since estimates about a poor
     first reference may go astray. Until it has caught up, estimates are linear about the reference
     of before. Where it ends does not depend on the slices while each replay ends before the next is
-    due: its references come from the samples that were there when it began. A run ends with what
-    the replay under way finds (`Identifier.settled`).
+    due: its references come from the samples that were there when it began. A run ends with the
+    result of the replay under way (`Identifier.settled`).
 
     Parameters
     ----------

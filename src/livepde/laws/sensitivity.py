@@ -69,21 +69,22 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     """State and parameter from sparse, noisy sensors, with a covariance.
 
     Reduced-order filter of Moireau, Chapelle and Le Tallec (2008); Zhang's adaptive observer;
-    recursive prediction error. q = q_prior + Phi a with a ~ N(0, I): Phi is the prior deviation for
-    numbers and the leading modes of the prior for fields. The joint covariance of u and a has the
-    square root [U; C]. With S the Jacobian of a step and A the derivative of A(u) q in q,
+    recursive prediction error. q = q_prior + Phi a with a ~ N(0, I): Phi is the prior standard
+    deviation for numbers and the leading modes of the prior for fields. The joint covariance of u
+    and a has the square root [U; C]. With S the Jacobian of a step and A the derivative of A(u) q
+    in q,
 
         predict   one implicit step for u;   S U+ = M U/h - A(u+) Phi C
         update    d = z - G u+ - D q,  Y = G U+ + D Phi C:   a += C K d,  u += U+ K d,
                   K = (I + Y^T N^-1 Y)^-1 Y^T N^-1,  [U; C] times the square root of (I + ...)^-1
 
-    It costs one step and one block of back-substitutions. For unknowns that stay as they are U is
-    L C with the sensitivity L = du/da. One that moves (`evolution`, or `drift` for all) adds new
-    columns at each substep, independent of what the state remembers of older values; the factor is
-    then compressed to `rank` columns, so that nothing has to be forgotten by hand.
+    A sample costs one step and one block of back-substitutions. For unknowns that stay as they are
+    U is L C with the sensitivity L = du/da. An unknown that moves (`evolution`, or `drift` for all)
+    adds new columns at each substep, independent of the older ones; the factor is then compressed
+    to `rank` columns, so that no forgetting factor has to be chosen.
 
     Bounds of numbers, and those of latent values (`within` of an unknown), hold for the reference
-    about which the filter is linear, and for what is reported; the filter itself stays linear.
+    about which the filter is linear, and for reported estimates; the filter itself stays linear.
 
     Parameters
     ----------
@@ -91,15 +92,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Number of modes for each field: one number, or name -> number. "auto": so many that they
         hold 99.99 % of the prior variance, at most 60.
     noise
-        Standard deviation of the measurement noise; default what the observation says. "auto": what
-        the observation says is a first guess, and the level is found from the samples, the same
-        multiple for all sensors.
+        Standard deviation of the measurement noise; default the noise of the observation. "auto":
+        the noise of the observation is a first guess, and the level is found from the samples, the
+        same multiple for all sensors.
     drift
         Variance of a gained per unit of time, relative to the prior, by every unknown without an
-        evolution of its own: > 0 follows parameters that change. It gains the less the closer its
-        deviation is to the prior's, so that nothing winds up while the data tell nothing.
+        evolution of its own: > 0 follows parameters that change. An unknown gains the less, the
+        closer its variance is to that of the prior, so that no variance winds up without data.
     memory
-        Time after which what the state knows of the parameters has faded to 1/e.
+        Time constant with which the cross-covariance of state and parameters decays.
     replay
         Iterate about one reference trajectory; for states with a long memory. Not together with
         `memory`.
@@ -110,18 +111,18 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Innovations of more than this many expected standard deviations, times the usual size of
         normalised innovations where that exceeds 1, are not used; infinity: all are.
     gate_patience
-        After so many refusals in a row a sensor is believed again: something has really changed.
+        After so many refusals in a row a sensor is used again: the process has really changed.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     start_window
         While the unknowns are learned the last samples, up to this many, are assimilated again
         whenever their number has doubled, about the most probable trajectory of the unknowns, until
-        the linearisation holds: see `livepde.laws.iterated_smoother`. 0: never. Not where a
-        `Replay` does the like.
+        the linearisation holds: see `livepde.laws.iterated_smoother`. 0: never. With a `Replay`,
+        which iterates as well, it has no effect.
     guards
-        What to do when a linearisation is overconfident or the estimate runs away; None: nothing.
+        Safeguards against an overconfident linearisation and a runaway estimate; None: none.
     shadows
-        Which discretisation errors widen what is reported; None: none does.
+        Discretisation errors that widen the reported covariance; None: no error does.
     verdict
         Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
         cost solves, those of terms that the process may lack; False: not at all.
@@ -182,7 +183,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     @property
     def fades(self) -> bool:
-        """True if what the state knows of the unknowns fades."""
+        """True if the cross-covariance of state and unknowns decays (`memory`)."""
         return bool(np.isfinite(self.memory))
 
     def weighs_readings(self) -> bool:
@@ -413,7 +414,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def _together(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, Assimilation, Mask]:
-        """Return all members after a sample, and for whom nothing was out of the ordinary."""
+        """Return all members after a sample, and which of them needed no special treatment."""
         filter_, before = work.filter, state.now
         x, told = assimilate(filter_, before, span, work.options)
         if not told.status.ok:
@@ -511,5 +512,5 @@ def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
 
 
 def without_factors(x: FilterState) -> FilterState:
-    """Return a filter without what its last stages have left: what estimates hold."""
+    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
     return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())

@@ -38,7 +38,7 @@ NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without re
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
-    """What the law computes once, and its options.
+    """Parts that the law computes once, and its options.
 
     Attributes
     ----------
@@ -85,7 +85,7 @@ class SensitivityWork:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityState:
-    """What the law knows of each member; the leading axis of every array is the members.
+    """State of the law for each member; the leading axis of every array is the members.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class SensitivityState:
     watch
         Innovations of the last samples, for `Jumps`.
     scale
-        What the sensors have shown, for `Guards`.
+        Ranges of the readings of each sensor so far, for `Guards`.
     """
 
     now: FilterState

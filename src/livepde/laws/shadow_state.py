@@ -20,8 +20,8 @@ class ShadowState:
     Attributes
     ----------
     u, a
-        By how much the discretisation has shifted state and reduced unknowns, a row for each
-        shadow, shapes (members, shadows, n) and (members, shadows, k).
+        Shifts of state and reduced unknowns by the discretisation, a row for each shadow, shapes
+        (members, shadows, n) and (members, shadows, k).
     count, last, due
         Steps so far, and at which the shadows were taken last and are taken next, (members,).
     rate, usual, jumped
@@ -29,7 +29,7 @@ class ShadowState:
         one step to the next, and the count of steps at which it last differed by much more; shapes
         (members, n), (members,) and (members,).
     size
-        Norm of what the step shadow found last, (members,); infinite before.
+        Norm of the last error that the step shadow found, (members,); infinite before.
     begun, u0, inputs0
         Time, state and inputs where the shadows were taken last; the state without columns if no
         shadow needs it. Shapes (members,), (members, n) and (members, channels).
@@ -37,18 +37,18 @@ class ShadowState:
         Of the last interval, infinite before the first, and how inputs changed in it per unit of
         time; shapes (members,) and (members, channels).
     bend, missed
-        Integral of what straight lines have missed of the inputs in the last interval, and of all
-        that no shadow has stepped with yet, shapes (members, channels).
+        Integral over the last interval of the difference of the inputs from straight lines, and the
+        sum of these integrals that no shadow has stepped with yet, shapes (members, channels).
     held
         Of inputs that are held: last value, last change, and sums of the squares of changes and of
         their differences, shape (members, 4, channels).
     halves, blocks
-        What the last stages of halved steps, and of a block of steps, have left.
+        Warm-start data of the last stages of halved steps, and of a block of steps.
     fine, fine_stage
-        The state on the halved mesh minus that of the filter, shape (members, N), and what the last
-        stage there has left.
+        The state on the halved mesh minus that of the filter, shape (members, N), and the
+        warm-start data of the last stage on the halved mesh.
     seen
-        What the sensors see of that, shape (members, sensors).
+        The difference in the predicted readings due to `fine`, shape (members, sensors).
     gains
         Sum of the gains of the samples since the shadows were taken last, each times the time since
         then, shape (members, sensors, k); without sensors if no shadow needs it.
@@ -118,7 +118,7 @@ class ShadowState:
         )
 
     def without_stages(self) -> ShadowState:
-        """Return the shifts alone, without what the next steps need."""
+        """Return the shifts alone, without the data that only the next steps need."""
         nothing = np.zeros((len(self), 0))
         return changed(
             self,

@@ -1,15 +1,16 @@
-"""The discretisation error of a filter: what step, mesh and input lines have shifted it by.
+"""The discretisation error of a filter: its shifts by time step, mesh and input interpolation.
 
-The filter and one without discretisation error would take the same samples with the same gain. What
-the former is off by, e of the state and s of the unknowns, follows
+The filter and one without discretisation error would take the same samples with the same gain. The
+error of the former, e of the state and s of the unknowns, follows
 
     predict   [e; s]+ = T [e; s] + d,      T the linearised step, d the error that this step adds
     update    [e; s] <- [e; s] - K H [e; s]
 
 with the filter's own T, H and gain K, for unknowns that stay and for unknowns that move. Each
-shadow says what d is, by Richardson's extrapolation: the step from two halved steps, the input
-lines from the curvature of the readings. The mesh has a trajectory of its own on the halved mesh,
-with the unknowns of the filter: what it differs by is no d, but is seen by the sensors.
+shadow estimates its d: that of the step by Richardson's extrapolation from two halved steps, that
+of the input lines from the curvature of the readings. The mesh has a trajectory of its own on the
+halved mesh, with the unknowns of the filter: the difference of the two trajectories is no d, but
+enters the predicted readings.
 """
 
 from __future__ import annotations
@@ -50,10 +51,10 @@ SMOOTH = 0.5  # differences of changes over changes, squared: below, an input ch
 
 @dataclass(frozen=True)
 class Shadows:
-    """Which discretisation errors the sensitivity law follows beside its estimates.
+    """Discretisation errors that the sensitivity law follows beside its estimates.
 
-    Their signed shifts are summed, and widen what is reported: variance plus square of the sum. The
-    estimate itself, and the filter, stay as they are.
+    Their signed shifts are summed, and widen the reported covariance: variance plus square of the
+    sum. The estimate itself, and the filter, stay as they are.
 
     The first 16 steps are shadowed, later one of eight, which stands for those around it: an error
     of step or input lines that changes much faster is found on average only. The mesh is followed
@@ -68,9 +69,9 @@ class Shadows:
         mean the same on every mesh.
     inputs
         The straight line between readings of a channel, by the curvature of three readings, and
-        values that were held in gaps, once the next one is known. Where all inputs are held as
-        those of an actuator, by how much straight lines would shift the estimates is followed for
-        the verdict alone.
+        values that were held in gaps, once the next one is known. Under zero-order hold of all
+        inputs, the shift of the estimates by straight lines instead is followed for the verdict
+        alone.
     largest
         Coefficients of the state on the halved mesh beyond which it is not followed, because that
         would cost more than the filter.
@@ -96,11 +97,11 @@ class Steps(NamedTuple):
     x, end
         The filter before and after the last of them.
     span, block
-        The last of them, and all since the shadow was taken before.
+        The last of them, and all steps since the previous shadow.
     waited, next
-        The number of the latter, and of those that follow until the next is taken, (members,).
+        Number of steps since the previous shadow, and from now to the next one, (members,).
     jumps
-        Members of which something jumped in the last step, shape (members,).
+        Members of which the rate of the state jumped in the last step, shape (members,).
     """
 
     x: FilterState
@@ -113,18 +114,18 @@ class Steps(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What a shadow has found.
+    """Discretisation error of some steps, as found by a shadow.
 
     Attributes
     ----------
     error
-        What the state is off by more, shape (members, n); None for nothing.
+        Additional error of the state, shape (members, n); None for zero.
     parts
         Fields of `ShadowState` to exchange.
     failed
         Members whose shadow could not be stepped, shape (members,); nothing is added for them.
     a
-        What the reduced unknowns are off by more, shape (members, k); None for nothing.
+        Additional error of the reduced unknowns, shape (members, k); None for zero.
     """
 
     error: Array | None
@@ -284,10 +285,10 @@ class InputShadow(Shadow):
 
 
 class HeldInputShadow(InputShadow):
-    """How estimates would shift if inputs that are held changed along straight lines instead.
+    """Shift of the estimates by straight lines in the place of the zero-order hold of inputs.
 
-    Only inputs that change smoothly are looked at: successive changes of readings are alike, those
-    of settings that are made anew now and then are not.
+    Only inputs that change smoothly count: successive changes of measured inputs are alike, those
+    of set points are not.
     """
 
     kind = HELD
@@ -316,10 +317,10 @@ class HeldInputShadow(InputShadow):
 class MeshShadow(Shadow):
     """The error of the mesh: a trajectory on the halved mesh beside one on the mesh.
 
-    It has the unknowns of the filter, and follows where samples move the state: only its difference
-    to the state of the filter is kept. Several steps are taken at once on both meshes. Until the
-    next the sensors see the difference as it was; then it is known how it has changed, linearly in
-    between, and what that would have done to the unknowns is added.
+    The fine trajectory has the unknowns of the filter, and follows where samples move the state:
+    only its difference to the state of the filter is kept. Several steps are taken at once on both
+    meshes. Up to the next block the difference in the readings is held constant; then its change is
+    known, is taken as linear in between, and the effect of this change on the unknowns is added.
 
     Attributes
     ----------
@@ -328,7 +329,7 @@ class MeshShadow(Shadow):
     fine
         The same on the halved mesh.
     mesh
-        That mesh.
+        The halved mesh.
     """
 
     mean: Filter
@@ -385,14 +386,14 @@ class MeshShadow(Shadow):
 def _followed(
     mean: Filter, x: FilterState, u: Array, kept: KeptFactors, span: Span
 ) -> tuple[Array, KeptFactors, Mask]:
-    """Return the states of members after a span, what the last stage left, and who failed.
+    """Return the states of members after a span, the warm-start data, and which members failed.
 
     Parameters
     ----------
     mean
         A filter without covariance.
     x, u
-        The filter at the start, and the states that are followed in the place of its own.
+        The filter at the start, and the states that are propagated in the place of its own.
     """
     members, n = u.shape
     k = x.C.shape[2]
@@ -425,7 +426,7 @@ class ShadowSet:
     shadows
         One for each row of `ShadowState.u`.
     refused
-        Why the mesh has none; empty if it has, or none was asked for.
+        Why the mesh has no shadow; empty if it has one, or none was asked for.
     """
 
     filter: Filter
@@ -566,9 +567,10 @@ class ShadowSet:
     def notes(self, x: FilterState) -> dict[str, Array]:
         """Return notes on the shifts of the unknowns, each of shape (members,).
 
-        Of each number by kind in its unit (`k_step_shift`), and in standard deviations of what is
-        reported without them: of all kinds together where that is largest
-        (`discretisation_shift`), and of each kind there (`step_shift`).
+        For each number, the shift by each kind of error in the unit of the number (`k_step_shift`).
+        In standard deviations as reported without the shifts: the largest shift by all kinds
+        together (`discretisation_shift`), and those by each kind at the same unknown
+        (`step_shift`).
         """
         reduction, latent = self.filter.reduction, self.filter.problem.model.latent
         C = robust_factors(self.filter, x)[1]
@@ -598,9 +600,9 @@ class ShadowSet:
     def widening(self, x: FilterState) -> tuple[Array, Array]:
         """Return the row of the square root [U C] that is reported for all shifts together.
 
-        Shapes (members, 1, n) and (members, 1, k). It is no longer than one prior standard
-        deviation: what the data tell wrongly is known as well as before, and the linear filter is
-        nothing to count more.
+        Shapes (members, 1, n) and (members, 1, k). The row is no longer than one prior standard
+        deviation: wrong data cannot make the unknowns less certain than their prior, and a longer
+        shift lies outside the range of the linear filter.
         """
         u, a = (rows[:, self.counted].sum(axis=1, keepdims=True) for rows in self.shifts(x))
         size = np.linalg.norm(self.filter.reduction.in_prior_units(a, x.age), axis=2)
@@ -614,7 +616,7 @@ class ShadowSet:
 def _recalled(
     s: ShadowState, x: FilterState, new: FilterState, gain: Array, t: float
 ) -> ShadowState:
-    """Return members with the gain of one more sample, which makes those before count less.
+    """Return members with the gain of one more sample, which reduces the effect of earlier gains.
 
     Parameters
     ----------
@@ -632,7 +634,7 @@ def _recalled(
 def _watched(
     s: ShadowState, x: FilterState, end: FilterState, span: Span
 ) -> tuple[ShadowState, Mask]:
-    """Return members after one more step, and of whom something jumped in it."""
+    """Return members after one more step, and those of which the rate of the state jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
     differs, most = np.sqrt((more * more).sum(axis=1)), JUMP * s.usual
@@ -649,7 +651,7 @@ def _watched(
 
 
 def _wait(count: IntArray) -> IntArray:
-    """Return after how many more steps shadows are taken that were taken after so many."""
+    """Return the number of steps from a shadow after `count` steps to the next one, (members,)."""
     return np.where(count < FIRST, 1, LATER[count // 8 % len(LATER)])
 
 

@@ -1,22 +1,22 @@
 """Fixed-interval smoother: state and unknowns at each sample, given those before and after it.
 
 The filter carries x = m + [U C]^T xi with xi ~ N(0, I). From one sample to the next xi' is made of
-xi and of what is gained in between by rotations, truncations and the contraction of the update, so
-that the two are jointly Gaussian:
+xi and of the process noise in between by rotations, truncations and the contraction of the update,
+so that the two are jointly Gaussian:
 
     xi = g + T^T xi' + R^T zeta,    T = E[xi' xi^T | z'],  g = E[xi | z'],  R^T R = I - P^T P,
 
-P being T before the update and zeta ~ N(0, I) what the truncation forgets. (`FilterState.past` and
-`dpast` follow xi through predict and update: T and g are what has become of I and 0.) So given all
-samples xi ~ N(mu, B^T B) follows backward, in as many coordinates as the square root has rows, from
-mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
+P being T before the update and zeta ~ N(0, I) the part that the truncation drops.
+(`FilterState.past` and `dpast` follow xi through predict and update: T and g are the images of I
+and 0.) So given all samples xi ~ N(mu, B^T B) follows backward, in as many coordinates as the
+square root has rows, from mu = 0 and B = I at the end (Rauch, Tung and Striebel 1965):
 
     mu = g + T^T mu',    B = upper triangle of a QR factorisation of [B' T; R]
 
-All is linear about one trajectory of the unknowns. It begins at the estimates of the run, of what
-stays at its last one, and is moved to the smoothed one by damped Gauss-Newton steps that make
-samples and prior together more probable (Bell 1994), until these change it by less than a tenth of
-a standard deviation.
+The smoother is linear about one trajectory of the unknowns. This trajectory begins at the estimates
+of the run, for constant unknowns at their last one, and is moved to the smoothed one by damped
+Gauss-Newton steps that make samples and prior together more probable (Bell 1994), until these
+change it by less than a tenth of a standard deviation.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ class _FixedInterval:
 
     @property
     def estimated(self) -> Array:
-        """Trajectory of the run's estimates; what gains nothing is traced back from later ones."""
+        """Trajectory of the run's estimates; coordinates without process noise are traced back."""
         reduction, none = self.work.filter.reduction, np.zeros((1, self.work.filter.reduction.size))
         prior = self.work.filter.problem.model.latent.prior
         a = np.atleast_2d(reduction.reduced(np.array(self.data.q) - prior))

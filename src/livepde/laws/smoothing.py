@@ -1,15 +1,15 @@
 """Smoothing of noisy samples for `GradientLaw(gain="auto")`, with no noise level given.
 
-The law differentiates what the sensors say: noise of w and noise of B(w) are correlated, and what
-smoothing takes from B(w) moves with w. Neither averages out, and both look like a wrong q. So alpha
-is not the one of the best u_alpha, but the one where the two biases cancel. With z the data, n
-their noise, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
+The law differentiates the readings: noise of w and noise of B(w) are correlated, and the part that
+smoothing removes from B(w) moves with w. Neither averages out, and both look like a wrong q. So
+alpha is not the one of the best u_alpha, but the one where the two biases cancel. With z the data,
+n their noise, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
 
     E (u_alpha, L (u_alpha - u)) = 0,    that is    E (u_alpha, L (z - u_alpha)) = E (u_alpha, L n).
 
 Smoothing is Tikhonov's, iterated: u_j minimises ||G v - z||_Z^2 + alpha |v - u_{j-1}|^2. Its
-factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of what is
-smooth falls with the power, that of noise does not. Both sides of the balance are running means
+factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of smooth
+functions falls with the power, that of noise does not. Both sides of the balance are running means
 over the samples so far, for each alpha of a grid, and alpha is the first where they meet.
 
 The level of the noise is read from the rougher half of the modes, where a smooth state has next to
@@ -17,13 +17,13 @@ none, and there from products of successive differences in time,
 
     E (z_k - z_{k-1}) (z_{k-1} - z_{k-2}) = -sigma^2:
 
-noise turns back, what moves goes on. It is not more than the observation states. Noise is
-independent from sensor to sensor with the deviations that the observation states, or white in Z if
-it states none.
+noise turns back, a motion goes on. The level is not taken larger than the observation states. Noise
+is independent from sensor to sensor with the standard deviations that the observation states, or
+white in Z if it states none.
 
-Exact data turn back nowhere. The same products of second derivatives of the data tell
-(`NoiseDetector`) before any mode is computed, which are those of a dense matrix: then alpha is zero
-and a sample costs a few products with a sparse one.
+Exact data turn back nowhere. The same products, of second derivatives of the data, detect this
+(`NoiseDetector`) before any mode is computed, since the modes are those of a dense matrix: then
+alpha is zero and a sample costs a few products with a sparse one.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class NoiseDetector:
         self.small = int(shown.sum()) < FEWEST
 
     def add(self, balance: Balance, z: Array, boundary: Array) -> tuple[Balance, bool]:
-        """Return the means with what a sample tells of noise, and whether the samples are noisy.
+        """Return the means with the noise products of a sample, and whether the samples are noisy.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class NoiseDetector:
 
 
 class SmoothingOperator:
-    """G_alpha for one set of present sensors, and what a sample adds to the balance."""
+    """G_alpha for one set of present sensors, and the terms of a sample in the balance."""
 
     def __init__(self, observed: Observed, present: Array) -> None:
         self.spectral = filter_ = Spectral(Tikhonov("V"), observed, present)
@@ -179,9 +179,9 @@ class SmoothingOperator:
         return out
 
     def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
-        """Return the modes of the data, and those without what the boundary alone continues to.
+        """Return the modes of the data, and those less the smooth continuation of the boundary.
 
-        Of samples z of shape (samples, sensors), with boundary values of shape (samples, n).
+        For samples z of shape (samples, sensors), with boundary values of shape (samples, n).
         """
         filter_, held = self.spectral, boundary[:, self.fixed].T
         known = z[:, filter_.present].T - self.G @ held

@@ -119,8 +119,8 @@ def _position(filter_: Filter, x: FilterState) -> Position:
 def _distance(reduction: Reduction, x: FilterState, a: Array) -> tuple[float, int]:
     """Return the squared distance of an estimate from its prior, and its degrees of freedom.
 
-    Over the directions that the data have told: there the estimate is distributed as the prior
-    less what is left of it, N(0, 1 - P).
+    The distance is over the directions where the data have halved the prior variance: there the
+    estimate is distributed as N(0, 1 - P), prior less posterior covariance.
     """
     if reduction.moves:
         return 0.0, 0

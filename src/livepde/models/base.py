@@ -24,8 +24,8 @@ class Variable:
     optional
         Whether it may be left out.
     transform
-        Of an unknown in a case that `livepde init` writes: "log" of what is positive, "logit" of a
-        share between 0 and 1; empty of what may be negative.
+        Transform of an unknown in a case that `livepde init` writes: "log" for a positive quantity,
+        "logit" for a share between 0 and 1; empty for a quantity that may be negative.
     """
 
     unit: str

@@ -1,4 +1,4 @@
-"""Verdict of a run on itself: trusted, caution or do not trust, with what speaks against it."""
+"""Verdict of a run on itself: trusted, caution or do not trust, with the findings against it."""
 
 from livepde.verdict.assess import Position, assess
 from livepde.verdict.directions import Dictionary, ScoreDirection

@@ -47,18 +47,18 @@ NAMED = 4  # causes that are kept
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Where the estimates of one member stand.
+    """Data on the estimates of one member, for its verdict.
 
     Attributes
     ----------
     ledger, member
-        The ledger, and which of its members.
+        The ledger, and the number of the member in it.
     moved
-        By how much each direction of each window has moved the estimate away from the truth, in
-        standard deviations that are reported: unknown -> (windows, directions).
+        Shift of the estimate from the truth by each direction of each window, in reported standard
+        deviations: unknown -> (windows, directions).
     distance
-        Squared distance of the estimate from the prior mean over what the prior and the data allow,
-        and its degrees of freedom.
+        Squared distance of the estimate from the prior mean, chi-square under the model, and its
+        degrees of freedom.
     sensors
         Names of the sensors.
     noise
@@ -101,8 +101,8 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
 def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
     """Return which errors of sensors would not show, and move an estimate beyond its interval.
 
-    One of less than `SEEN` standard errors is not seen, and none is larger than the amplitude of
-    its direction: what is usual.
+    An error of less than `SEEN` standard errors is not seen, and none is taken larger than the
+    amplitude of its direction, which is a usual size.
     """
     den = at.ledger.sums[at.member, 1, 0].sum(axis=1)
     hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
@@ -168,9 +168,9 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
 
 
 def _mended(at: Position, evidence: CauseEvidence) -> bool:
-    """Return whether what speaks against the model is long past.
+    """Return whether the evidence against the model is long past.
 
-    Nothing does in the windows that begin anew, neither in those of now nor, as long as the longest
+    There is none in the restarted windows: neither in the current ones nor, as long as the longest
     of them is young, in the one before it.
     """
     ledger, k = at.ledger, at.member
@@ -241,7 +241,7 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
 def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
     """Return the setting of a case that frees a cause of a size, empty if there is none.
 
-    What is freed has a prior standard deviation of twice the size.
+    The freed unknown has a prior standard deviation of twice the size.
     """
     keys = {"offset": "offset", "gain": "gain", "position": "at_std"}
     if direction.kind in keys:

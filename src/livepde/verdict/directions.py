@@ -1,4 +1,4 @@
-"""Dictionary of causes: what a sensor or a process may do that the model does not know of."""
+"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks."""
 
 from __future__ import annotations
 

@@ -174,7 +174,7 @@ def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array
 
 
 def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, Array]:
-    """Return correlation and variance of what the largest direction of each window leaves."""
+    """Return correlation and variance of the residuals of the largest direction of each window."""
     _, _, squares, products, pairs = noise
     count = noise[0]
     if log_e.size:
@@ -273,8 +273,8 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
 def disagreement(ledger: Ledger, member: int = 0, wider: float = 1.0) -> tuple[float, Array] | None:
     """Return p-value and share of each sensor of the test of whether sensors agree; None without.
 
-    Q = sum_i Bp_i^T F_i^+ Bp_i, Bp_i = B_i - F_i F^-1 sum B: the heterogeneity of what each sensor
-    alone says of the unknowns (Cochran 1954), chi-square under the model.
+    Q = sum_i Bp_i^T F_i^+ Bp_i, Bp_i = B_i - F_i F^-1 sum B: the heterogeneity of the estimates of
+    the unknowns by each sensor alone (Cochran 1954), chi-square under the model.
     """
     score, information = (part.sum(axis=0) for part in _record(ledger, member, wider))
     sensors, k = score.shape

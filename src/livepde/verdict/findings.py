@@ -61,17 +61,17 @@ class Cause:
     Attributes
     ----------
     kind, subject
-        What is wrong ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
-        "loss", "flux", "initial"), and of which sensor, channel, boundary or unknown.
+        Kind of error ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
+        "loss", "flux", "initial"), and the sensor, channel, boundary or unknown that it concerns.
     text
-        The same in words, with its size.
+        The cause in words, with its size.
     share
-        Part of the misfit beyond the noise that it explains, 0 to 1; NaN if not known.
+        Part of the misfit beyond the noise that the cause explains, 0 to 1; NaN if not known.
     remedy
-        What to do.
+        Recommended action, as a sentence.
     setting
-        "key=value" of a case that frees it, as `livepde run --set` takes it; empty if there is
-        none.
+        "key=value" of a case that makes the cause an unknown, as `livepde run --set` takes it;
+        empty if there is none.
     """
 
     kind: str
@@ -96,7 +96,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that speaks against the estimates.
+    """One result of a test that speaks against the estimates.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Finding:
     severity
         "note" (worth knowing), "caution" or "do not trust".
     text
-        What was found, as a sentence.
+        The finding, as a sentence.
     subject
         The unknown or sensor concerned; empty for the whole run.
     evidence, measure
@@ -113,10 +113,10 @@ class Finding:
     causes
         Likely causes, the likeliest first.
     remedy
-        What to do.
+        Recommended action, as a sentence.
     shift
-        Unknown -> by how many of its standard deviations the estimate would move if the first
-        cause were taken into account.
+        Unknown -> shift of its estimate, in its standard deviations, if the first cause were taken
+        into account.
     """
 
     what: str
@@ -259,7 +259,7 @@ class Verdict:
     findings
         What speaks against them, the worst first, and notes.
     untested
-        What was not tested, and why.
+        Tests that were not made, and why.
     unseen
         Errors that the data would not show and that would yet move an estimate by more than its
         interval, as sentences, the worst first.

@@ -1,7 +1,7 @@
 """Scores of a sample for the ledger, and sensitivities to the causes of misfit.
 
-Let delta be by how much the truth and the estimate of [u; a] differ because of a cause of amplitude
-one, and f what that cause does to the readings directly. A Kalman filter that does not know of it
+Let delta be the difference of the truth and the estimate of [u; a] due to a cause of amplitude one,
+and f the direct effect of that cause on the readings. A Kalman filter without a model of the cause
 has the innovations r = r_0 + theta g with
 
     g = H delta + f,    delta <- delta - K g,    delta <- S delta between samples
@@ -18,8 +18,8 @@ have moved rows since the last sample; each sample that waits keeps its M and Y.
 
     w_k = M_k (w_(k-1) - Y_(k-1) f_(k-1)),    g_k = f_k + Y_k^T w_k.
 
-So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w says by how much the
-estimate of the unknowns is off for each unit of the cause.
+So w costs no solve: it is exact for a linear filter, whatever moves, and C^T w is the bias of the
+estimate of the unknowns for each unit of the cause.
 """
 
 from __future__ import annotations
@@ -46,21 +46,21 @@ SAME = 1e-12  # relative difference of readings that are the same
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What a filter knows when a sample comes, before it uses it; in units of the noise.
+    """Prior of a filter at a sample, with the sample; in units of the noise.
 
     Attributes
     ----------
     C, causes
         Square root of the covariance of the unknowns, (members, r, k), and M, (members, r, rank).
     a, q
-        Return reduced and latent unknowns, as they are estimated: not every judge asks.
+        Functions that return the estimated reduced and latent unknowns: not every judge asks.
     u
-        The state, as it is estimated.
+        The estimated state.
     Y, d, used
-        Observed square root, (members, r, sensors), innovations less what the discretisation is
-        known to do to them, and which values are used.
+        Observed square root, (members, r, sensors), innovations less their shift by the estimated
+        discretisation error, and the mask of the values that are used.
     z, predicted, noise
-        Readings, what was expected of them, and the noise, (members or 1, sensors).
+        Readings, their predictions, and the noise, (members or 1, sensors).
     at
         Time and inputs.
     """

@@ -1,4 +1,4 @@
-"""Ledger of running sums over the innovations: what a verdict is drawn from, in constant memory.
+"""Ledger of running sums over the innovations: the data of a verdict, in constant memory.
 
 Every array has the members as its leading axis. A *direction* is a possible cause of misfit with
 an amplitude of one: an offset of a sensor, a wrong boundary value, a jump of an unknown. If it is
@@ -65,7 +65,7 @@ class Ledger:
     process
         States by which the process answers a missing term, (members, terms, n).
     readings, reached
-        What the sensors see of those at two times, (members, 2, terms, sensors), and these times,
+        Readings due to those states at two times, (members, 2, terms, sensors), and these times,
         (members, 2).
     sound
         Whether nothing spoke against the model in the longest window that ended last, (members,).

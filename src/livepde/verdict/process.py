@@ -1,8 +1,8 @@
 """Answers of the process to terms that its model may lack: a source, a loss, a boundary value.
 
 The free response p of the state to a term, M p' + (B + A q)' p = load, goes on by implicit Euler
-steps over several samples, and what the sensors see of it is interpolated between them. It is
-needed to a tenth of its size, to tell causes apart, and so costs a fraction of a step.
+steps over several samples, and its effect on the sensors is interpolated between these steps. The
+response is needed to a tenth of its size, to tell causes apart, and so costs a fraction of a step.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Running sums of sensors that are never assimilated, against what is predicted of them."""
+"""Running sums of the prediction errors of sensors that are never assimilated."""
 
 from __future__ import annotations
 
@@ -81,9 +81,9 @@ class WithheldLedger:
     def findings(self, names: Sequence[str]) -> Iterator[Finding]:
         """Return which sensors are missed by more than prediction and noise allow.
 
-        The errors of one sensor go together as far as they come from the unknowns: so their mean
-        square over what is predicted counts as one draw of chi-square. The noise is what successive
-        differences show.
+        The errors of one sensor are correlated as far as they come from the unknowns: so their mean
+        square over its expected value counts as one draw of chi-square. The noise is estimated from
+        successive differences.
         """
         for k, name in enumerate(names):
             count, pairs, differences, squares, errors, *_, variance = self.sums[:, k]

@@ -6,10 +6,10 @@ The Jacobian of a stage is
 
 and no matrix of all of it is ever formed: its blocks have the patterns of the forms. The Schur
 complement H + A_in^T R S^{-1} A is dense; C = H + (a sparse matrix of the size of the product)
-stands for it. Of a field q that A does not differentiate that is the diagonal matrix that does to
-constants what the product does: smooth functions hardly miss the difference, and rough ones are
-ruled by G_Q. Else it is A_in^T R D^{-1} R^T A with D, the lumped mass times 1/h + theta, in the
-place of S. An approximate solution with K is then
+stands for it. For a field q that A does not differentiate this matrix is diagonal and agrees with
+the product on constants: for smooth functions the difference is small, and rough ones are ruled by
+G_Q. Else it is A_in^T R D^{-1} R^T A with D, the lumped mass times 1/h + theta, in the place of S.
+An approximate solution with K is then
 
     u = S^{-1} b_u,    q = C^{-1} (b_q + A_in^T R u),    u = S^{-1} (b_u - A q).
 

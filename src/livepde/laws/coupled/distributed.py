@@ -170,7 +170,7 @@ def _refuse_parts(terms: StageTerms, ranks: int) -> None:
 
 
 def _is_plain(terms: StageTerms) -> bool:
-    """Return whether what the ranks know of is all there is to a stage."""
+    """Return whether a stage has only terms that are implemented on several ranks."""
     forms, model = terms.forms, terms.forms.model
     fields = all(isinstance(b, FieldBlock) for b in model.parameter_space.blocks.values())
     latent = model.latent.dim == model.parameter_space.dim and not model.latent.generator.nnz

@@ -8,8 +8,8 @@ With w = u_alpha + P u and r = R u - u_alpha, the unknowns y = (u, q) of one imp
 
 together (`Metric` says what H and load are), so that with full data the two terms with A cancel in
 the energy, as in the paper (align:neplusnr). Over omega w is the data, elsewhere the estimate.
-What the stage before has left of its residual, times its step over this one's, is taken from F and
-load: so what is left in a run of stages does not add up.
+The remaining residual of the stage before, times the ratio of its step to this one, is subtracted
+from F and load: so the residuals of a run of stages do not add up.
 
 theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
 in q, A(w) in the second line is its derivative.
@@ -47,7 +47,7 @@ ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exa
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """What the data alone say over omega: A(w), a matrix or its data, and B(w), shape (n,)."""
+    """Terms over omega that the data determine: A(w), a matrix or its data, B(w), shape (n,)."""
 
     A: Any
     flux: Array
@@ -68,8 +68,8 @@ class StageProblem:
     metric
         H and load of the second line.
     left
-        What the stage before has left of its residual and this one makes up for, a dual vector,
-        shape (n + m,); None: stages do not make up for what is left.
+        Remaining residual of the stage before, for which this one makes up, a dual vector, shape
+        (n + m,); None: residuals are not carried from stage to stage.
     """
 
     c: Array
@@ -82,14 +82,14 @@ class StageProblem:
 
 @dataclass(frozen=True, eq=False)
 class StageData:
-    """A stage with all that is computed once for it.
+    """A stage with the data that are computed once for it.
 
     Attributes
     ----------
     problem
         The stage.
     source, load
-        F and the load, without what the stage before has left, shapes (n,) and (m,).
+        F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
     inside
         A and B over omega, where the data give all of w there.
     sizes
@@ -123,7 +123,7 @@ class StageIterate:
     scales
         Dual norms of the largest terms of the two lines.
     w, r
-        What A and B see over omega, and the observed residual, shape (n,).
+        Argument of A and B over omega, and the observed residual, shape (n,).
     A_in
         A(w) over omega, shape (n, m), where it is a matrix of its own.
     theta
@@ -150,7 +150,7 @@ class StageIterate:
 
 @dataclass(frozen=True, eq=False)
 class StageTerms:
-    """What all solvers of a stage share: its forms, gains and norms.
+    """Terms of a stage that all solvers share: its forms, gains and norms.
 
     Parameters
     ----------
@@ -274,7 +274,10 @@ class StageTerms:
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
 
     def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
-        """Return a stage, from its F on the free coefficients and what the data say over omega."""
+        """Return a stage, from its F on the free coefficients and the terms of the data on omega.
+
+        The remaining residual of the stage before is subtracted here.
+        """
         load, left = problem.metric.load, problem.left
         if left is not None:
             source, load = source - left[: self.n], load - left[self.n :]
@@ -287,7 +290,7 @@ class StageTerms:
     def sizes(
         self, problem: StageProblem, source: Array, load: Array
     ) -> tuple[float, float, float]:
-        """Return the sizes of what is given of a stage, see `StageData`."""
+        """Return `StageData.sizes`: scales of both residuals, and the norm of u_alpha."""
         # Where nothing moves, all terms of a line are rounding errors, and none is a scale.
         unchanged = np.square(problem.c) * self.diagonal
         least = math.sqrt(float(unchanged[: self.n].sum())) / problem.h
@@ -353,7 +356,7 @@ class StageTerms:
         return row if row.any() else None
 
     def limited(self, data: StageData, at: StageIterate, allowed: float) -> bool:
-        """Return true if each line is as small as allowed, or what rounding errors make of it.
+        """Return true if the residual of each line is as small as allowed or as its rounding error.
 
         Line by line: one that is small beside the rounding errors of the other is not solved.
         """
@@ -363,7 +366,7 @@ class StageTerms:
         return all(line <= max(allowed * scale, rounding) for line, scale, rounding in sizes)
 
     def rounding(self, data: StageData, at: StageIterate) -> tuple[float, float]:
-        """Return the dual norms of what rounding errors make of both lines at a point."""
+        """Return bounds of the rounding errors of both lines at a point, in dual norms."""
         forms, model, n = self.forms, self.forms.model, self.n
         u, q = np.abs(at.y[:n]), np.abs(at.y[n:])
         problem, moment = data.problem, data.problem.moment
@@ -411,7 +414,7 @@ class StageSolver(ABC):
 
     @property
     def carried(self) -> float:
-        """Relative accuracy of r where the next stage makes up for what is left."""
+        """Relative accuracy of r where the next stage makes up for the remaining residual."""
         return CARRIED
 
     def accuracy(self, data: StageData) -> float:
@@ -428,10 +431,10 @@ class StageSolver(ABC):
 
     @abstractmethod
     def prepare(self) -> None:
-        """Compute what does not depend on the samples."""
+        """Compute the parts that do not depend on the samples."""
 
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        """Return a stage, with what the data alone say over omega.
+        """Return a stage, with the terms over omega that the data alone determine.
 
         Parameters
         ----------

@@ -37,7 +37,7 @@ class StageForms:
     Parameters
     ----------
     model, split
-        The process, and what of its state is observed.
+        The process, and the split of its state into an observed and a hidden part.
     M_op, N_op
         Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
     nu

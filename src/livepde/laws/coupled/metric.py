@@ -1,4 +1,4 @@
-"""The metric of the parameter in one stage: what stands before q in the second line."""
+"""The metric of the parameter in one stage: the operator on q in the second line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Metric:
     drift
         Weight of G_Q K, 1/gain.
     load
-        What does not depend on q, shape (m,).
+        Terms of the right-hand side that do not depend on q, shape (m,).
     information
         Data of J, in the pattern that the stage was made with; None: zero.
     theta

@@ -120,7 +120,7 @@ class CoupledStage:
     Attributes
     ----------
     carries
-        True if the next stage makes up for what one has left of its residual.
+        True if each stage makes up for the remaining residual of the one before.
     """
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
