@@ -121,7 +121,7 @@ class FleetRecords:
         return np.stack(columns, axis=1)
 
     def _profiles(self, u: Array, factors: Factors) -> dict[str, Array]:
-        """Return values and deviations of the state at the vertices, (members, vertices) each."""
+        """Return values and standard deviations of the state, (members, vertices) each."""
         found: dict[str, Array] = {}
         members, _, r = factors.u.shape
         order = vertex_order(self.model)

@@ -90,7 +90,8 @@ class JoinedStates:
         leaves = checkpoint.flatten(state)
         self._put_log(which, leaves.pop(LOG))
         changed = {path: new for path, new in leaves.items() if new is not self._taken.get(path)}
-        # A view may be one of what is written now: a filter that becomes the older one.
+        # An array may be a view of one that is overwritten now, as of a filter that becomes the
+        # older one: it is copied first.
         changed = {path: new if new.base is None else new.copy() for path, new in changed.items()}
         for path, new in changed.items():
             self._put_leaf(which, path, new)

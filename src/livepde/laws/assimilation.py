@@ -108,7 +108,8 @@ class UpdateOptions:
     Attributes
     ----------
     gate, patience
-        Innovations beyond `gate` expected deviations are refused, `patience` times in a row.
+        Innovations beyond `gate` expected standard deviations are refused, `patience` times in a
+        row.
     adaptive
         True if the noise is a first guess whose multiple is found from the samples; their
         likelihood is kept then, too.
@@ -162,7 +163,8 @@ def _absorbed(
     off = None if shadows is None else shadows.seen(x, span.end)
     expected, told = e, d
     if shadows is not None and off is not None:
-        # What the discretisation is known to do to the innovations has a finding of its own.
+        # Shifts of the innovations by the known discretisation error have a finding of their own:
+        # neither the gate nor the verdict may count them again.
         known = off[:, shadows.counted].sum(axis=1) / noise
         expected, told = d / np.sqrt(variance + known * known), d + known
     far = _far(x, expected, used, options.gate)
@@ -174,7 +176,7 @@ def _absorbed(
         newest = np.where(kept | (refused > 1), e, np.nan)
         used, whole = kept, bool(kept.all())
         e = np.where(used, e, np.nan)
-    if not whole:  # zeros tell nothing: what is missing takes part as such
+    if not whole:  # missing values take part as zeros, which carry no information
         Y, d, told = (
             np.where(used[:, None], Y, 0.0),
             np.where(used, d, 0.0),
@@ -191,8 +193,8 @@ def _absorbed(
         parts |= _learned(x, used, d, noise, made)
     if shadows is not None and off is not None:
         parts["shadows"] = shadows.updated(x, new, made, used / noise, off, span.t1)
-    # What is not finite of U is not finite in du, whatever its weight. An innovation whose square
-    # overflows would leave statistics that are not finite.
+    # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
+    # square overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
     finite = np.isfinite(sums + largest * largest)
     return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)

@@ -149,7 +149,7 @@ class AutoLaw(Law[Bank, AutoState]):
         rank = max(2 * reduction.size + 4, work.filter.rank)
         drifts = bool(reduction.still.any())
         candidates = tuple(c for c in CANDIDATES if drifts or not c.drift)
-        # What moves far has no use for a reference that stays.
+        # A replay keeps one reference, which is of no use for unknowns that move far from it.
         walks = reduction.moving(0.0) > 0
         replays = np.array([not (walks or c.drift) for c in candidates])
         judge = work.filter.judge
@@ -244,8 +244,8 @@ class AutoLaw(Law[Bank, AutoState]):
         filters = work.filters(tick, state.noise)
         new, reports = self.member.step_members(filters, members, filters.filter.span(interval))
         change = new.now.evidence - members.now.evidence
-        # A replay mends the evidence of all samples in its window: what is left of them. The window
-        # may begin anew with this sample.
+        # A replay corrects the evidence of all samples in its window, of which the fading weights
+        # remember a share alone. The window may begin anew with this sample.
         share = np.minimum(1.0, MEMORY / (members.assimilated + 1.0))
         change = np.where(new.due != members.due, change * share, change)
         if work.stated:

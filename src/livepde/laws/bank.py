@@ -1,4 +1,4 @@
-"""A bank of filters: what each member assumes, and how far it is believed."""
+"""A bank of filters: the hypothesis of each member, and its weight given the samples."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Bank:
 
     @cached_property
     def scales(self) -> Array:
-        """Logarithms of the factors on prior deviations, shape (candidates,)."""
+        """Logarithms of the factors on prior standard deviations, shape (candidates,)."""
         return np.log([candidate.scale for candidate in self.candidates])
 
     def filters(self, tick: float, noise: Array) -> SensitivityWork:
@@ -105,18 +105,19 @@ class Bank:
 
 @dataclass(frozen=True, eq=False)
 class AutoState:
-    """The members of the bank, and how far each is believed.
+    """State of the bank: its members and their weights.
 
     Attributes
     ----------
     noise
-        First guess of the deviation of each sensor, shape (sensors,); NaN while there is none.
+        First guess of the standard deviation of the noise of each sensor, shape (sensors,); NaN
+        while there is none.
     tick
         Usual time from one sample to the next, which drifts refer to; 0 before there is one.
     waiting
         Log of the samples that wait for a first guess of the noise.
     start
-        A filter before the first of them.
+        A filter before the first waiting sample.
     members
         Filters of the members that are awake; `members.now.member` are their numbers.
     weights
@@ -179,7 +180,7 @@ def numbered(state: SensitivityState, number: int, due: int) -> SensitivityState
 
 
 def scaled(state: SensitivityState, scale: float) -> SensitivityState:
-    """Return a filter before the first sample with another prior deviation of the unknowns."""
+    """Return a filter before the first sample, with the prior standard deviations scaled."""
     start = state.start
     unknown = start.C.any(axis=2, keepdims=True)  # other rows are the noise of readings at first
     x = replace(start, U=np.where(unknown, scale * start.U, start.U), C=scale * start.C)

@@ -217,7 +217,7 @@ class Belief:
         return float(rest @ rest) / variance if variance > 0.0 else 0.0
 
     def left(self, rows: Any) -> Array:
-        """Return the share of the prior deviation that is left of each of some coefficients of q.
+        """Return the remaining share of the prior standard deviation of some coefficients of q.
 
         NaN without covariance.
         """
@@ -229,7 +229,7 @@ class Belief:
         return left
 
     def modes_left(self, part: Any) -> Array:
-        """Return the share of the prior deviation that is left of each mode of a part of q.
+        """Return the remaining share of the prior standard deviation of modes of a part of q.
 
         The modes are those of the posterior relative to the prior, so that their shares do not
         depend on units: as many as the part has reduced coordinates, the least known first. None

@@ -193,6 +193,7 @@ class Filter:
         F = self.reduction.transition(h)
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
+        # A coordinate that gains in one member has a row in all of them: members share one array.
         grows = np.flatnonzero((gained > 0.0).any(axis=0))
         members, _, k = x.C.shape
         new = np.zeros((members, len(grows), k))
@@ -226,6 +227,8 @@ class Filter:
     def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
         length = span.t1 - span.start
+        # The process noise of moving unknowns has to act on u within the span, not at its end
+        # alone, so that these take each substep by itself.
         count = self.problem.control.count(length) if self.moves else 1
         at = [span.start + k / count * length for k in range(count)] + [span.t1]
         taken = 0
@@ -251,6 +254,8 @@ class Filter:
         shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
+            # The estimate relative to the linearisation point, [du; da], is propagated as one more
+            # tangent: so it follows the same linear model as the rows of [U C].
             C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
             found = self.reduction.directions(at.q, C)
             if not shadows:  # which change no number of the others
@@ -264,6 +269,8 @@ class Filter:
         def stage(columns: Array, t: float, h: float) -> Array:
             nonlocal kept
             q, along = end.q, at_end
+            # An inner stage sees the unknowns at its own time: those of the end would reduce the
+            # order of the time scheme.
             if self.moves and t != stop:
                 now = self.predict_unknowns(x, t - start)
                 q, along = now.q, directions(now)
@@ -301,6 +308,8 @@ class Filter:
         Wt, row = W.transpose(0, 2, 1), half[:, None]
         U, C = Wt @ x.U, Wt @ x.C
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
+        # Past values and causes are coordinates on the rows of the square root, and so have to be
+        # multiplied by the same matrix as U and C.
         if x.past.shape[2]:
             past = Wt @ x.past
             new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
@@ -311,6 +320,8 @@ class Filter:
     def remembered(self, x: FilterState) -> FilterState:
         """Return the state that follows the values of a of now also from now on."""
         now = self.reduction.reduced(x.q - self.problem.model.latent.prior) + x.da
+        # As columns of their own on the same rows, these values keep their covariance with the
+        # later ones, by which every later sample smooths them.
         past, dpast = np.concatenate([x.past, x.C], axis=2), np.concatenate([x.dpast, now], axis=1)
         return changed(x, past=past, dpast=dpast)
 
@@ -328,6 +339,8 @@ class Filter:
         da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
             beyond = (within != estimate).any(axis=1)
+            # Least squares raises on a square root that is not finite: such a member fails with a
+            # status of its own, and must not stop the others.
             for k in np.flatnonzero(beyond & np.isfinite(x.C).all(axis=(1, 2))).tolist():
                 shift = self.reduction.reduced(within[k] - x.q[k])
                 da[k] = x.da[k] - shift
@@ -348,6 +361,7 @@ class Filter:
         coordinates only.
         """
         members, _, k = x.C.shape
+        # The added rows are zero in U, which makes the added error independent of the state.
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         C = np.concatenate([x.C, np.broadcast_to(rows, (members, *rows.shape))], axis=1)
         U, past, causes = (_extended(part, len(rows)) for part in (x.U, x.past, x.causes))
@@ -356,6 +370,8 @@ class Filter:
 
     def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
+        # The prior has no covariance with the state or with earlier values: a zero U, past and
+        # causes say that nothing learned so far counts any more.
         members, k = x.da.shape
         prior = np.broadcast_to(self.problem.model.latent.prior, x.q.shape)
         C = np.broadcast_to(np.eye(k), (members, k, k))
@@ -378,6 +394,8 @@ class Filter:
         rotated = rotation.transpose(0, 2, 1) @ x.U
         alone = rotated[:, k:]
         weighted = alone * self.scale
+        # The Gram matrix of the rows is small however fine the mesh is; halved digits do not matter
+        # for the choice of directions.
         square = weighted @ weighted.transpose(0, 2, 1)
         square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # reported by the caller
         _, vectors = np.linalg.eigh(square)
@@ -426,6 +444,7 @@ def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
     if members > FEW:
         upper: Array = np.asarray(np.linalg.qr(stacked.transpose(0, 2, 1), mode="r"))
         good = np.isfinite(upper).all(axis=(1, 2))
+        # An inverse of entries that are not finite may raise, and so stop all members.
         inverse = np.full((members, r, r), np.nan)
         inverse[good] = np.linalg.inv(upper[good, :r, :r])
         return inverse, upper[:, :r, r], upper[:, r, r] ** 2
@@ -435,6 +454,7 @@ def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
         factored = lapack.dgeqrf(stacked[k].T, lwork=BLOCK * (r + 1), overwrite_a=1)[0]
         last[k] = factored[: r + 1, r]
         inverse[k] = lapack.dtrtri(factored[:r, :r])[0]
+    # LAPACK leaves the reflectors of the factorisation below the diagonal.
     return inverse * _upper(r), last[:, :r], last[:, r] ** 2
 
 

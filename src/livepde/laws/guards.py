@@ -95,6 +95,7 @@ class Scale:
     def add(self, z: Array, d: Array) -> Scale:
         """Return the value after a sample z with innovations d, NaN where missing."""
         first = np.where(np.isnan(self.first), np.abs(d), self.first)
+        # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
     def beyond(self, d: Array, noise: Array) -> Array:
@@ -104,8 +105,10 @@ class Scale:
         the sensor that has varied most: the range of a sensor that a wave has not reached yet says
         nothing about the size of the wave. Shape (members,).
         """
+        # A sensor that has shown one value has no range yet: its first innovation stands in for it.
         ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
         unseen = np.isnan(self.first) | np.isnan(self.low)
         missed = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
         largest = np.where(unseen, 0.0, ranges).max(axis=1)
+        # Without any reading there is nothing to miss, and a runaway must not be claimed.
         return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))

@@ -11,7 +11,7 @@ from livepde.linalg import Array
 __all__ = ["GUESSED", "PATIENCE", "first_guess"]
 
 ORDERS = (1, 2, 3, 4, 5)  # of differences
-MEDIAN = 0.6745  # of the size of a normal variable of deviation 1
+MEDIAN = 0.6745  # of the absolute value of a normal variable of standard deviation 1
 ROUNDING = 1e-12  # of the size of readings: no noise
 SCATTER = 0.5  # of the logarithm of such a guess
 GUESSED = 12  # samples from which the noise is guessed where nobody states it

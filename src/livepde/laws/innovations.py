@@ -63,6 +63,8 @@ class Innovations:
         Members that were not `measured`, shape (members,), stay as they are; default all were.
         `newest` are those with some that were not used; default e.
         """
+        # Every sum is a product of two rows of the statistics, so that one matrix product serves
+        # all of them.
         seen, before = np.isfinite(e), self.sensors
         newest = e if newest is None else newest
         if seen.all():
@@ -81,12 +83,14 @@ class Innovations:
     @property
     def ratio(self) -> Array:
         """Mean of e^2 of each member, shape (members,); 1 if the noise level is right."""
+        # `TINY` on both sides makes the ratio 1, that of a right model, before any innovation.
         ratio: Array = (self.sums[:, 2] + TINY) / (self.sums[:, 0] + TINY)
         return ratio
 
     @property
     def correlation(self) -> Array:
         """Correlation of successive innovations, (members,); 0 if the model explains the data."""
+        # The bound keeps (1 + rho)/(1 - rho) finite, and rounding can exceed 1.
         correlation = self.sums[:, 4] / (self.sums[:, 3] + TINY) / (self.ratio + TINY)
         return np.minimum(np.maximum(correlation, -LARGEST_CORRELATION), LARGEST_CORRELATION)
 
@@ -154,6 +158,8 @@ class Innovations:
         count, weight = self.sums[:, 0], self.sums[:, 1]
         rho = self.unbiased_correlation
         following = self.ratio * (1.0 + rho) / (1.0 - rho)
+        # For white noise the mean square has the variance 2/N, and (1 + rho)/(1 - rho), about
+        # 1 + 2 rho, the variance 4/N: together 6/N.
         error = np.sqrt(6.0 * weight + TINY) / (count + TINY)
         return np.sqrt(_beyond_chance(following, error))
 

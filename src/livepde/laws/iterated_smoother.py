@@ -81,6 +81,8 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
     the variance of constant unknowns in all directions, and an iteration hardly moves the estimate.
     """
     count, moved, shares = int(state.assimilated[0]), math.nan, _shares(state.start, state.now)
+    # While all directions keep most of their variance, no estimate has moved far enough for its
+    # linearisation to matter.
     if shares[0] < HALF:
         found = iterated_smoother(work, state)
         moved = math.inf if found is None else _apart(work.filter, found, state.now)
@@ -112,6 +114,8 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
         if one is None:
             continue
         ends.append(_descended(samples, one))
+        # Gauss-Newton steps end in a local minimum: other beginnings are spared only if this one
+        # explains the samples, and either these are many or its first linearisation held.
         if samples.explained(ends[-1]) and (len(intervals) >= ENOUGH or _holds(one)):
             break
     if not ends:
@@ -120,6 +124,7 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     best = _Samples(work, state, opening, intervals).about(trajectory)
     if best is None:
         return None
+    # Only the search needs earlier values, which would cost columns in each later update.
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
 
 
@@ -153,6 +158,7 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
     """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
+        # Where the step is within the uncertainty, the second-order error is far below it.
         if _deviations(best.x, step[-1]) <= CONVERGED:
             break
         step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
@@ -168,6 +174,7 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
 def _shares(before: FilterState, now: FilterState) -> Array:
     """Return the remaining shares of the variance of the unknowns of one member, ascending."""
     earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
+    # The eigenproblem needs a definite matrix, also where a coordinate began without variance.
     found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
     return found
 
@@ -223,6 +230,7 @@ class _Samples:
         filter_, reduction = self.work.filter, self.work.filter.reduction
         prior = filter_.problem.model.latent.prior
         known = self.state.start.q[0]
+        # No trajectory of the modes can move the rest of the start, which therefore is kept.
         beyond = known - prior - reduction.Phi @ reduction.reduced(known - prior)  # of the modes
         q = known if trajectory is None else prior + beyond + reduction.Phi @ trajectory[0]
         x, misfit = self._placed(q), 0.0
@@ -246,6 +254,8 @@ class _Samples:
             followed.append(reduction.reduced(x.q[0] - prior))
             misfit += missed(filter_, x, interval)
             if filter_.moves:
+                # The density of an increment is that given the value before: its variance is that
+                # of the process noise alone.
                 gained = reduction.gained(h, nothing, filter_.drifts(x.member))[0]
                 misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
@@ -269,6 +279,8 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
     predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
     noise = np.sqrt(x.level[0]) * filter_.noise_of(interval)[0]
     e = np.abs((interval.z1 - predicted[0]) / noise)
+    # Beyond `OUTLIER` the cost grows like a logarithm, so that no wrong reading chooses the
+    # trajectory.
     beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))
     return float(np.nansum(np.minimum(e, OUTLIER) ** 2 + beyond))
 

@@ -27,9 +27,9 @@ class ReducedEvolution:
     Attributes
     ----------
     part
-        Where its reduced coordinates stand: copies times modes.
+        Slice of its reduced coordinates: copies times modes.
     model, std
-        Its model in the latent coefficients, and the prior deviation of its latent coefficients.
+        Evolution model of the latent coefficients, and their prior standard deviation.
     """
 
     part: slice
@@ -62,9 +62,9 @@ class Reduction:
     problem
         Model and sensors.
     Phi
-        Prior deviations for numbers, leading modes of the prior for fields, shape (m, k).
+        Prior standard deviations for numbers, leading modes of the prior for fields, shape (m, k).
     evolutions
-        How the coordinates of each unknown move by themselves.
+        Evolution models of the coordinates of each unknown.
     """
 
     problem: Problem
@@ -312,9 +312,9 @@ class Reduction:
         return np.asarray(np.sqrt(self._left_out))
 
     def rest(self, age: float, drift: float) -> Array:
-        """Return the deviation of each latent coefficient in the modes that are left out, (m,).
+        """Return the standard deviation of latent coefficients in the omitted modes, (m,).
 
-        They are as the prior has them, and have moved for a time `age`.
+        These coefficients keep their prior, and have moved for a time `age`.
         """
         if age == 0.0 or not self._left_out.any():
             return self._unseen

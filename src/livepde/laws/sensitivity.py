@@ -200,6 +200,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "observation (one number, or one for each sensor) or to the law."
             )
         reduction = Reduction.of(problem, self.modes)
+        # Constant unknowns never need more rows than coordinates. Moving ones and noisy inputs add
+        # rows at each step, and a compression needs room for the state's own uncertainty.
         moving = reduction.moving(self.drift)
         if self.jumps is not None:
             jumping = int(reduction.named(self.jumps.unknowns, "Jumps: unknowns").sum())
@@ -235,6 +237,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             followed = ShadowSet.of(filter_, MeanFilter.of(filter_), self.shadows)
             filter_ = replace(filter_, shadows=followed)
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
+        # A replay iterates the same linearisation: both would do the same work twice.
         iterated = 0 if self.replay else self.start_window
         return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
 
@@ -302,6 +305,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             parts = (filter_.problem, filter_.reduction, filter_.noise)
             x = with_initial_rows(state.start, *parts, moment)
             return state if x is state.start else _started(state, x)
+        # The initial state is a functional of the unknowns here: its derivative is the cross-
+        # covariance with them, so that samples correct both together from the first one on.
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
         x = changed(state.start, U=U)
         return changed(_started(state, x), initial=np.ones(1, dtype=bool))
@@ -318,6 +323,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return state
         problem, replays = filter_.problem, bool(state.replays[0])
         form = problem.model.form_initial
+        # The safeguards of a step never see a sample at the initial time: where this is not linear
+        # in the unknowns, it has to be iterated here.
         iterates = form is not None and not form.linear_in_parameter
         if self.guards is not None and not replays:
             iterates = iterates or not problem.observed.linear
@@ -330,6 +337,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
+            # The noise level is that before the sample, which would count in each iteration else.
             level, samples = state.now.level, state.now.samples
             x = changed(x, level=level, samples=samples, kept=state.now.kept)
         state = changed(state, reference=x.q)
@@ -390,6 +398,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
         """Return state and reports of all members after a sample of each."""
+        # A window goes back to the time and inputs of its first row, which a run without a sample
+        # at the initial time does not have yet.
         before = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
         new, told, usual = self._together(work, before, span)
         reports = reports_of(work, new.now, told)
@@ -401,6 +411,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             one, alone[k] = step_alone(work, take(before, k), span.member(k))
             if not alone[k].status.ok and len(state) == 1:
                 return state, reports.with_members(alone)
+            # The members share the rows of one log: whoever failed has an empty row there.
             while work.keeps_log and one.log.shape[1] <= before.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
             parts.append(one)
@@ -423,6 +434,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if len(span) > 1:
             usual = usual & span.together
         if self.replay is not None:
+            # A full store begins a new window, which relinearises: such a member steps alone.
             full = state.log.shape[1] + 1 - state.window > work.most
             usual = usual & ~(replays & full & ~state.replay.active)
         scale, watch = state.scale, state.watch
@@ -430,12 +442,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = usual & (replays | guards.within_reach(x.da - before.da))
             d = span.z1 - told.predicted
             scale = scale.add(span.z1, d)
+            # Ranges are at least as large as the noise, so that smaller innovations cannot run
+            # away: most samples are spared the exact test.
             if told.largest.max() > guards.runaway:
                 noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
                 usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
         if (jumps := self.jumps) is not None and present.any():
             e = x.innovations.newest
             seen, alarm = jumps.add(watch, e)
+            # Without a reading `newest` is that of an earlier sample, which has been counted.
             watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
             usual = usual & ~(alarm & present)
         if not replays.all():
@@ -480,6 +495,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return self.member_belief(work, state.now, 0)
 
     def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
+        # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now = without_ledger(without_factors(state.now))
         return lambda: self.member_belief(work, now, 0)
 

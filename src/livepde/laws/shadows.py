@@ -194,6 +194,7 @@ class StepShadow(Shadow):
         control = mean.problem.control
         finer = replace(mean.problem, control=replace(control, parts=2 * control.parts))
         ratio = 2.0**control.scheme.order
+        # Halved steps have matrices of their own: in a common cache both would factorise anew.
         return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
 
     def begun(
@@ -208,6 +209,7 @@ class StepShadow(Shadow):
         # An error much larger than the one before is that of this step alone.
         alike = np.where(size <= ALIKE * s.size, 1.0, s.size / np.maximum(size, TINY))
         weight = 1.0 + (0.5 * (steps.waited + steps.next) - 1.0) * alike
+        # The error of a step with a jump is exceptional and no measure for the next ones.
         parts = {"halves": kept, "size": np.where(steps.jumps | failed, s.size, size)}
         return Found(weight[:, None] * error, parts, failed)
 
@@ -246,6 +248,8 @@ class InputShadow(Shadow):
         if span.gaps is not None:
             return self._read_gaps(s, h, slope, span.gaps)
         slope = slope / h
+        # The second derivative is 2 (slope - s.slope)/(h + s.length), and the line lies above the
+        # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
         return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
 
@@ -271,12 +275,15 @@ class InputShadow(Shadow):
 
     def found(self, s: ShadowState, steps: Steps) -> Found:
         ahead = (0.5 * (steps.next - 1))[:, None] * s.bend  # of half of the steps until the next
+        # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
+        # this off again when they have been read.
         missed = s.missed + ahead
         missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
         left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
             return Found(None, left, np.zeros(len(missed), dtype=bool))
         span = steps.span
+        # The response is linear in the input for small errors: one interval takes the sum of all.
         off = missed / (span.t1 - span.t0)[:, None]
         first, last = span.inputs0 + off, span.inputs1 + off
         moved = replace(span, inputs0=first, inputs1=last, interval=None)
@@ -307,6 +314,7 @@ class HeldInputShadow(InputShadow):
         changes = np.nan_to_num(changes) + change**2
         differences = np.nan_to_num(differences) + (change - np.nan_to_num(before)) ** 2
         smooth = differences < SMOOTH * changes
+        # The held later value exceeds the straight line by half of the change on average.
         missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
         values = np.broadcast_to(span.inputs1, change.shape)
         held = np.stack([values, change, changes, differences], axis=1)
@@ -362,6 +370,8 @@ class MeshShadow(Shadow):
     def found(self, s: ShadowState, steps: Steps) -> Found:
         x, end, mesh = steps.x, steps.end, self.mesh
         coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
+        # A long step for the whole block has a time error of its own, which cancels only in the
+        # difference to a step of the same length on the coarse mesh.
         if (steps.waited > 1).any():
             coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
         start = mesh.prolonged(s.u0) + s.fine
@@ -372,6 +382,8 @@ class MeshShadow(Shadow):
         each = enumerate(zip(end.u, end.q, fine, strict=True))
         seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
         slope = (seen - s.seen) / (steps.block.t1 - steps.block.t0)[:, None]
+        # `gains` weighs the gain of each sample by the time since the block began: times the slope
+        # that is the effect of a difference which has grown linearly.
         a = MESH * (slope[:, None] @ s.gains)[:, 0]
         parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
         return Found(None, parts | {"gains": np.zeros_like(s.gains)}, failed[:, 0], a)
@@ -441,6 +453,8 @@ class ShadowSet:
         if options.step:
             found.append(StepShadow.of(mean))
         if options.mesh and not (refused := refusal(problem, options.largest)):
+            # An identification must not fail because its mesh error cannot be estimated: a note
+            # says so.
             try:
                 found.append(MeshShadow.of(mean))
             except LivepdeError as error:
@@ -493,6 +507,7 @@ class ShadowSet:
         due = (s.count >= s.due) | jumps
         if span.gaps is not None:
             due = due | (span.gaps > 0.0).any(axis=(1, 2))
+        # A block is one step for all members in it, which therefore have to begin together.
         for t in np.unique(s.begun[due]) if due.any() else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
@@ -517,6 +532,7 @@ class ShadowSet:
             if found.error is not None:
                 u[:, row] += np.where(found.failed[:, None], 0.0, found.error)
             if found.a is not None:
+                # A shift of the unknowns moves the state with it, by their covariance.
                 good = np.isfinite(found.a).all(axis=1) & np.isfinite(end.C).all(axis=(1, 2))
                 for k in np.flatnonzero(good & ~found.failed).tolist():
                     a[k, row] += found.a[k]
@@ -552,6 +568,7 @@ class ShadowSet:
         s, left, weights = x.shadows, made.left.transpose(0, 2, 1), weights[:, None]
         if s.gains.size:
             s = _recalled(s, x, new, weights.transpose(0, 2, 1) * left, t)
+        # Predictions of values that were not used may be NaN, which a weight of zero does not undo.
         half = (np.where(weights > 0.0, seen, 0.0) * weights) @ left
         return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
 
@@ -584,6 +601,7 @@ class ShadowSet:
             worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
             numbers = {"discretisation_shift": float(total[worst])}
             for row, kind in enumerate(self.kinds):
+                # Held inputs have no part in the total, and so their own worst unknown.
                 at_worst = worst if kind != HELD else int(np.argmax(np.abs(shift[:, row])))
                 numbers[f"{kind}_shift"] = float(shift[at_worst, row])
                 for label, at in latent.space.labels.items():
@@ -626,6 +644,8 @@ def _recalled(
     since = (t - s.begun)[:, None, None]
     if not since.any():
         return s
+    # A sample multiplies the effect of earlier ones by I - K H, for which the share of the variance
+    # that it leaves stands: the full product would need a matrix for each sensor.
     before, after = ((C * C).sum(axis=1, keepdims=True) for C in (x.C, new.C))
     left = np.divide(after, before, out=np.zeros_like(after), where=before > 0.0)
     return changed(s, gains=left * s.gains + since * (gain @ new.C))

@@ -153,7 +153,7 @@ def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
 
 
 def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> Array:
-    """Return the reduced unknowns of a linearisation point and a deviation, shape (k,)."""
+    """Return the reduced unknowns of a linearisation point plus a difference da, shape (k,)."""
     reduction = work.filter.reduction
     a: Array = (reduction.reduced(x.q - work.filter.problem.model.latent.prior) + da)[0]
     return a
@@ -217,7 +217,7 @@ class _FixedInterval:
             misfit += missed(filter_, x, interval)
             misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
         if trajectory is None or not np.isfinite(misfit):
-            misfit = np.inf  # of what follows no single trajectory
+            misfit = np.inf  # a pass about each estimate in turn follows no single trajectory
         return _SmootherPass(np.array(followed), points, misfit)
 
     def _started(self, trajectory: Array | None) -> tuple[FilterState, float]:

@@ -33,7 +33,7 @@ Measure: TypeAlias = Literal["e-value", "p-value", "number"]
 
 LEVELS: tuple[Level, ...] = ("trusted", "caution", "do not trust")
 RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
-FLAT = 0.9  # of the prior deviation left, at least: the data have told hardly anything
+FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
@@ -199,7 +199,7 @@ def flat(label: str, left: float) -> Finding:
 
 
 def discretised(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
-    """Return whether the discretisation has shifted the unknowns, and by what.
+    """Return the finding that the discretisation has shifted the unknowns, if it has.
 
     Parameters
     ----------
@@ -257,7 +257,7 @@ class Verdict:
     level
         "trusted", "caution" or "do not trust".
     findings
-        What speaks against them, the worst first, and notes.
+        Findings against the estimates, the worst first, and notes.
     untested
         Tests that were not made, and why.
     unseen

@@ -104,7 +104,7 @@ class Judge:
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
-        # What stands in a row that waits, in this order.
+        # Sizes of the parts of a row that waits, in their order.
         sizes = {
             "t": 1,
             "used": sensors,

@@ -21,7 +21,7 @@ from livepde.stepping import ForwardStage
 
 __all__ = ["Now", "Process", "Term", "stride"]
 
-REACH = 64.0  # samples in which a source of amplitude one moves the state by three deviations
+REACH = 64.0  # samples in which a source of amplitude one moves the state by three times the noise
 DEVIATIONS = 3.0
 GAIN = 0.1  # of a channel of a source or flux
 LOSS = 0.1  # in `REACH` samples

@@ -38,7 +38,7 @@ __all__ = ["Inside", "StageData", "StageIterate", "StageProblem", "StageSolver",
 
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
-CARRIED = 1e-2  # the same where the next stage makes up for what is left
+CARRIED = 1e-2  # the same where the next stage makes up for the remaining residual
 STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r away
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 OWED = 0.1  # weight of the second line's residual, where a later step makes up for it
@@ -266,9 +266,9 @@ class StageTerms:
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
         own, own_q = state / max(scales[0], TINY), other / max(scales[1], TINY)
         if data.problem.metric.theta is not None:
-            # Such a metric takes up in the next step what is left of q and r in this one.
+            # With such a metric the next step makes up for the remaining residuals of this one.
             return max(own, OWED * own_q), True, scales
-        # S >= M (1/h + theta) on what is observed: that much of u, at most, the residual leaves.
+        # S >= M (1/h + theta) on the observed part, which bounds the error of u by the residual.
         least = 1.0 / data.problem.h + theta
         r = math.sqrt(max(X, 0.0)) + FLOOR * data.sizes[2]
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales

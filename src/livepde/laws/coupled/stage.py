@@ -127,7 +127,8 @@ class CoupledStage:
         self.terms = terms
         large = DistributedSolver.of(terms) or BlockSolver.of(terms)
         self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
-        # What a stage leaves would be learned from where the metric is that of the information.
+        # The metric of the information learns from the residual of a stage, which therefore must
+        # not be carried over to the next one.
         learns = terms.memory is not None
         least = 0.0 if learns else self.solver.ceiling
         self.newton = replace(newton, ceiling=max(newton.ceiling, least))
