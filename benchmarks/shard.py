@@ -29,7 +29,7 @@ __all__ = ["shard"]
 
 SIZE = 500  # members of a shard
 TRUTHS = 20  # rods of other coefficients; each member has noise of its own
-GROWN = "shard: memory of 10 000 members without shadows"
+GROWN = "shard: memory of 10 000 members"
 WARM = 100  # samples of each member before time and memory are taken: logs are as long as they get
 TIMED = 10  # samples of each member that are timed
 FEW = 100  # members of the shards whose workers are killed
@@ -61,7 +61,7 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
     alone = _in_process(_alone, STARTED, "usual")
     one, two = (_throughput(workers) for workers in (1, 2))
     different, missing, taken, done = _killed(kills)
-    memory, ratio = lean.base + lean.each * ASSETS, two / one
+    memory, ratio = usual.base + usual.each * ASSETS, two / one
     rows: list[tuple[Any, ...]] = [
         (what, *(getattr(cost, name) * scale for cost in (lean, usual)))
         for what, name, scale in (

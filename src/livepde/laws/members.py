@@ -9,7 +9,7 @@ import numpy as np
 
 from livepde.linalg import Array, Mask
 
-__all__ = ["changed", "join", "put", "take", "where"]
+__all__ = ["changed", "join", "put", "take", "where", "zeros"]
 
 State = TypeVar("State")
 
@@ -89,6 +89,12 @@ def where(chosen: Mask, state: State, other: State) -> State:
 
     mixed: State = _each(either, state, other)
     return mixed
+
+
+def zeros(state: State) -> State:
+    """Return a state of zeros, which takes no memory for each member of a fleet."""
+    nothing: State = _each(np.zeros_like, state)
+    return nothing
 
 
 def _widened(arrays: tuple[Array, ...]) -> list[Array]:

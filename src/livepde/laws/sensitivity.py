@@ -278,14 +278,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
             now=x,
-            start=x,
+            start=(start := work.kept_start(x)),
             window=zero,
             opening=no,
             initial=no,
             reference=x.q,
             assimilated=zero,
             due=np.array([self.replay.first if self.replay else NEVER]),
-            replay=ReplayState.none(x),
+            replay=ReplayState.none(start),
             start_due=np.array([1 if work.start_window else NEVER]),
             older=x,
             newer=x,
@@ -303,13 +303,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if model.form_initial is None:
             filter_ = work.filter
             parts = (filter_.problem, filter_.reduction, filter_.noise)
-            x = with_initial_rows(state.start, *parts, moment)
-            return state if x is state.start else _started(state, x)
+            x = with_initial_rows(state.now, *parts, moment)
+            return state if x is state.now else _started(work, state, x)
         # The initial state is a functional of the unknowns here: its derivative is the cross-
         # covariance with them, so that samples correct both together from the first one on.
         U = model.initial_directions(q0, work.filter.reduction.Phi, moment).T[None]
-        x = changed(state.start, U=U)
-        return changed(_started(state, x), initial=np.ones(1, dtype=bool))
+        x = changed(state.now, U=U)
+        return changed(_started(work, state, x), initial=np.ones(1, dtype=bool))
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a sample is not used
     def begin(
@@ -333,7 +333,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not np.isfinite(now.da).all():
                 return state
             initial = bool(state.initial[0])
-            begun = Window(state.start, now, x.q[0], initial, interval.end, 0.0)
+            begun = Window(state.now, now, x.q[0], initial, interval.end, 0.0)
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
@@ -522,9 +522,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         )
 
 
-def _started(state: SensitivityState, x: FilterState) -> SensitivityState:
+def _started(
+    work: SensitivityWork, state: SensitivityState, x: FilterState
+) -> SensitivityState:
     """Return one member at the start with another filter."""
-    return changed(state, start=x, now=x, older=x, newer=x, replay=ReplayState.none(x))
+    start = work.kept_start(x)
+    return changed(state, start=start, now=x, older=x, newer=x, replay=ReplayState.none(start))
 
 
 def without_factors(x: FilterState) -> FilterState:

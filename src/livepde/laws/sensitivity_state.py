@@ -16,7 +16,7 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
-from livepde.laws.members import changed, where
+from livepde.laws.members import changed, where, zeros
 from livepde.laws.replay import Replay, ReplayState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
@@ -33,6 +33,7 @@ __all__ = [
     "without_past",
 ]
 
+LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
 NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without replay is replayed
 
 
@@ -65,6 +66,10 @@ class SensitivityWork:
         """True if the law ever goes back to earlier samples."""
         return bool(self.back or self.replay or self.start_window)
 
+    def kept_start(self, x: FilterState) -> FilterState:
+        """Return the filter where a window begins; zeros for a law that never goes back there."""
+        return x if self.replay or self.start_window else zeros(x)
+
     @cached_property
     def jumping(self) -> Mask:
         """Coordinates of the unknowns that may jump, shape (k,)."""
@@ -92,9 +97,10 @@ class SensitivityState:
     now
         The filter now.
     start, window, opening, initial, reference
-        Where the window of a replay begins: the filter, the row of the log, whether that row holds
-        a sample that the filter has not seen, whether it is the initial state that the model says
-        (`Model.initial`), and the latent parameter from which the reference of `now` comes.
+        Where the window of a replay, or of an iterated start, begins: the filter, the row of the
+        log, whether that row holds a sample that the filter has not seen, whether it is the initial
+        state that the model says (`Model.initial`), and the latent parameter from which the
+        reference of `now` comes.
     assimilated, due
         Samples used since, and at how many the next replay is due: `NEVER` without replay.
     replay
@@ -172,13 +178,13 @@ def stored(
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
     """Return a state without the rows of the log that nobody goes back to."""
-    rows = state.log.shape[1]
-    if rows < 3 * max(work.back, 32):
+    rows, least = state.log.shape[1], max(work.back, LEAST)
+    if rows <= least:
         return state
     older = state.since_older if work.back else np.full(len(state), rows - 1)
     stays = state.replays | (state.start_due != NEVER)
     first = int(np.where(stays, np.minimum(older, state.window), older).min())
-    if first < rows // 2:
+    if first < least:
         return state
     replay = state.replay
     if replay.active.any():
@@ -236,11 +242,11 @@ def new_window(
     log = state.log if row is None else state.log[:, : row + 1]
     zero = np.zeros(1, dtype=np.int64)
     first = work.replay.first if work.replay is not None and state.replays[0] else NEVER
-    no = np.zeros(1, dtype=bool)
+    no, kept = np.zeros(1, dtype=bool), work.kept_start(start)
     return changed(
         state,
         now=start,
-        start=start,
+        start=kept,
         log=log,
         window=zero + log.shape[1] - 1,
         opening=no,
@@ -248,7 +254,7 @@ def new_window(
         reference=start.q,
         assimilated=zero,
         due=zero + first,
-        replay=ReplayState.none(start),
+        replay=ReplayState.none(kept),
         start_due=zero + (1 if work.start_window and first == NEVER else NEVER),
     )
 

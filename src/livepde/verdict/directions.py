@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from livepde.errors import ObservationError
 from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observed, Points
@@ -227,7 +228,7 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
             moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])
             try:
                 rows = sp.csr_array(block.probe(moved.T, "sensor"))
-            except Exception:  # noqa: BLE001  outside of a mesh that is no box
+            except ObservationError:  # outside of a mesh that is no box
                 moved = at.copy()
                 rows = sp.csr_array(block.probe(moved.T, "sensor"))
             if rows.shape[0] != len(at):  # sensors of vectors, each with several readings
