@@ -119,11 +119,11 @@ def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
     arrays = [np.asarray(leaf, order="C") for leaf in leaves.values()]
     described = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
     text = _text(json.dumps(dict(header)), tuple(described))
-    parts = [text, bytes(-len(text) % ALIGNED)]
+    parts: list[Any] = [text, bytes(-len(text) % ALIGNED)]
     for array in arrays:
-        parts += [array.tobytes(), bytes(-array.nbytes % ALIGNED)]
-    body = b"".join(parts)
-    return START.pack(MAGIC, len(text), _digest(body)) + body
+        parts += [array, bytes(-array.nbytes % ALIGNED)]
+    # Joined once: the states of a shard are large, and each copy would count in its memory.
+    return b"".join([START.pack(MAGIC, len(text), _digest(*parts)), *parts])
 
 
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
@@ -154,8 +154,12 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
     return dict(header), leaves
 
 
-def _digest(body: Any) -> bytes:
-    return hashlib.blake2b(body, digest_size=DIGEST).digest()
+def _digest(*parts: Any) -> bytes:
+    """Return the checksum of buffers, one after the other."""
+    found = hashlib.blake2b(digest_size=DIGEST)
+    for part in parts:
+        found.update(part)
+    return found.digest()
 
 
 @lru_cache(maxsize=64)
