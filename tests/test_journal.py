@@ -29,12 +29,18 @@ from livepde.runs import RunWriter, database
 from livepde.runs.database import in_use, log_of, written
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
-from livepde.runs.live import CHECKPOINT, Live, Retention
+from livepde.runs.live import Live, Retention
 from livepde.runs.salvage import Salvage
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
 
 NAME = "journal.sqlite"
+CHECKPOINT = 40  # samples between two checkpoints here: a run has several in less time
+
+
+@pytest.fixture(autouse=True)
+def often(monkeypatch):
+    monkeypatch.setattr("livepde.runs.live.CHECKPOINT", CHECKPOINT)
 
 
 def samples(count: int, after: float = -np.inf) -> SampleFeed:
@@ -177,8 +183,8 @@ def limit_pages(kept: Journal, more: int) -> None:
 def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
     whole, full = tmp_path / "whole", tmp_path / "full"
     whole.mkdir(), full.mkdir()
-    finished(whole, 600)
-    run = started(full, 600)
+    finished(whole, 300)
+    run = started(full, 300)
     limit_pages(run.journal, 20)
     with pytest.raises(
         lp.errors.RunError, match=r"full.*What was written before is safe; make room"
@@ -188,16 +194,16 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
         run.journal.commit()
     kept = len(run.journal)
     run.journal.close()
-    assert 0 < kept < 600
+    assert 0 < kept < 300
     with closing(sqlite3.connect(full / NAME)) as raw:
         assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    again = started(full, 600)
+    again = started(full, 300)
     again.resume()
     again.run()
     again.journal.close()
     with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
         same(other, one)
-        assert other.accepted == 600
+        assert other.accepted == 300
 
 
 def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
@@ -715,7 +721,7 @@ class First:
 
 @pytest.mark.slow
 def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
-    count, retention = 4 * CHECKPOINT, Retention(10.0, 7)
+    count, retention = 10 * CHECKPOINT, Retention(10.0, 7)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     whole.mkdir(), broken.mkdir()
     run = started(whole, count, retention=retention)

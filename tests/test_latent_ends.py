@@ -107,7 +107,7 @@ def test_the_filter_stays_linear_so_that_nothing_is_lost():
 @pytest.mark.slow
 def test_a_walk_has_no_end():
     walk = lp.Scalar(0.0, 0.1, evolution=lp.RandomWalk(1.0))
-    data = run(source(walk), stream([5.0] * 60), u0=0.0).to_xarray()
+    data = run(source(walk), stream([5.0] * 30), u0=0.0).to_xarray()
     assert data["v"].values[-1] > 2.0
     assert "bounded" not in data
 

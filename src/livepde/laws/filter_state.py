@@ -13,7 +13,7 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["NO_LEDGER", "FilterState", "along", "without_ledger"]
+__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied", "without_ledger"]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -104,3 +104,8 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
 def without_ledger(x: FilterState) -> FilterState:
     """Return a filter state without the data that only its verdict needs."""
     return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
+
+
+def unaccompanied(x: FilterState) -> FilterState:
+    """Return a filter state without its ledger and without the errors of the discretisation."""
+    return changed(without_ledger(x), shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))

@@ -11,23 +11,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 
 from livepde.laws.assimilation import assimilate, assimilate_at_once
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState, without_ledger
+from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed, put, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
-from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
-__all__ = ["expecting", "iterate_starts", "missed", "moved", "unaccompanied"]
+__all__ = ["expecting", "iterate_starts", "missed", "moved"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -107,7 +106,7 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     intervals = intervals_since(log, problem.channels)
     # A search needs neither the ledger nor the errors of the discretisation, which cost as much
     # again: the last pass alone follows them.
-    samples = _Samples(*unaccompanied(work, state), opening, intervals)
+    samples = _Samples(work.unaccompanied, state.unaccompanied, opening, intervals)
     ends: list[_Pass] = []
     for trajectory in _beginnings(samples, (1 + len(intervals), state.now.C.shape[2])):
         one = samples.about(trajectory)
@@ -126,16 +125,6 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
         return None
     # Only the search needs earlier values, which would cost columns in each later update.
     return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
-
-
-def unaccompanied(
-    work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityWork, SensitivityState]:
-    """Return a filter that follows no discretisation error and keeps no ledger, and one member."""
-    none = ShadowState.none(len(state), state.now.u.shape[1], state.now.C.shape[2])
-    start, now = (changed(without_ledger(x), shadows=none) for x in (state.start, state.now))
-    filter_ = replace(work.filter, shadows=None, judge=None)
-    return replace(work, filter=filter_), changed(state, start=start, now=now)
 
 
 def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.base import Report, Status
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gauss_newton import (
     CONVERGED,
     Window,
@@ -102,7 +102,8 @@ def _iterated(
 ) -> tuple[FilterState, dict[str, float]]:
     """Return the filter after a sample that may have moved it too far, and notes.
 
-    The cure of an excessive move is a replay of this one sample from the start of its interval.
+    The cure of an excessive move is a replay of this one sample from the start of its interval. The
+    search follows neither ledger nor discretisation errors, which cost as much again.
     """
     before = state.now
     if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
@@ -127,13 +128,17 @@ def _iterated(
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered
         for _ in range(guards.iterations):
-            q = next_reference(filter_, window)
-            x, report = _filtered(work, placed(filter_, window, q), interval)
+            last, q = window, next_reference(filter_, window)
+            bare = replace(window, start=unaccompanied(begin))
+            x, report = _filtered(work.unaccompanied, placed(filter_, bare, q), interval)
             if not report.status.ok:
                 break
             window = replace(window, now=x, reference=q)
             if distance(filter_, window) <= CONVERGED:
-                return levelled(window.now, temper), {"iterated": 1.0, **tempered}
+                x, report = _filtered(work, placed(filter_, last, q), interval)
+                if not report.status.ok:
+                    break
+                return levelled(x, temper), {"iterated": 1.0, **tempered}
     return _filtered(work, before, interval.silent)[0], {"held": 1.0}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
 from livepde.laws.base import InitialReading, Notes
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
@@ -60,6 +60,11 @@ class SensitivityWork:
         """Return the same for a member whose initial state was given so, and made of readings."""
         problem = replace(self.filter.problem, initial_readings=readings, initial=initial)
         return replace(self, filter=replace(self.filter, problem=problem))
+
+    @cached_property
+    def unaccompanied(self) -> SensitivityWork:
+        """The same for a search: it keeps no ledger and follows no discretisation error."""
+        return replace(self, filter=replace(self.filter, shadows=None, judge=None))
 
     @cached_property
     def keeps_log(self) -> bool:
@@ -137,6 +142,11 @@ class SensitivityState:
 
     def __len__(self) -> int:
         return len(self.now)
+
+    @property
+    def unaccompanied(self) -> SensitivityState:
+        """The same without ledger and discretisation errors, as the filter of a search has it."""
+        return changed(self, start=unaccompanied(self.start), now=unaccompanied(self.now))
 
     @property
     def replays(self) -> Mask:

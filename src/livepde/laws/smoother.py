@@ -31,7 +31,7 @@ from livepde.laws.assimilation import assimilate_at_once
 from livepde.laws.base import FixedInterval
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved, unaccompanied
+from livepde.laws.iterated_smoother import expecting, missed, moved
 from livepde.laws.members import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
@@ -79,7 +79,7 @@ def smoothed(
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
     """
-    work, before = unaccompanied(work, before)
+    work, before = work.unaccompanied, before.unaccompanied
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
@@ -92,7 +92,7 @@ def evidence(
 
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
-    work, before = unaccompanied(work, before)
+    work, before = work.unaccompanied, before.unaccompanied
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         samples = _FixedInterval(work, before, after, data)
         samples.work = replace(work, options=replace(work.options, adaptive=True))
