@@ -277,7 +277,7 @@ def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
     for t0, t1 in pairwise(times):
         a = latent.moved(a, t1 - t0)
         for item in latent.parts.values():
-            grown = np.repeat(item.evolution.growth(t1 - t0, item.unknown.latent_std), item.size)
+            grown = np.repeat(item.evolution.growth(t1 - t0, item.unknown.prior.latent_std), item.size)
             if grown.any():
                 noise = root[item.part, item.part] @ rng.standard_normal(len(grown))
                 a = a.copy()

@@ -91,7 +91,7 @@ class Dense:
             F, gained = np.zeros((k, k)), np.zeros((k, k))
             for p in model.latent.parts.values():
                 F[p.part, p.part] = np.kron(p.evolution.transition(h), np.eye(p.size))
-                grown = np.repeat(p.evolution.growth(h, p.unknown.latent_std), p.size)
+                grown = np.repeat(p.evolution.growth(h, p.unknown.prior.latent_std), p.size)
                 gained[p.part, p.part] = grown[:, None] * self.prior[p.part, p.part]
             prior = model.latent.prior
             a = prior + F @ (self.x[n:] - prior)

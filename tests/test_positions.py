@@ -171,7 +171,7 @@ def case(folder, place: str):
 def test_a_case_states_it(tmp_path):
     prepared = case(tmp_path, 'at = "30 cm", at_std = "1 cm"').prepare()
     unknown = prepared.case.model.parameter_space.unknowns["position"]
-    assert (list(unknown.names), unknown.std, unknown.unit) == (["T"], pytest.approx(0.01), "m")
+    assert (list(unknown.names), unknown.prior.std, unknown.unit) == (["T"], pytest.approx(0.01), "m")
     identifier = prepared.identifier
     assert "position[T]_std" in identifier.run(prepared.stream).to_xarray()
     _, factor = identifier.latent_belief().q_factor

@@ -162,7 +162,7 @@ class MovingHorizon:
         for k, (label, prior, std) in enumerate(
             zip(model.unknowns, model.prior, model.std, strict=True)
         ):
-            positive = unknown_of(space, label).transform == "log"
+            positive = isinstance(unknown_of(space, label).prior, LogNormal)
             found.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
         return found
 

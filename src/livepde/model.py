@@ -364,7 +364,7 @@ class Model:
         """Space of the latent parameter; its Gram matrix is the inverse of the prior covariance."""
         parts = []
         for part in self.latent.parts.values():
-            unknown, size, variance = part.unknown, part.size, part.unknown.latent_std**2
+            unknown, size, variance = part.unknown, part.size, part.unknown.prior.latent_std**2
             if isinstance(unknown, Field):
                 space = self._field_space(unknown, part.block, variance)
             else:

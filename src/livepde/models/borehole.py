@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Field, On, Place, Scalar, Unknown, dot, grad, linear
+from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
 from livepde.models.base import Equation, Option, Variable, closed
 
@@ -87,12 +87,12 @@ def grouted_borehole(
     Raises
     ------
     ModelError
-        The radii are not inside of the mesh in this order, or rho_c is not a `Scalar`.
+        The radii are not inside of the mesh in this order, or rho_c is not one number.
     """
-    if not isinstance(rho_c, Scalar):
-        raise ModelError("grouted_borehole: rho_c must be one number, a Scalar.")
+    if not isinstance(heat := declared(rho_c), Scalar):
+        raise ModelError("grouted_borehole: rho_c must be one number: a prior, or a Scalar.")
     layered = _layered(mesh, r_p, r_b)
-    thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), rho_c.prior
+    thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), heat.prior.centre
     # Quadrature of order four integrates the weight r with elements of first order exactly.
     cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
     state = Field(layered, linear(layered), dirichlet=cold, unit="degC", quadrature=4)
