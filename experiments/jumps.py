@@ -37,7 +37,7 @@ def truth(t: float) -> float:
 
 def states() -> list[tuple[float, Any]]:
     """Return the exact states."""
-    model = rod(lp.Scalar(BEFORE))
+    model = rod(lp.Normal(BEFORE))
     forward, u = ForwardStage(model), model.initial(0.0)
     found = [(0.0, u)]
     for t0, t1 in pairwise(TIMES.tolist()):
@@ -68,8 +68,11 @@ def measured(law: lp.laws.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: i
 
 def main() -> None:
     """Print the table."""
-    walk = {rate: lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(rate)) for rate in (0.005, 0.02, 0.1)}
-    constant, S = lp.Scalar(0.2, 0.2), lp.SensitivityLaw
+    walk = {
+        rate: lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.RandomWalk(rate))
+        for rate in (0.005, 0.02, 0.1)
+    }
+    constant, S = lp.Normal(0.2, 0.2), lp.SensitivityLaw
     rows: dict[str, tuple[Any, lp.Scalar]] = {
         "constant": (S(), constant),
         "constant, memory 2": (S(memory=2.0), constant),

@@ -259,7 +259,7 @@ def test_gradient_law_on_averages(rod):
 def test_gradient_law_tunes_itself_on_means_over_subdomains(tmp_path):
     """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
     mesh, times = lp.interval(0, 1, 40), 0.05 * np.arange(201)
-    rod = lp.models.heat(mesh, lp.Scalar(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
+    rod = lp.models.heat(mesh, lp.Normal(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
     parts = {f"T{k}": (k / 10, (k + 1) / 10) for k in range(10)}
     means = lp.Averages(
         {k: (lambda x, a=a, b=b: (x[0] > a) & (x[0] < b)) for k, (a, b) in parts.items()}

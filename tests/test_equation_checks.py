@@ -68,10 +68,10 @@ def unknown(draw: Any, name: str, text: str, mesh: Any, typical: Typical) -> Any
     # As they are, unknowns stay near their prior: nothing else keeps a divisor from zero.
     if name not in typical.ranges and draw(st.booleans()):
         options = {"prior": prior, "std": 0.05 * prior}
-        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS, lp.Scalar().evolution)))
+        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS, lp.Normal().evolution)))
     else:
         options["std"] = prior * draw(st.floats(0.05, 0.5))
-        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS[:2], lp.Scalar().evolution)))
+        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS[:2], lp.Normal().evolution)))
     kinds = ["number"] * ("initial" not in text)
     kinds += ["field"] * ("field" in text)
     kinds += ["regions"] * ("by layer" in text or "by region" in text)

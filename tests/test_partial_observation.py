@@ -26,7 +26,7 @@ def reaction(cells: int) -> lp.Model:
     smooth = lp.Sobolev(1.0, length=0.1).pointwise(1)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=3.0, std=3.0)},
+        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=lp.Normal(3.0, std=3.0))},
         A=lambda q, u, v, x: q.q * u * v,
         B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: 5 + 2 * np.sin(t) + 3 * np.cos(0.7 * t) * np.sin(2 * np.pi * x[0]),

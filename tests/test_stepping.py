@@ -38,7 +38,7 @@ def cubic(**options):
 
     model = lp.Model(
         lp.Field(line(5), ElementLineP1(), dirichlet={"boundary": exact}, quadrature=6),
-        lp.Scalar(prior=1.5),
+        lp.Normal(1.5),
         A=product,
         B=lambda u, v, x: laplace(u, v, x) + u**3 * v,
         f=source,
@@ -503,7 +503,7 @@ def test_a_simulation_that_blows_up_says_so():
 def wells(terms, f=0.0):
     mesh = lp.interval(0.0, 1.0, 12)
     state = lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0})
-    unknowns = {"k": lp.Scalar(0.3), "S": lp.Scalar(2.0)}
+    unknowns = {"k": lp.Normal(0.3), "S": lp.Normal(2.0)}
     return lp.Model(state, unknowns, A=terms, f=f, inputs=["Q"])
 
 
@@ -572,7 +572,7 @@ def test_a_flux_that_sets_in_is_followed_by_graded_steps():
     """The state goes with the square root of time: one long step misses it."""
     model = lp.Model(
         lp.Field(lp.interval(0.0, 4.0, 400), ElementLineP1()),
-        lp.Scalar(1.0, 0.1),
+        lp.Normal(1.0, 0.1),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
         f=[lp.On("left", lambda x, t: 1.0)],
     )

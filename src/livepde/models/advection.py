@@ -75,7 +75,7 @@ def advection_diffusion(
     >>> import livepde as lp
     >>> bed = lp.interval(0.0, 0.4, 40)
     >>> sides = {"left": lp.Channel("T_river"), "right": lp.Channel("T_40")}
-    >>> kappa, K = lp.Scalar(8e-7, 4e-7, transform="log"), lp.Scalar(0.0, 1e-5)
+    >>> kappa, K = lp.LogNormal(8e-7, 4e-7), lp.Normal(0.0, 1e-5)
     >>> model = advection_diffusion(bed, kappa, sides, K=K, L=0.4, ratio=1.5)
     >>> model.channels
     ('dH', 'T_river', 'T_40')

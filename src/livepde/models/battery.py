@@ -64,7 +64,7 @@ def battery_particle(
     Examples
     --------
     >>> import livepde as lp
-    >>> D = lp.Scalar(1e-14, 1e-14, transform="log")
+    >>> D = lp.LogNormal(1e-14, 1e-14)
     >>> model = battery_particle(lp.interval(0.0, 1e-5, 40), D, area=1.0, c_max=30000.0)
     >>> model.channels
     ('I',)

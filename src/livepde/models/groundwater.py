@@ -112,7 +112,7 @@ def groundwater(
     --------
     >>> import livepde as lp
     >>> mesh = lp.rectangle((-50.0, 50.0), (-50.0, 50.0), (40, 40))
-    >>> T, S = (lp.Scalar(x, x, transform="log") for x in (1e-2, 1e-2))
+    >>> T, S = (lp.LogNormal(x, x) for x in (1e-2, 1e-2))
     >>> model = groundwater(mesh, T, S, {"boundary": 0.0}, wells={"Q": (0, 0)}, radius=5.0)
     >>> model.inputs
     ('Q',)

@@ -57,7 +57,7 @@ def wave(
     Examples
     --------
     >>> import livepde as lp
-    >>> model = wave(lp.interval(0, 1, 20), lp.Scalar(1.0, 0.3), dirichlet={"left": 0.0})
+    >>> model = wave(lp.interval(0, 1, 20), lp.Normal(1.0, 0.3), dirichlet={"left": 0.0})
     >>> list(model.state_space.blocks)
     ['w', 'p']
     """
