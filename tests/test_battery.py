@@ -32,7 +32,7 @@ def particle(
     moving = {"evolution": evolution} if evolution else {}
     return battery_particle(
         lp.interval(0.0, R, cells),
-        lp.Scalar(D, std, transform="log", **moving),
+        lp.Scalar(lp.LogNormal(D, std), **moving),
         slope,
         area=AREA,
         c_max=FULL,

@@ -788,7 +788,7 @@ def test_positive_unknowns(rod):
     assert row.prior == pytest.approx(3e-5)
     assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
-    assert case.model.parameter_space.unknowns["alpha"].transform == "log"
+    assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(3e-5, 3e-5)
 
 
 @pytest.mark.parametrize(

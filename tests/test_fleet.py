@@ -20,15 +20,16 @@ from livepde.models import heat
 from livepde.result import Result
 
 SENSORS = lp.Points({"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02)
-POSITIVE = {"transform": "log", "bounds": (0.0, np.inf)}
+ALPHA = lp.Normal(0.5, std=0.25)
+BOUNDED = lp.Normal(0.5, std=0.25, bounds=(0.45, 0.55))
 
 
-def rod(**alpha):
+def rod(prior=ALPHA, **alpha):
     """Two unknowns; inputs in the boundary values and beside an unknown."""
     ends = {"left": lp.Channel("T_0"), "right": 0.0}
     return heat(
         line(16),
-        lp.Scalar(0.5, std=0.25, unit="m^2/s", **alpha),
+        lp.Scalar(prior, unit="m^2/s", **alpha),
         ends,
         loss=lp.Normal(0.3, std=0.2),
     )
@@ -65,7 +66,7 @@ def walks():
         "d": None,
     }
     unknowns = {
-        name: lp.Scalar(0.5, std=0.2, **({"evolution": kind} if kind else {}))
+        name: lp.Scalar(lp.Normal(0.5, std=0.2), **({"evolution": kind} if kind else {}))
         for name, kind in evolutions.items()
     }
     return lp.Model(
@@ -81,7 +82,7 @@ def walks():
 MODELS = {
     "walks": walks,
     "rod": rod,
-    "logarithm": lambda: rod(**POSITIVE),
+    "logarithm": lambda: rod(lp.LogNormal(0.5, 0.25)),
     "sources": sources,
     "layers": layers,
 }
@@ -224,7 +225,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
 
 @pytest.mark.slow
 def test_a_bound_is_kept_and_left_again():
-    model = rod(bounds=(0.45, 0.55))
+    model = rod(BOUNDED)
     fleet, estimate = compare(model, law(start_window=4), members=6)
     assert fleet.together
     alpha, _ = estimate.parameters["alpha"]
@@ -246,7 +247,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
     for model, guards in (
         (rod(), None),
         (rod(), lp.laws.Guards()),
-        (rod(bounds=(0.45, 0.55)), None),
+        (rod(BOUNDED), None),
     ):
         fleet, estimate = compare(model, law(guards=guards, start_window=4), stream)
         assert fleet.together

@@ -25,7 +25,7 @@ LAWS = {
 def rod(law, **unknown):
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"left": 0.0, "right": lp.Channel("T_end")}),
-        {"k": lp.Scalar(0.2, std=0.05, bounds=(0.01, 5.0), **unknown)},
+        {"k": lp.Scalar(lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0)), **unknown)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: x.inputs["heat"],
         inputs=("heat",),

@@ -35,7 +35,7 @@ def explosive() -> lp.Model:
 
 
 def rod(driven: Any = lambda t: 1.0, **unknown: Any) -> lp.Model:
-    a = {"a": lp.Scalar(0.2, 0.2, **unknown)}
+    a = {"a": lp.Scalar(lp.Normal(0.2, 0.2), **unknown)}
     return driven_rod(a, lambda t: driven(t) * np.sin(3 * t), MESH)
 
 

@@ -67,8 +67,8 @@ def test_bounds_cut_an_interval_off():
 
 
 def test_where_rounding_hides_the_latent_value_the_interval_is_open():
-    free = {"transform": "logit", "bounds": (0.0, 1.0), "within": np.inf}
-    assert lp.Scalar(0.3, 0.1, **free).interval(1.0, 0.0) == (0.0, 1.0)
+    share = lp.Scalar(lp.LogitNormal(0.3, 0.1, bounds=(0.0, 1.0)), within=np.inf)
+    assert share.interval(1.0, 0.0) == (0.0, 1.0)
     positive = lp.Scalar(lp.LogNormal(0.3, 0.1), within=np.inf)
     assert positive.interval(0.0, 0.0) == (0.0, np.inf)
 

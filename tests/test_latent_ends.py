@@ -42,12 +42,11 @@ SPIKE[12] = 9999.0
 
 
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(guards=None), lp.SensitivityLaw()])
-@pytest.mark.parametrize("transform", ["log", "logit"])
-def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(transform: str, law: Any):
-    bounds = (0.0, 1.0) if transform == "logit" else (-np.inf, np.inf)
-    unknown = lp.Scalar(0.4, 0.1, bounds, transform=transform, within=4.0)
+@pytest.mark.parametrize("prior", [lp.LogNormal(0.4, 0.1), lp.LogitNormal(0.4, 0.1, (0.0, 1.0))])
+def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(prior: Any, law: Any):
+    unknown = lp.Scalar(prior, within=4.0)
     least, largest = (
-        float(unknown.map.value(np.array(unknown.latent_prior + s * 4.0 * unknown.latent_std)))
+        float(prior.transform.value(np.array(prior.latent_mean + s * 4.0 * prior.latent_std)))
         for s in (-1.0, 1.0)
     )
     result = run(decay(unknown), stream(SPIKE), law)
@@ -76,11 +75,11 @@ def test_what_is_reached_is_told():
 @pytest.mark.slow
 def test_a_stated_number_counts_and_infinity_is_no_end():
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
-    narrow = {"prior": 0.5, "std": 0.01, "transform": "log"}
+    narrow = lp.LogNormal(0.5, 0.01)
     law = lp.SensitivityLaw(gate=np.inf)
-    near = run(decay(lp.Scalar(**narrow, within=3.0)), stream(far), law).to_xarray()
+    near = run(decay(lp.Scalar(narrow, within=3.0)), stream(far), law).to_xarray()
     assert near["k"].values[-1] == pytest.approx(0.5 * np.exp(3 * 0.02))
-    free = run(decay(lp.Scalar(**narrow, within=np.inf)), stream(far), law).to_xarray()
+    free = run(decay(lp.Scalar(narrow, within=np.inf)), stream(far), law).to_xarray()
     assert free["k"].values[-1] > 1.5
     assert "bounded" not in free
 

@@ -24,7 +24,7 @@ def rod(cells: int, **k: Any) -> lp.Model:
     """Return a rod with unknown conductivity and loss, heated by a channel at its left end."""
     mesh = lp.interval(0.0, 1.0, cells)
     field = lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0})
-    unknowns = {"k": lp.Scalar(1.0, std=0.3, **k), "h": lp.Normal(1.0, std=0.3)}
+    unknowns = {"k": lp.Scalar(lp.Normal(1.0, std=0.3), **k), "h": lp.Normal(1.0, std=0.3)}
     return lp.Model(
         field,
         unknowns,

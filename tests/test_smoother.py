@@ -144,7 +144,7 @@ TIMES = 0.1 * np.arange(101)
 def conducting(evolution=None):
     """Return a rod with an unknown conductivity `a` whose left end swings."""
     moves = {} if evolution is None else {"evolution": evolution}
-    a = lp.Scalar(0.1, 0.05, transform="log", **moves)
+    a = lp.Scalar(lp.LogNormal(0.1, 0.05), **moves)
     return driven_rod({"a": a}, lambda t: np.sin(1.3 * t) + 0.5 * np.sin(3.1 * t), ROD)
 
 

@@ -137,17 +137,30 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
     np.testing.assert_array_equal(space.interpolate(given)[-4:], [0.1, 0.7, 0.5, 0.5])
     q = q.copy()
     q[0] = -1.0
-    with pytest.raises(SpaceError, match="'log': a value lies outside"):
+    with pytest.raises(
+        SpaceError, match=r"'log': a value is not strictly inside of the bounds \(0.0, inf\)"
+    ):
         latent.inverse(q)
 
 
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: lp.LogNormal(0.0, 1.0), "not inside of what"),
-        (lambda: lp.Scalar(1.0, 1.0, transform="sqrt"), "expected 'log' or 'logit'"),
-        (lambda: lp.LogitNormal(1.0, 1.0), "two finite bounds"),
-        (lambda: lp.LogNormal(1.0, 1.0, bounds=(0, 2)), "no upper bound"),
+        (lambda: lp.LogNormal(0.0, 1.0), r"median 0.0 needs .* strictly inside of \(0.0, inf\)"),
+        (lambda: lp.LogNormal(-1.0, 1.0), r"median -1.0 lies outside of its bounds \(0.0, inf\)"),
+        (lambda: lp.LogNormal(1.0, 1.0, bounds=(0, 2)), "with an upper one take LogitNormal"),
+        (lambda: lp.LogNormal(1.0, 1.0, bounds=(-np.inf, np.inf)), "with a finite lower one"),
+        (lambda: lp.LogitNormal(1.0, 1.0, bounds=(0, np.inf)), "two finite bounds"),
+        (lambda: lp.LogitNormal(1.0, 1.0, bounds=(0, 1)), r"strictly inside of \(0, 1\)"),
+        (lambda: lp.Normal(np.nan), r"mean nan lies outside of its bounds"),
+        (lambda: lp.Normal(np.inf), r"mean inf needs to be finite"),
+        (lambda: lp.Normal(1.0, 0.0), "Normal: std must be a positive number; got 0.0"),
+        (lambda: lp.Scalar(0.5), r"Scalar: prior=0.5; write Normal\(0.5, std\), or LogNormal"),
+        (
+            lambda: lp.Field(mesh, ElementLineP1(), prior="x"),
+            r"Field: prior='x'; write Normal\(mean",
+        ),
+        (lambda: rod({"a": 0.5}), r"got 0.5 as an unknown; write Normal\(0.5, std\), or"),
         (lambda: lp.Scalar(lp.Normal(1.0), evolution="random-walk"), "expected RandomWalk"),
         (lambda: lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Normal()}), "by a penalty"),
         (lambda: lp.Scalars(("a", "a"), lp.Normal()), "names must be given and differ"),
@@ -157,7 +170,7 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
         (lambda: lp.fem.Periodic(1.0, 0), "harmonics must be at least 1"),
         (
             lambda: lp.Field(mesh, ElementLineP1(), prior=lp.Normal(bounds=(0, 1))),
-            "bounds need transform",
+            "bounds need a LogNormal or LogitNormal",
         ),
         (
             lambda: lp.Field(mesh, ElementLineHermite(), prior=lp.LogNormal(1.0, std=1.0)),
@@ -165,7 +178,7 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
         ),
         (
             lambda: lp.Scalar(lp.LogNormal(1.0, 1.0), evolution=lp.fem.Periodic(1.0)),
-            "together with Periodic",
+            "Periodic needs a prior without bounds and transform",
         ),
     ],
 )
@@ -397,7 +410,7 @@ HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
 
 
 def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
-    common = {"prior": 0.5, "std": 0.2, "transform": "log", "evolution": lp.RandomWalk(0.01)}
+    common = {"prior": lp.LogNormal(0.5, 0.2), "evolution": lp.RandomWalk(0.01)}
     both = [lp.Piecewise(HALVES, **common, own=own) for own in ({}, {"r": lp.Scalar(**common)})]
     samples = data(lambda t: 0.3, np.linspace(0.0, 2.0, 21))
     plain, own = (estimates(rod({"a": a}), lp.SensitivityLaw(), samples)[-1] for a in both)

@@ -14,6 +14,7 @@ from benchmarks.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
 from livepde.control import Known, ReducedModel
 from livepde.control.mpc import packages, quiet
+from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed
 from livepde.result import unknown_of

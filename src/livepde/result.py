@@ -233,8 +233,8 @@ class Marginal:
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the ends of the central interval that holds it with probability `level`.
 
-        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law without
-        covariance.
+        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
+        without covariance.
         """
         low, high = self.unknown.interval(self.mean, self.std, level)
         return (float(low), float(high)) if isinstance(self.mean, float) else (low, high)
