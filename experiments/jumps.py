@@ -23,7 +23,7 @@ MESH = lp.interval(0.0, 1.0, 30)
 POINTS = [0.25, 0.5, 0.75]
 
 
-def rod(a: lp.Scalar) -> lp.Model:
+def rod(a: lp.fem.Unknown) -> lp.Model:
     """Return a rod whose left end swings."""
     ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
     state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
@@ -46,7 +46,7 @@ def states() -> list[tuple[float, Any]]:
     return found
 
 
-def measured(law: lp.laws.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -> Any:
+def measured(law: lp.laws.Law[Any, Any], unknown: lp.fem.Unknown, exact: Any, seed: int) -> Any:
     """Return error before the jump, time until nine tenths of it are followed, error at the end."""
     rng, model = np.random.default_rng(seed), rod(unknown)
     sensors: lp.observation.Observation = lp.Points(POINTS, noise=NOISE)
@@ -73,7 +73,7 @@ def main() -> None:
         for rate in (0.005, 0.02, 0.1)
     }
     constant, S = lp.Normal(0.2, 0.2), lp.SensitivityLaw
-    rows: dict[str, tuple[Any, lp.Scalar]] = {
+    rows: dict[str, tuple[Any, lp.fem.Unknown]] = {
         "constant": (S(), constant),
         "constant, memory 2": (S(memory=2.0), constant),
         "constant, replay": (S(replay=lp.Replay()), constant),

@@ -27,7 +27,7 @@ CURRENT = 1.0
 
 
 def particle(
-    cells: int = 30, slope: lp.Scalar | None = None, evolution: Any = None, std: float = D
+    cells: int = 30, slope: lp.fem.Unknown | None = None, evolution: Any = None, std: float = D
 ) -> lp.Model:
     moving = {"evolution": evolution} if evolution else {}
     return battery_particle(

@@ -33,14 +33,14 @@ POWER = 1000.0
 HOUR = 3600.0
 
 
-def unknown(name: str) -> lp.Scalar:
+def unknown(name: str) -> lp.fem.Prior:
     if name == "share":
         return lp.LogitNormal(TRUTH[name], 0.05, bounds=(0.0, 1.0))
     return lp.LogNormal(TRUTH[name], 0.3 * TRUTH[name])
 
 
 def model(
-    cells: int = 80, far: float = 12.0, rho_c: lp.Scalar | None = None, **more: float
+    cells: int = 80, far: float = 12.0, rho_c: lp.fem.Unknown | None = None, **more: float
 ) -> lp.Model:
     mesh = lp.interval(0.02, far, cells, geometric=True)
     unknowns = {name: unknown(name) for name in TRUTH} | ({"rho_c": rho_c} if rho_c else {})

@@ -187,10 +187,10 @@ def test_layers_with_priors_of_their_own(rod):
     )
     space = case.model.parameter_space
     a, b = (space.unknown_of(f"alpha[{name}]") for name in "ab")
-    assert (a.prior, b.prior) == pytest.approx((5e-5, 8e-5))
-    assert b.std == pytest.approx(3e-5)
+    assert (a.prior.centre, b.prior.centre) == pytest.approx((5e-5, 8e-5))
+    assert b.prior.std == pytest.approx(3e-5)
     assert (a.evolution.moves, b.evolution) == (False, lp.MeanReverting(3600.0))
-    assert b.bounds == a.bounds
+    assert b.prior.bounds == a.prior.bounds
     assert len(preview(case.prepare(), case.prepare().stream).unknowns) == 2
 
 
@@ -903,8 +903,8 @@ def test_unknowns_of_sensors_share_a_prior(rod):
         "alpha", "offset[T_10]", "gain[T_10]", "correlated[T_10]"
     }  # fmt: skip
     unknowns = model.parameter_space.unknowns
-    assert (unknowns["offset"].std, unknowns["offset"].unit) == (0.5, "K")
-    assert (unknowns["gain"].prior, unknowns["gain"].std) == (1.0, 0.05)
+    assert (unknowns["offset"].prior.std, unknowns["offset"].unit) == (0.5, "K")
+    assert unknowns["gain"].prior == lp.Normal(1.0, 0.05)
     assert unknowns["correlated"].evolution == lp.MeanReverting(3600.0)
     assert path.exists()
 

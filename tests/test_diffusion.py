@@ -14,7 +14,7 @@ from livepde.models import conduction, heat
 from livepde.stepping import Advance, Alexander2, simulate
 
 
-def number(value: float) -> lp.Scalar:
+def number(value: float) -> lp.Normal:
     return lp.Normal(value, max(abs(value), 1.0))
 
 

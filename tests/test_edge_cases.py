@@ -17,7 +17,7 @@ ZERO = {"boundary": 0.0}
 def conduction(prior=1.0, **options):
     return lp.Model(
         lp.Field(line(20), ElementLineP1(), dirichlet=ZERO),
-        lp.Scalar(prior),
+        lp.Normal(prior),
         A=diffusion,
         f=lambda x, t: 10 * (1 + np.sin(3 * t)) + 0 * x[0],
         **options,

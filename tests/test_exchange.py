@@ -49,7 +49,7 @@ from livepde.models import heat
 
 def build():
     mesh = lp.interval(0.0, 0.4, 40)
-    model = heat(mesh, lp.Scalar(5e-5, std=3e-5, bounds=(1e-6, 1e-3)), {"left": lp.Channel("T")})
+    model = heat(mesh, lp.Normal(5e-5, std=3e-5, bounds=(1e-6, 1e-3)), {"left": lp.Channel("T")})
     sensors = lp.Points({"T_10": 0.1}, noise=0.05, unit="degC")
     return lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=20.0, dt_max=20.0)
 
@@ -257,7 +257,7 @@ def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
         "import livepde as lp\n"
         "from livepde.models import heat\n"
         "def build():\n"
-        "    alpha = lp.Scalar(5e-5, std=3e-5)\n"
+        "    alpha = lp.Normal(5e-5, std=3e-5)\n"
         "    model = heat(lp.interval(0.0, 0.4, 8), alpha, {'left': lp.Channel('hot')})\n"
         "    return lp.Identifier(model, lp.Points({'T': 0.1}, noise=0.1), lp.SensitivityLaw())\n"
     )
@@ -298,7 +298,7 @@ def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
         "from skfem import ElementLineP1\n"
         "def build():\n"
         "    field = lp.Field(lp.interval(0.0, 1.0, 10), ElementLineP1())\n"
-        "    model = lp.Model(field, {'k': lp.Scalar(1.0, std=0.5)},\n"
+        "    model = lp.Model(field, {'k': lp.Normal(1.0, std=0.5)},\n"
         "        A=lambda q, u, v, x: q.k * u * v, B=lambda u, v, x: -10 * np.exp(u) * v)\n"
         "    return lp.Identifier(model, lp.Points({'a': 0.5}, noise=0.1), lp.SensitivityLaw(),\n"
         "        u0=2.0)\n"

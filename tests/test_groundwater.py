@@ -31,7 +31,7 @@ def theis(r: Any, t: Any, T: float, S: float, rate: float) -> Any:
     return rate / (4 * np.pi * T) * exp1(r**2 * S / (4 * T * t))
 
 
-def positive(value: float) -> lp.Scalar:
+def positive(value: float) -> lp.LogNormal:
     return lp.LogNormal(value, value)
 
 

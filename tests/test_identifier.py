@@ -402,7 +402,9 @@ def test_a_stream_that_gives_no_samples(kind):
 
 def test_numbers_where_something_else_is_expected():
     mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.errors.SpaceError, match=r"got 0\.5 as an unknown; expected Scalar"):
+    with pytest.raises(
+        lp.errors.SpaceError, match=r"got 0\.5 as an unknown; write Normal\(0\.5, std\)"
+    ):
         lp.Model(lp.Field(mesh, ElementLineP1()), {"k": 0.5}, A=lambda q, u, v, x: q.k * u * v)
     with pytest.raises(lp.errors.SpaceError, match=r"cells >= 1, whole"):
         lp.interval(0.0, 1.0, 2.5)

@@ -218,7 +218,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
-    def rod(unknown: lp.Scalar) -> lp.Model:
+    def rod(unknown: lp.fem.Unknown) -> lp.Model:
         return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
 
     model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
@@ -258,7 +258,7 @@ def test_a_moving_field_keeps_its_boundary_value(law: Any):
     np.testing.assert_array_equal(estimate.q[fixed], 0.0)
 
 
-def reacting(first: lp.Scalar) -> lp.Model:
+def reacting(first: lp.fem.Unknown) -> lp.Model:
     return lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0}),
         {"a": first, "b": lp.Normal(0.3, 0.2)},
@@ -294,7 +294,7 @@ def test_the_theory_does_not_speak_of_models_nonlinear_in_what_is_estimated():
     assert any("not linear in what is estimated" in note for note in report.notes)
 
 
-def starting(unknown: lp.Scalar) -> lp.Model:
+def starting(unknown: lp.fem.Unknown) -> lp.Model:
     return lp.Model(
         lp.Field(mesh, ElementLineP1()),
         {"u0": unknown},

@@ -120,7 +120,7 @@ def test_what_modes_leave_out_moves_like_the_rest():
     mesh = lp.interval(0.0, 1.0, 10)
     points, state = lp.Points([0.5], noise=1e3), lp.Field(mesh, lp.linear(mesh))
 
-    def deviation(modes: int, evolution: Any, prior: Any = lp.Normal(0.0, 2.0)) -> Array:
+    def deviation(modes: int, evolution: Any, prior: lp.fem.Prior) -> Array:
         q = lp.Field(mesh, lp.linear(mesh), inner="H1", prior=prior, evolution=evolution)
         model = lp.Model(state, {"q": q}, A=lambda q, u, v, x: q.q * u * v)
         identifier = lp.Identifier(model, points, lp.SensitivityLaw(modes=modes), u0=0.0)
@@ -128,8 +128,9 @@ def test_what_modes_leave_out_moves_like_the_rest():
             identifier.step(t, [0.0])
         return np.asarray(identifier.estimate().q_std)
 
+    normal = lp.Normal(0.0, 2.0)
     for evolution in (lp.RandomWalk(0.7), lp.MeanReverting(2.0), lp.fem.Periodic(4.0)):
-        few, all_ = deviation(3, evolution), deviation(11, evolution)
+        few, all_ = deviation(3, evolution, normal), deviation(11, evolution, normal)
         assert few == pytest.approx(all_, rel=1e-3)
     log = lp.LogNormal(1.0, 2.0)
     few, all_ = (deviation(n, lp.RandomWalk(0.7), log) for n in (3, 11))

@@ -131,7 +131,7 @@ def test_the_speed_of_a_wave_is_found():
 
 
 def test_a_periodic_parameter_and_the_observation_of_all():
-    field = ring(ElementLineP1(), inner="H1", prior=1.0)
+    field = ring(ElementLineP1(), inner="H1", prior=lp.Normal(1.0))
     state = lp.Field(field.mesh, ElementLineP2(), periodic=RING)
     model = lp.Model(state, field, A=lambda q, u, v, x: q * u * v)
     assert model.Q.dim == 24

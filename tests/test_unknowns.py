@@ -450,7 +450,7 @@ def test_jumps_of_a_region_or_of_all():
             lambda: lp.Piecewise(HALVES, lp.Normal(), own={"c": lp.Normal()}),
             "the name of a region, one of",
         ),
-        (lambda: lp.Piecewise(HALVES, lp.Normal(), own={"l": 2.0}), "and a Scalar"),
+        (lambda: lp.Piecewise(HALVES, lp.Normal(), own={"l": 2.0}), "and a prior or a Scalar"),
         (lambda: rod(lp.Piecewise(HALVES, lp.Normal(), own={"l": lp.Normal()})), "needs a name"),
     ],
 )

@@ -139,7 +139,7 @@ def _inside(nodes: Array, edge: float) -> bool:
 
 
 def _built(frame: Frame, key: str, build: Callable[[], Any]) -> Any:
-    """Return the built mesh; an error names the key of the case."""
+    """Return what is built, a mesh or an unknown; an error names the key of the case."""
     try:
         return build()
     except SpaceError as error:
@@ -311,7 +311,8 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
-        return _built(frame, key, lambda: Normal(prior, std, (low, high)))
+        normal: Prior = _built(frame, key, lambda: Normal(prior, std, (low, high)))
+        return normal
     return _transformed(frame, spec.transform, prior, std, (low, high), key)
 
 
@@ -330,7 +331,8 @@ def _transformed(
         text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
         raise frame.error(key, text + "inside of the bounds.")
     distribution = LogNormal if transform == "log" else LogitNormal
-    return _built(frame, key, lambda: distribution(median, std, (low, high)))
+    found: Prior = _built(frame, key, lambda: distribution(median, std, (low, high)))
+    return found
 
 
 def _evolution(
