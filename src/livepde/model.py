@@ -94,7 +94,8 @@ class Model:
         The field u, or a mapping of names to fields on one mesh, which forms see as u.c, v.c and so
         on; Dirichlet values may be numbers, functions g(x, t) or channels.
     parameter
-        The unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
+        The unknown: a prior (`Normal`, `LogNormal`, `LogitNormal`: one number), a `Scalar`,
+        `Piecewise`, `Scalars` or `Field`, or a mapping of names to those.
     A
         Integrand (q, u, v, x), linear in v; for a mapping of unknowns `q.name`. Whether it is
         linear in q is found out; all of the residual may stand here.

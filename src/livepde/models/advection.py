@@ -39,7 +39,7 @@ def advection_diffusion(
     mesh
         `livepde.interval(...)`, or a mesh of more dimensions with the flow along its first; in m.
     kappa
-        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`.
+        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`.
     dirichlet
         Mapping from boundary to number, function g(x, t), or `Channel`. Other boundaries have no
         diffusive flux.

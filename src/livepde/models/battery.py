@@ -42,7 +42,7 @@ def battery_particle(
         Radius in m, from 0 ("left") to the surface ("right"), with cells of size sqrt(D h) at the
         surface for time steps h.
     D
-        Diffusivity of lithium at half filling in m^2/s; positive: transform="log".
+        Diffusivity of lithium at half filling in m^2/s; positive: a `LogNormal`.
     slope
         Derivative of the logarithm of the diffusivity by the filling; default 0, a constant D.
     area

@@ -46,7 +46,7 @@ def grouted_borehole(
     its middle. The power is distributed evenly, and the mean over "left" is the temperature of the
     fluid.
 
-    All unknowns are positive: use transform="log", and "logit" for the share.
+    All unknowns are positive: use `LogNormal`, and `LogitNormal` for the share.
 
     The capacity of the ground may be unknown because radii there are replaced by a coordinate that
     measures the heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x
@@ -62,7 +62,7 @@ def grouted_borehole(
     k
         Conductivity of the ground in W/(m K).
     rho_c
-        Volumetric heat capacity of the ground in J/(m^3 K), a `Scalar`.
+        Volumetric heat capacity of the ground in J/(m^3 K), one number.
     R_b
         Resistance between fluid and wall of the borehole in m K/W.
     share

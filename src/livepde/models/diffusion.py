@@ -36,7 +36,7 @@ def heat(
     mesh
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     alpha
-        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
+        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
         is continuous between layers, so all layers have the same heat capacity (else:
         `conduction`).
     dirichlet

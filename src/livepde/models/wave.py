@@ -36,7 +36,7 @@ def wave(
     mesh
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     c2
-        Squared speed in m^2/s^2: a `Scalar`, a `Piecewise`, or a `Field`.
+        Squared speed in m^2/s^2: a number, a `Piecewise`, or a `Field`.
     d
         Damping in 1/s: a number or an unknown.
     dirichlet
