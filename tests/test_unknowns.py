@@ -187,6 +187,41 @@ def test_priors_that_cannot_be_meant_are_one_sentence(build: Any, words: str):
         build()
 
 
+@pytest.mark.parametrize(
+    ("prior", "mean", "std", "bounds"),
+    [
+        (lp.Normal(2.0, 0.5, bounds=(0.0, 3.0)), 2.0, 0.5, (0.0, 3.0)),
+        (lp.LogNormal(2.0, 0.5), np.log(2.0), 0.25, (-np.inf, np.inf)),
+        (lp.LogNormal(2.0, 0.5, bounds=(1.0, np.inf)), 0.0, 0.5, (-np.inf, np.inf)),
+        (lp.LogitNormal(0.5, 0.1, bounds=(0.0, 1.0)), 0.0, 0.4, (-np.inf, np.inf)),
+    ],
+)
+def test_priors_are_gaussian_in_their_latent_values(prior: Any, mean: Any, std: Any, bounds: Any):
+    assert (prior.latent_mean, prior.latent_std) == pytest.approx((mean, std))
+    assert prior.latent_bounds == bounds
+    assert prior.transform.value(np.array(prior.latent_mean)) == pytest.approx(prior.centre)
+
+
+@pytest.mark.parametrize(
+    "prior", [lp.Normal(0.5, 0.2), lp.LogNormal(0.5, 0.2), lp.LogitNormal(0.5, 0.2, (0.1, 0.9))]
+)
+def test_a_prior_alone_is_one_number(prior: Any):
+    samples = data(lambda t: 0.3, np.linspace(0.0, 1.0, 11))
+    both = [{"a": prior}, {"a": lp.Scalar(prior)}]
+    alone, scalar = (estimates(rod(a), lp.SensitivityLaw(), samples)[-1] for a in both)
+    np.testing.assert_array_equal(alone.q, scalar.q)
+    np.testing.assert_array_equal(alone.q_std, scalar.q_std)
+    assert alone["a"].interval() == scalar["a"].interval()
+    assert FunctionSpace.of(prior, "q").prior == [0.5]
+
+
+def test_a_prior_alone_holds_for_a_region():
+    own = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), unit="m", own={"r": lp.LogNormal(0.3, 0.1)})
+    left, right = own.separated("a").values()
+    assert (left.prior, right.prior) == (lp.Normal(0.4, 0.1), lp.LogNormal(0.3, 0.1))
+    assert (left.unit, right.unit) == ("m", "m")
+
+
 def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)
     samples = data(lambda t: 0.05, times)

@@ -198,8 +198,7 @@ class _Declared:
             raise SpaceError(f"{what}: within must be a positive number; got {self.within}.")
         if self.evolution.copies > 1 and not self.prior.symmetric:
             raise SpaceError(
-                f"{what}: Periodic needs a prior without bounds and transform, "
-                "Normal(mean, std); choose."
+                f"{what}: Periodic needs a prior without bounds and transform: a Normal."
             )
 
 
