@@ -520,7 +520,11 @@ REFUSED = [
     ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m/s"', "unknowns.alpha.prior"),
     ("bounds = [", 'transform = "log"\nbounds = [', "alpha: transform='log' knows no upper bound"),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "logit"', "needs two finite bounds"),
-    ('prior = "5e-5 m^2/s"', 'prior = 1e-6\ntransform = "logit"', "inside of what transform='logit' allows"),
+    (
+        'prior = "5e-5 m^2/s"',
+        'prior = 1e-6\ntransform = "logit"',
+        "alpha: prior 1e-06 is not inside of what transform='logit' allows",
+    ),
     ('prior = "5e-5 m^2/s"', "prior = true", "unknowns.alpha.prior: got True"),
     ('prior = "5e-5 m^2/s"', "", "the key 'unknowns.alpha.prior' is missing"),
     ('prior = "5e-5 m^2/s"', "prior = 1.0", "prior 1 lies outside of the bounds [1e-06, 0.001]"),
@@ -791,7 +795,7 @@ def test_positive_unknowns(rod):
     assert row.prior == pytest.approx(3e-5)
     assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
-    assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(3e-5, 3e-5)
+    assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(5e-5, 3e-5)
 
 
 @pytest.mark.parametrize(
