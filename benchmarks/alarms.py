@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.cases import find_cases
 from livepde.cases import load
 from livepde.errors import LivepdeError
-from livepde.fem import Field, Piecewise, Scalar, dot, grad, interval, linear
+from livepde.fem import Field, LogNormal, Normal, Piecewise, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import Jumps, Replay, SensitivityLaw
 from livepde.linalg import Array
@@ -148,7 +148,7 @@ def _driven(x: Any, t: float) -> Any:
 def _heat(law: SensitivityLaw, title: str) -> Process:
     model = Model(
         Field(MESH, linear(MESH), dirichlet={"left": _driven, "right": 0.0}),
-        {"a": Scalar(0.3, 0.1, transform="log")},
+        {"a": LogNormal(0.3, 0.1)},
         A=lambda q, u, v, x: q.a * dot(grad(u), grad(v)),
     )
     return Process(title, model, Points(POINTS), 0.0, lambda rng: rng.uniform(0.2, 0.4, 1), law)
@@ -169,7 +169,7 @@ def _reaction(unknown: Any, title: str, observation: Observation, **options: Any
 @cache
 def _reaction_number() -> Process:
     return _reaction(
-        Scalar(3.0, 1.0),
+        Normal(3.0, 1.0),
         "reaction q of the paper's equation, three points",
         Points(POINTS),
         draw=lambda rng: rng.uniform(2.0, 4.0, 1),
@@ -184,7 +184,7 @@ def _reaction_field() -> Process:
         return np.asarray(2.0 + rng.uniform(1.0, 3.0) * np.sin(np.pi * x) ** 2)
 
     return _reaction(
-        Field(MESH, linear(MESH), inner="H1", prior=3.0, std=1.0),
+        Field(MESH, linear(MESH), inner="H1", prior=Normal(3.0, std=1.0)),
         "reaction q(x) of the paper's equation, seen on (0.3, 0.87)",
         Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.87)),
         draw=draw,
@@ -195,7 +195,7 @@ def _reaction_field() -> Process:
 @cache
 def _burgers() -> Process:
     sides: dict[str, Any] = {"left": lambda x, t: 0.5 + 0.5 * np.sin(2.0 * t) + 0.0 * x[0]}
-    nu = Scalar(0.1, 0.03, transform="log")
+    nu = LogNormal(0.1, 0.03)
     model = burgers(interval(0.0, 1.0, 32), nu, dirichlet={**sides, "right": 0.0})
     return Process(
         "viscosity of Burgers' equation, three points",
@@ -317,9 +317,9 @@ def _rod(a: Any, loss: float = 0.0, source: float = 0.0) -> Model:
 
 
 def _suspects() -> dict[str, Suspect]:
-    number = Scalar(0.3, 0.1, transform="log")
+    number = LogNormal(0.3, 0.1)
     halves: dict[str, Any] = {"left": "left half", "right": lambda x: x[0] >= 0.5}
-    layers = Piecewise(halves, prior=0.3, std=0.1, transform="log")
+    layers = Piecewise(halves, LogNormal(0.3, std=0.1))
     plain = _rod(number)
 
     def layered(rng: np.random.Generator) -> Array:

@@ -18,7 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from livepde.fem import Field, Inputs, Moment, RandomWalk, Scalar, dot, grad, linear
+from livepde.fem import (
+    Field,
+    Inputs,
+    LogNormal,
+    Moment,
+    Normal,
+    RandomWalk,
+    Scalar,
+    dot,
+    grad,
+    linear,
+)
 from livepde.fem import interval as line
 from livepde.identifier import Identifier
 from livepde.laws import Belief, Replay, SensitivityLaw
@@ -102,8 +113,8 @@ class Problem:
         )
 
 
-A, B = Scalar(0.3, 0.06), Scalar(1.0, 0.4)
-PROFILE = Field(MESH, linear(MESH), inner="H1", prior=0.3, std=0.1, transform="log")
+A, B = Normal(0.3, 0.06), Normal(1.0, 0.4)
+PROFILE = Field(MESH, linear(MESH), inner="H1", prior=LogNormal(0.3, std=0.1))
 SPREAD = (0.1667, 0.3333, 0.5, 0.6667, 0.8333)
 
 
@@ -132,7 +143,7 @@ PROBLEMS: Mapping[str, Problem] = {
     ),
     "random walk": Problem(
         "diffusivity that changes",
-        {"a": Scalar(0.3, 0.06, transform="log", evolution=RandomWalk(0.1))},
+        {"a": Scalar(LogNormal(0.3, 0.06), evolution=RandomWalk(0.1))},
         SensitivityLaw(),
     ),
     "missing loss": Problem(
@@ -277,7 +288,9 @@ def _path(model: Model, times: Array, rng: np.random.Generator) -> Array:
     for t0, t1 in pairwise(times):
         a = latent.moved(a, t1 - t0)
         for item in latent.parts.values():
-            grown = np.repeat(item.evolution.growth(t1 - t0, item.unknown.latent_std), item.size)
+            grown = np.repeat(
+                item.evolution.growth(t1 - t0, item.unknown.prior.latent_std), item.size
+            )
             if grown.any():
                 noise = root[item.part, item.part] @ rng.standard_normal(len(grown))
                 a = a.copy()

@@ -12,7 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from livepde.fem import Channel, Scalar, interval
+from livepde.fem import Channel, LogNormal, interval
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
@@ -183,8 +183,8 @@ def _taken(home: Path, *options: str) -> float:
 
 def _rod() -> Model:
     ends = {"left": Channel("heated"), "right": 0.0}
-    loss = Scalar(0.5, std=0.5, transform="log", bounds=(0.0, np.inf))
-    alpha = Scalar(0.5, std=0.25, transform="log", bounds=(0.0, np.inf))
+    loss = LogNormal(0.5, std=0.5)
+    alpha = LogNormal(0.5, std=0.25)
     return heat(interval(0.0, 1.0, NODES - 1), alpha, ends, loss=loss)
 
 

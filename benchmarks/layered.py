@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.fem import Channel, Field, Piecewise, dot, grad, interval, linear, rectangle
+from livepde.fem import Channel, Field, Normal, Piecewise, dot, grad, interval, linear, rectangle
 from livepde.model import Model
 
 __all__ = ["ENDS", "POINTS", "PRIOR", "STD", "STEP", "ends_at", "plate", "rod"]
@@ -40,7 +40,8 @@ def rod(nodes: int, unknowns: int, ends: str) -> Model:
         Field(mesh, linear(mesh), dirichlet=held),
         {
             "k": Piecewise(
-                {f"k_{i}": partial(_layer, i, unknowns) for i in range(unknowns)}, PRIOR, STD
+                {f"k_{i}": partial(_layer, i, unknowns) for i in range(unknowns)},
+                Normal(PRIOR, STD),
             )
         },
         A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)),
@@ -55,7 +56,7 @@ def plate(nodes: int) -> Model:
     quarters = {f"k_{i}{j}": partial(_quarter, i, j) for i in range(2) for j in range(2)}
     return Model(
         Field(mesh, linear(mesh), dirichlet={"boundary": 0.0}),
-        {"k": Piecewise(quarters, PRIOR, STD)},
+        {"k": Piecewise(quarters, Normal(PRIOR, STD))},
         A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)),
         f=10.0,
     )

@@ -20,7 +20,7 @@ from time import process_time
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.fem import Channel, Inputs, Scalar, interval
+from livepde.fem import Channel, Inputs, Normal, interval
 from livepde.models import heat
 from livepde.runs import JOURNAL, Check, Outcome, Table, drive
 from livepde.stepping import Advance, ImplicitEuler, simulate
@@ -89,7 +89,7 @@ main()
 def rod(folder: Path, samples: int = SAMPLES) -> Path:
     """Write the case and its data into a folder, and return the path of the case."""
     ends = {"left": Channel("T_left"), "right": Channel("T_right")}
-    model = heat(interval(0.0, 0.4, 2 * CELLS), Scalar(9.7e-5), ends, source=Scalar(1e-3))
+    model = heat(interval(0.0, 0.4, 2 * CELLS), Normal(9.7e-5), ends, source=Normal(1e-3))
     q = model.initial_parameter({"alpha": 9.7e-5, "source": 1e-3})
     block, rng = model.state_block, np.random.default_rng(1)
     at = np.linspace(0, 2 * CELLS, SENSORS + 2).astype(int)[1:-1]

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.fleet import NODES, NOISE, SENSORS, STEP
 from livepde.atomic_write import write_bytes
-from livepde.fem import Channel, Scalar, interval
+from livepde.fem import Channel, LogNormal, interval
 from livepde.fleet import Shard
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
@@ -295,7 +295,7 @@ def _send(pipe: Connection, what: Callable[[int, str], Any], count: int, law: st
 
 
 def _rod() -> Model:
-    alpha = Scalar(0.5, std=0.25, transform="log", bounds=(0.0, np.inf))
+    alpha = LogNormal(0.5, std=0.25)
     return heat(interval(0.0, 1.0, NODES - 1), alpha, {"left": Channel("heated"), "right": 0.0})
 
 

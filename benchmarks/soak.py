@@ -19,7 +19,18 @@ import numpy as np
 
 from benchmarks.progress import shown
 from livepde.errors import RunError
-from livepde.fem import Channel, Field, Inputs, RandomWalk, Scalar, dot, grad, interval, linear
+from livepde.fem import (
+    Channel,
+    Field,
+    Inputs,
+    Normal,
+    RandomWalk,
+    Scalar,
+    dot,
+    grad,
+    interval,
+    linear,
+)
 from livepde.identifier import Identifier, Sample
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
@@ -192,8 +203,8 @@ def _identifier() -> Identifier:
     model = Model(
         state=Field(mesh, linear(mesh), dirichlet={"left": Channel("left"), "right": 0.0}),
         parameter={
-            "k": Scalar(0.04, std=0.02),
-            "loss": Scalar(0.2, std=0.1, evolution=RandomWalk(0.001)),
+            "k": Normal(0.04, std=0.02),
+            "loss": Scalar(Normal(0.2, std=0.1), evolution=RandomWalk(0.001)),
         },
         A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)) + q.loss * u * v,
     )

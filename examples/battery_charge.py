@@ -15,7 +15,7 @@ PERIOD, NOISE, LIMIT = 30.0, 2e-3, 0.85  # s, V, filling at the surface
 def particle(cells: int) -> lp.Model:
     """Return the particle, on a mesh that is finer towards the surface."""
     mesh = lp.fem.line((R * (1.0 - np.linspace(1.0, 0.0, cells + 1) ** 2)).tolist())
-    D = lp.Scalar(6e-15, std=3e-15, transform="log", bounds=(0.0, np.inf))
+    D = lp.LogNormal(6e-15, std=3e-15)
     return battery_particle(mesh, D, area=AREA, c_max=FULL)
 
 

@@ -14,7 +14,7 @@ def rod(cells: int) -> lp.Model:
     mesh = lp.interval(0.0, 0.15, cells)
     return lp.Model(
         state=lp.Field(mesh, ElementLineP1(), unit="degC"),
-        parameter={"k": lp.Scalar(20.0, std=10.0, transform="log", bounds=(0.0, np.inf))},
+        parameter={"k": lp.LogNormal(20.0, std=10.0)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         B=lambda u, v, x: 2000.0 * (u - ROOM) * v,
         f=lp.On("left", lambda x, t: 60e3 * x.inputs["heater"]),

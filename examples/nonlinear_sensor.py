@@ -10,7 +10,7 @@ from livepde.streams import AbsoluteNoise, Twin
 # u_t = k u_xx + s in units of the left end's temperature; three pyrometers show z = u^4.
 model = lp.Model(
     state=lp.Field(lp.interval(0.0, 1.0, 40), ElementLineP2(), dirichlet={"left": 1.0}),
-    parameter={"k": lp.Scalar(0.5, std=0.3, bounds=(0.01, 5.0)), "s": lp.Scalar(0.0, std=2.0)},
+    parameter={"k": lp.Normal(0.5, std=0.3, bounds=(0.01, 5.0)), "s": lp.Normal(0.0, std=2.0)},
     A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
 )
 sensors = lp.observation.Transformed(

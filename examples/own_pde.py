@@ -24,8 +24,8 @@ def radiating_rod(mesh, unknowns, dirichlet, R=0.005, C=3.9e6):
 
 def main():
     """Check the model, then find k = 21 and eps = 0.8 from three thermometers."""
-    k = lp.Scalar(15.0, std=10.0, unit="W/(m K)", transform="log")
-    eps = lp.Scalar(0.5, std=0.2, bounds=(0.0, 1.0), transform="logit")
+    k = lp.Scalar(lp.LogNormal(15.0, std=10.0), unit="W/(m K)")
+    eps = lp.LogitNormal(0.5, std=0.2, bounds=(0.0, 1.0))
     model = radiating_rod(lp.interval(0.0, 0.2, 40), {"k": k, "eps": eps}, {"left": 900.0})
     lp.diagnostics.check_model(model, u=600.0, inputs={"a": 300.0}).raise_if_failed()
     sensors = lp.Points({"T_2": 0.02, "T_5": 0.05, "T_9": 0.09}, noise=1.0, unit="K")

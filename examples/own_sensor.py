@@ -27,7 +27,7 @@ def main() -> CheckReport:
     """Bind the sensor to a model and check it: R and P are projections, G^+ reconstructs."""
     model = lp.Model(
         state=lp.Field(lp.interval(0.0, 1.0, 50), ElementLineP1(), dirichlet={"left": 0.0}),
-        parameter=lp.Scalar(1.0),
+        parameter=lp.Normal(1.0),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     report = check_observation(Differences(((0.2, 0.4), (0.5, 0.9)), noise=0.01), model)

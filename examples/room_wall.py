@@ -37,7 +37,7 @@ def room(cells: int) -> lp.Model:
         {"air": lambda x: x[0] < 0.02}
     )
     regions = {name: (lambda x, name=name: layer(x, name)) for name in WALL}
-    k = lp.Piecewise(regions, prior=1.0, std=0.6, transform="log", bounds=(0.0, np.inf))
+    k = lp.Piecewise(regions, lp.LogNormal(1.0, std=0.6))
     return lp.Model(
         state=lp.Field(mesh, lp.linear(mesh), unit="degC"),
         parameter={"k": k},

@@ -10,7 +10,7 @@ from livepde.streams import AbsoluteNoise, Twin
 mesh = lp.interval(0.0, 1.0, 40)
 model = lp.Model(
     state=lp.Field(mesh, ElementLineP2(), dirichlet={"left": 0.0, "right": lp.Channel("T_end")}),
-    parameter={"k": lp.Scalar(0.5, std=0.3, bounds=(0.01, 5.0)), "s": lp.Scalar(0.0, std=2.0)},
+    parameter={"k": lp.LogNormal(0.5, std=0.3), "s": lp.Normal(0.0, std=2.0)},
     A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
 )
 sensors = lp.Points({"T_1": 0.3, "T_2": 0.6}, noise=0.01)

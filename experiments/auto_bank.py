@@ -50,7 +50,7 @@ def data_of(problem: Problem, level: float, seed: int) -> Data:
     data = problem.data(level, seed)
     if problem.name != "burgers-varying":
         return data
-    unknown = lp.Scalar(0.1, 0.05, transform="log")
+    unknown = lp.LogNormal(0.1, 0.05)
     model = burgers(lp.interval(0.0, 1.0, 32), unknown, dirichlet=SIDES)
     return replace(data, process=replace(data.process, model=model))
 

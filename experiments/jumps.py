@@ -23,7 +23,7 @@ MESH = lp.interval(0.0, 1.0, 30)
 POINTS = [0.25, 0.5, 0.75]
 
 
-def rod(a: lp.Scalar) -> lp.Model:
+def rod(a: lp.fem.Unknown) -> lp.Model:
     """Return a rod whose left end swings."""
     ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
     state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
@@ -37,7 +37,7 @@ def truth(t: float) -> float:
 
 def states() -> list[tuple[float, Any]]:
     """Return the exact states."""
-    model = rod(lp.Scalar(BEFORE))
+    model = rod(lp.Normal(BEFORE))
     forward, u = ForwardStage(model), model.initial(0.0)
     found = [(0.0, u)]
     for t0, t1 in pairwise(TIMES.tolist()):
@@ -46,7 +46,7 @@ def states() -> list[tuple[float, Any]]:
     return found
 
 
-def measured(law: lp.laws.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: int) -> Any:
+def measured(law: lp.laws.Law[Any, Any], unknown: lp.fem.Unknown, exact: Any, seed: int) -> Any:
     """Return error before the jump, time until nine tenths of it are followed, error at the end."""
     rng, model = np.random.default_rng(seed), rod(unknown)
     sensors: lp.observation.Observation = lp.Points(POINTS, noise=NOISE)
@@ -68,9 +68,12 @@ def measured(law: lp.laws.Law[Any, Any], unknown: lp.Scalar, exact: Any, seed: i
 
 def main() -> None:
     """Print the table."""
-    walk = {rate: lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(rate)) for rate in (0.005, 0.02, 0.1)}
-    constant, S = lp.Scalar(0.2, 0.2), lp.SensitivityLaw
-    rows: dict[str, tuple[Any, lp.Scalar]] = {
+    walk = {
+        rate: lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.RandomWalk(rate))
+        for rate in (0.005, 0.02, 0.1)
+    }
+    constant, S = lp.Normal(0.2, 0.2), lp.SensitivityLaw
+    rows: dict[str, tuple[Any, lp.fem.Unknown]] = {
         "constant": (S(), constant),
         "constant, memory 2": (S(memory=2.0), constant),
         "constant, replay": (S(replay=lp.Replay()), constant),

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.fem import Field, Sobolev, dot, grad, interval, linear
+from livepde.fem import Field, LogNormal, Normal, Sobolev, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, Replay, SensitivityLaw
 from livepde.laws.reduction import Reduction
@@ -47,7 +47,7 @@ BINS = (0.0, 0.1, 0.2, 0.3)  # distances from omega
 def reaction(cells: int) -> Model:
     """Return u_t - u_xx + q u = f with the source of `seed-excited`."""
     mesh = interval(0.0, 1.0, cells)
-    q = Field(mesh, linear(mesh), inner=Sobolev(1.0, 0.3).pointwise(1), prior=3.0, std=1.5)
+    q = Field(mesh, linear(mesh), inner=Sobolev(1.0, 0.3).pointwise(1), prior=Normal(3.0, std=1.5))
     return Model(
         Field(mesh, linear(mesh), dirichlet={"boundary": 0.0}),
         {"q": q},
@@ -65,7 +65,7 @@ def rod(cells: int) -> Model:
         "right": lambda x, t: np.sin(0.7 * t) + 0.0 * x[0],
     }
     smooth = Sobolev(2.0, 0.3).pointwise(1)
-    a = Field(mesh, linear(mesh), inner=smooth, prior=0.1, std=0.04, transform="log")
+    a = Field(mesh, linear(mesh), inner=smooth, prior=LogNormal(0.1, std=0.04))
     return Model(
         Field(mesh, linear(mesh), dirichlet=ends),
         {"a": a},

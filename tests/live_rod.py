@@ -26,7 +26,7 @@ def identifier(*, verdict: bool = True) -> lp.Identifier:
     mesh = lp.interval(0.0, 1.0, 10)
     model = lp.Model(
         state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("left"), "right": 0.0}),
-        parameter={"k": lp.Scalar(0.05, std=0.03)},
+        parameter={"k": lp.Normal(0.05, std=0.03)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)

@@ -29,7 +29,7 @@ def heat(scale):
         return scale * (rate + (np.pi**2 + EXACT_Q) * state(x, t))
 
     field = lp.Field(lp.interval(0.0, 1.0, 16), ElementLineP2(), dirichlet={"boundary": 0.0})
-    return lp.Model(field, lp.Scalar(), product, B=laplace, f=f)
+    return lp.Model(field, lp.Normal(), product, B=laplace, f=f)
 
 
 def exact(model, scale):

@@ -15,8 +15,8 @@ from livepde.models import advection_diffusion
 from livepde.stepping import Advance, Alexander2, simulate
 
 
-def number(value: float) -> lp.Scalar:
-    return lp.Scalar(value, max(abs(value), 1.0))
+def number(value: float) -> lp.Normal:
+    return lp.Normal(value, max(abs(value), 1.0))
 
 
 def run(model, u0, times, inputs=None):
@@ -96,12 +96,12 @@ def test_random_columns_pass_the_checks(kappa, flux, dispersivity, seed):
     halves = {"gravel": lambda x: x[0] < 0.2, "clay": lambda x: x[0] >= 0.2}
     model = advection_diffusion(
         mesh,
-        lp.Piecewise(halves, kappa, kappa / 2, transform="log"),
+        lp.Piecewise(halves, lp.LogNormal(kappa, kappa / 2)),
         {"left": lp.Channel("T"), "right": 12.0},
-        v=lp.Scalar(flux, 1e-5),
-        K=lp.Scalar(1e-5, 1e-5),
-        dispersivity=lp.Scalar(dispersivity, dispersivity, transform="log"),
-        source=lp.Scalar(0.0, 1e-5, evolution=lp.MeanReverting(3600.0)),
+        v=lp.Normal(flux, 1e-5),
+        K=lp.Normal(1e-5, 1e-5),
+        dispersivity=lp.LogNormal(dispersivity, dispersivity),
+        source=lp.Scalar(lp.Normal(0.0, 1e-5), evolution=lp.MeanReverting(3600.0)),
         stabilise=bool(seed % 2),
         L=0.5,
         ratio=1.5,

@@ -34,7 +34,7 @@ def ends(t: float) -> dict[str, float]:
 def rows(change: float) -> str:
     """Return the data of the template's rod, whose diffusivity changes after 4000 s."""
     values = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
-    model = heat(lp.interval(0.0, 0.4, 40), lp.Scalar(TRUE_ALPHA), values)
+    model = heat(lp.interval(0.0, 0.4, 40), lp.Normal(TRUE_ALPHA), values)
     points = lp.Points({"T_10": 0.1, "T_20": 0.2, "T_30": 0.3})
     G, control = points.matrix(model.state_space), lp.Advance(lp.Alexander2(), 20.0)
     rng, u = np.random.default_rng(0), np.full(model.X.dim, 20.0)
@@ -109,7 +109,7 @@ def dataset(jumped: list[int], before: float = 1.0, after: float = 2.0) -> Any:
     """Return the dataset of a run of ten samples with alarms at some of them."""
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 4), ElementLineP1()),
-        {"a": lp.Scalar(1.0, 1.0)},
+        {"a": lp.Normal(1.0, 1.0)},
         A=lambda q, u, v, x: q.a * u * v,
         time_unit="s",
     )
@@ -188,9 +188,9 @@ def learned(unknowns: dict[str, Any], rate: Any) -> tuple[Any, Any]:
 @pytest.mark.slow
 def test_shares_over_time_end_where_identifiability_says():
     unknowns = {
-        "a": lp.Scalar(1.0, 0.5, transform="log"),
-        "b": lp.Scalar(0.0, 1.0, evolution=lp.fem.Periodic(5.0)),
-        "f": lp.Field(MESH, ElementLineP1(), inner="H1", std=1.0),
+        "a": lp.LogNormal(1.0, 0.5),
+        "b": lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.fem.Periodic(5.0)),
+        "f": lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(std=1.0)),
     }
     data, known = learned(unknowns, lambda q: q.a + q.b + q.f)
     a, b, f = known.unknowns
@@ -214,13 +214,13 @@ def test_the_table_says_pinned_flat_traded_off_and_at_a_bound():
         (table,) = [t for t in tables(data) if t.title == "What the data have told"]
         return {row[0]: row[2] for row in table.rows}
 
-    two = {"a": lp.Scalar(0.0, 1.0), "b": lp.Scalar(0.0, 1.0)}
+    two = {"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, 1.0)}
     assert states(two, lambda q: q.a) == {"a": "pinned", "b": "flat"}
     traded = states(two, lambda q: q.a - q.b)
     assert traded == {"a": "partly, traded off with b", "b": "partly, traded off with a"}
-    bound = {"a": lp.Scalar(0.5, 1.0, bounds=(0.2, 2.0))}
+    bound = {"a": lp.Normal(0.5, 1.0, bounds=(0.2, 2.0))}
     assert states(bound, lambda q: q.a) == {"a": "at its bound"}
-    walk = {"a": lp.Scalar(0.0, 1.0, evolution=lp.RandomWalk(5.0))}
+    walk = {"a": lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.RandomWalk(5.0))}
     assert states(walk, lambda q: 0.0 * q.a) == {"a": "moves"}
     field = {"f": lp.Field(MESH, ElementLineP1(), inner="H1")}
     assert states(field, lambda q: q.f)["f"].endswith("of 8 modes told")
@@ -229,7 +229,7 @@ def test_the_table_says_pinned_flat_traded_off_and_at_a_bound():
 def test_a_law_without_covariance_says_nothing_of_it():
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 4), ElementLineP1()),
-        {"a": lp.Scalar(1.0, 1.0)},
+        {"a": lp.Normal(1.0, 1.0)},
         A=lambda q, u, v, x: q.a * u * v,
     )
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=1.0)

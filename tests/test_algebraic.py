@@ -24,8 +24,8 @@ def electrolyte(held: bool = True, mass: Any = None) -> lp.Model:
         "phi": lp.Field(MESH, ElementLineP1(), dirichlet={"right": 0.0} if held else {}),
     }
     unknowns = {
-        "D": lp.Scalar(0.3, 0.2, transform="log"),
-        "sigma": lp.Scalar(1.0, 0.5, transform="log"),
+        "D": lp.LogNormal(0.3, 0.2),
+        "sigma": lp.LogNormal(1.0, 0.5),
     }
 
     def fluxes(q: Any, u: Any, v: Any, x: Any) -> Any:

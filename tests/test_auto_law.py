@@ -33,7 +33,7 @@ def rod(
 ) -> lp.Model:
     """Return a rod in units that are u, x and t times smaller."""
     unit = x**2 / t
-    a = {"a": lp.Scalar(0.2 * unit, std * unit, **unknown)}
+    a = {"a": lp.Scalar(lp.Normal(0.2 * unit, std * unit), **unknown)}
     return driven_rod(a, lambda s: u * np.sin(3 * s / t), lp.interval(0.0, x, cells))
 
 

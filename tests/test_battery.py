@@ -27,12 +27,12 @@ CURRENT = 1.0
 
 
 def particle(
-    cells: int = 30, slope: lp.Scalar | None = None, evolution: Any = None, std: float = D
+    cells: int = 30, slope: lp.fem.Unknown | None = None, evolution: Any = None, std: float = D
 ) -> lp.Model:
     moving = {"evolution": evolution} if evolution else {}
     return battery_particle(
         lp.interval(0.0, R, cells),
-        lp.Scalar(D, std, transform="log", **moving),
+        lp.Scalar(lp.LogNormal(D, std), **moving),
         slope,
         area=AREA,
         c_max=FULL,
@@ -72,7 +72,7 @@ def test_constant_flux_is_that_of_the_textbook():
 
 
 def test_what_leaves_is_the_charge():
-    model = particle(slope=lp.Scalar(-1.0, 1.0))
+    model = particle(slope=lp.Normal(-1.0, 1.0))
     _, c = discharged(model, TIMES)
     mesh = model.state.mesh
     assert np.all(np.diff(mesh.p[0]) > 0)  # c is in the order of the coefficients
@@ -84,12 +84,12 @@ def test_what_leaves_is_the_charge():
 @pytest.mark.slow
 def test_diffusivity_follows_the_filling():
     """Near the surface -D(c) c_r is the flux."""
-    r, c = discharged(particle(400, slope=lp.Scalar(2.0, 1.0)), TIMES)
+    r, c = discharged(particle(400, slope=lp.Normal(2.0, 1.0)), TIMES)
     middle = (c[-1] + c[-2]) / 2
     mobility = D * np.exp(2.0 * (middle / FULL - 0.5))
     flux = -mobility * (c[-1] - c[-2]) / (r[-1] - r[-2])
     assert flux == pytest.approx(CURRENT / (FARADAY * AREA), rel=0.01)
-    _, without = discharged(particle(30, slope=lp.Scalar(0.0, 1.0)), TIMES)
+    _, without = discharged(particle(30, slope=lp.Normal(0.0, 1.0)), TIMES)
     _, constant = discharged(particle(30), TIMES)
     assert np.allclose(without, constant)
 
@@ -103,7 +103,7 @@ def test_diffusivity_follows_the_filling():
     seed=st.integers(0, 2**32 - 1),
 )
 def test_forms_pass_the_shipped_checks(value, slope, filling, seed):
-    model = particle(15, slope=None if slope is None else lp.Scalar(slope, 0.5))
+    model = particle(15, slope=None if slope is None else lp.Normal(slope, 0.5))
     q = {"D": value} | ({} if slope is None else {"slope": slope})
     u = filling * FULL
     check_model(model, q=q, u=u, spread=0.1 * FULL, inputs={"I": 1.0}, seed=seed).raise_if_failed()
@@ -115,7 +115,7 @@ def pulses(t: float) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
-    model = particle(slope=lp.Scalar(0.0, 1.0))
+    model = particle(slope=lp.Normal(0.0, 1.0))
     sensor = lp.Points({"surface": R}, noise=50.0)
     true = {"D": 2e-14, "slope": -1.5}
     times = np.arange(0.0, 7201.0, 30.0)
@@ -145,7 +145,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
     """ln D falls by one in eight hours; seen is a voltage behind an unknown resistance."""
     noise, end = 1e-3, 8 * 3600.0
     model = particle(20, evolution=lp.RandomWalk(0.1 / 60.0), std=D).with_unknowns(
-        {"R_0": lp.Scalar(0.03, 0.02, transform="log")}
+        {"R_0": lp.LogNormal(0.03, 0.02)}
     )
     voltage = lp.observation.Calibrated(
         lp.Points({"V": R}),
@@ -181,17 +181,17 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
 def test_options_that_make_no_sense_are_refused(change, message):
     options = {"area": AREA, "c_max": FULL} | change
     with pytest.raises(ModelError, match=message):
-        battery_particle(lp.interval(0.0, R, 10), lp.Scalar(D, D), **options)
+        battery_particle(lp.interval(0.0, R, 10), lp.Normal(D, D), **options)
 
 
 def test_a_particle_begins_at_its_centre():
     with pytest.raises(ModelError, match="centre"):
-        battery_particle(lp.interval(0.1 * R, R, 10), lp.Scalar(D, D), area=AREA, c_max=FULL)
+        battery_particle(lp.interval(0.1 * R, R, 10), lp.Normal(D, D), area=AREA, c_max=FULL)
 
 
 @pytest.mark.parametrize("names", [("D",), ("D", "slope")])
 def test_the_equation_builds_it(names):
-    unknowns = {name: lp.Scalar(1e-14, 1e-14) for name in names}
+    unknowns = {name: lp.Normal(1e-14, 1e-14) for name in names}
     equation = EQUATIONS["battery_particle"]
     built = equation.build(lp.interval(0.0, R, 10), unknowns, {}, area=AREA, c_max=FULL)
     assert tuple(built.parameter_space.unknowns) == names

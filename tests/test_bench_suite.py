@@ -24,7 +24,7 @@ TIMES = np.linspace(0.0, 1.0, 21)
 
 def rod(seed: int, evolution: lp.RandomWalk | None = None) -> Process:
     moves = {} if evolution is None else {"evolution": evolution}
-    unknown = lp.Scalar(0.3, 0.1, transform="log", **moves)
+    unknown = lp.Scalar(lp.LogNormal(0.3, 0.1), **moves)
     model = driven_rod({"a": unknown}, lambda t: np.sin(4 * t), line(12))
     points = lp.Points([0.3, 0.6])
     q = np.array([0.3 * np.exp(np.random.default_rng(seed).normal() / 3)])

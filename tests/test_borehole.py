@@ -33,14 +33,14 @@ POWER = 1000.0
 HOUR = 3600.0
 
 
-def unknown(name: str) -> lp.Scalar:
+def unknown(name: str) -> lp.fem.Prior:
     if name == "share":
-        return lp.Scalar(TRUTH[name], 0.05, (0.0, 1.0), transform="logit")
-    return lp.Scalar(TRUTH[name], 0.3 * TRUTH[name], (0.0, np.inf), transform="log")
+        return lp.LogitNormal(TRUTH[name], 0.05, bounds=(0.0, 1.0))
+    return lp.LogNormal(TRUTH[name], 0.3 * TRUTH[name])
 
 
 def model(
-    cells: int = 80, far: float = 12.0, rho_c: lp.Scalar | None = None, **more: float
+    cells: int = 80, far: float = 12.0, rho_c: lp.fem.Unknown | None = None, **more: float
 ) -> lp.Model:
     mesh = lp.interval(0.02, far, cells, geometric=True)
     unknowns = {name: unknown(name) for name in TRUTH} | ({"rho_c": rho_c} if rho_c else {})
@@ -113,7 +113,7 @@ def test_late_the_fluid_follows_the_line_source():
 def test_an_unknown_capacity_is_that_capacity(factor):
     """Radii counted by the heat they hold change nothing that is measured at the borehole."""
     times = np.concatenate([[0.0], np.geomspace(60.0, 60 * HOUR, 80)])
-    capacity = lp.Scalar(factor * TRUTH["rho_c"], 1e6, transform="log")
+    capacity = lp.LogNormal(factor * TRUTH["rho_c"], 1e6)
     scaled, plain = model(160), model(160, rho_c=capacity)
     q = TRUTH | {"rho_c": factor * TRUTH["rho_c"]}
     (_, one), (_, other) = final(scaled, times, q), final(plain, times, q)
@@ -166,7 +166,7 @@ def test_a_mesh_without_room_for_the_layers_is_refused(start, stop, cells):
 
 
 def test_capacity_is_one_number():
-    layers = lp.Piecewise({"a": lambda x: x[0] > 0.0}, 2e6, 1e6)
+    layers = lp.Piecewise({"a": lambda x: x[0] > 0.0}, lp.Normal(2e6, 1e6))
     unknowns = {name: unknown(name) for name in TRUTH} | {"rho_c": layers}
     with pytest.raises(ModelError, match="Scalar"):
         grouted_borehole(lp.interval(0.02, 6.0, 40, geometric=True), **unknowns, **KNOWN)
@@ -241,11 +241,11 @@ def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
     assert std[-1] < 0.05 * 2.88
 
 
-@pytest.mark.parametrize("rho_c", [2.3e6, lp.Scalar(2e6, 5e5, transform="log")])
+@pytest.mark.parametrize("rho_c", [2.3e6, lp.LogNormal(2e6, 5e5)])
 def test_the_ground_alone_with_known_and_unknown_heat_capacity(rho_c: Any) -> None:
     """Late the wall follows the line source, T = T0 + Q/(4 pi k H) E1(r^2 rho_c/(4 k t))."""
     mesh = lp.interval(0.01, 30.0, 200, geometric=True)
-    k, R_b = lp.Scalar(2.0, 1.0), lp.Scalar(0.1, 0.05)
+    k, R_b = lp.Normal(2.0, 1.0), lp.Normal(0.1, 0.05)
     process = borehole(mesh, k, R_b, H=100.0, rho_c=rho_c, T0=10.0)
     check_model(process, u=12.0, spread=2.0, inputs={"Q": 5000.0}).raise_if_failed()
     known = isinstance(rho_c, float)
@@ -258,7 +258,7 @@ def test_the_ground_alone_with_known_and_unknown_heat_capacity(rho_c: Any) -> No
 
 def test_a_case_may_leave_the_heat_capacity_unknown() -> None:
     mesh, equation = lp.interval(0.1, 5.0, 10, geometric=True), EQUATIONS["borehole"]
-    unknowns = {name: lp.Scalar(1.0, 0.1) for name in ("k", "R_b", "rho_c")}
+    unknowns = {name: lp.Normal(1.0, 0.1) for name in ("k", "R_b", "rho_c")}
     options = {"H": 100.0, "rho_c": 2.3e6, "T0": 10.0}
     assert set(equation.build(mesh, unknowns, {}, **options).parameter_space.labels) == set(
         unknowns

@@ -187,10 +187,10 @@ def test_layers_with_priors_of_their_own(rod):
     )
     space = case.model.parameter_space
     a, b = (space.unknown_of(f"alpha[{name}]") for name in "ab")
-    assert (a.prior, b.prior) == pytest.approx((5e-5, 8e-5))
-    assert b.std == pytest.approx(3e-5)
+    assert (a.prior.centre, b.prior.centre) == pytest.approx((5e-5, 8e-5))
+    assert b.prior.std == pytest.approx(3e-5)
     assert (a.evolution.moves, b.evolution) == (False, lp.MeanReverting(3600.0))
-    assert b.bounds == a.bounds
+    assert b.prior.bounds == a.prior.bounds
     assert len(preview(case.prepare(), case.prepare().stream).unknowns) == 2
 
 
@@ -259,7 +259,7 @@ def test_gradient_law_on_averages(rod):
 def test_gradient_law_tunes_itself_on_means_over_subdomains(tmp_path):
     """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
     mesh, times = lp.interval(0, 1, 40), 0.05 * np.arange(201)
-    rod = lp.models.heat(mesh, lp.Scalar(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
+    rod = lp.models.heat(mesh, lp.Normal(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
     parts = {f"T{k}": (k / 10, (k + 1) / 10) for k in range(10)}
     means = lp.Averages(
         {k: (lambda x, a=a, b=b: (x[0] > a) & (x[0] < b)) for k, (a, b) in parts.items()}
@@ -518,6 +518,13 @@ REFUSED = [
     ('to = "40 cm"', "to = -1", "needs from < to"),
     ('to = "40 cm"', "to = [1]", "mesh.to: got [1]"),
     ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m/s"', "unknowns.alpha.prior"),
+    ("bounds = [", 'transform = "log"\nbounds = [', "alpha: transform='log' knows no upper bound"),
+    ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "logit"', "needs two finite bounds"),
+    (
+        'prior = "5e-5 m^2/s"',
+        'prior = 1e-6\ntransform = "logit"',
+        "alpha: prior 1e-06 is not inside of what transform='logit' allows",
+    ),
     ('prior = "5e-5 m^2/s"', "prior = true", "unknowns.alpha.prior: got True"),
     ('prior = "5e-5 m^2/s"', "", "the key 'unknowns.alpha.prior' is missing"),
     ('prior = "5e-5 m^2/s"', "prior = 1.0", "prior 1 lies outside of the bounds [1e-06, 0.001]"),
@@ -788,7 +795,7 @@ def test_positive_unknowns(rod):
     assert row.prior == pytest.approx(3e-5)
     assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
-    assert case.model.parameter_space.unknowns["alpha"].transform == "log"
+    assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(5e-5, 3e-5)
 
 
 @pytest.mark.parametrize(
@@ -903,8 +910,8 @@ def test_unknowns_of_sensors_share_a_prior(rod):
         "alpha", "offset[T_10]", "gain[T_10]", "correlated[T_10]"
     }  # fmt: skip
     unknowns = model.parameter_space.unknowns
-    assert (unknowns["offset"].std, unknowns["offset"].unit) == (0.5, "K")
-    assert (unknowns["gain"].prior, unknowns["gain"].std) == (1.0, 0.05)
+    assert (unknowns["offset"].prior.std, unknowns["offset"].unit) == (0.5, "K")
+    assert unknowns["gain"].prior == lp.Normal(1.0, 0.05)
     assert unknowns["correlated"].evolution == lp.MeanReverting(3600.0)
     assert path.exists()
 

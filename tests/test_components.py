@@ -34,7 +34,7 @@ def exchange(mesh, parameter=None, **options):
             ),
             "s": lp.Field(mesh, ElementLineP1(), unit="g/kg"),
         },
-        parameter=parameter or {"k": lp.Scalar(1.0, 1.0)},
+        parameter=parameter or {"k": lp.Normal(1.0, 1.0)},
         A=lambda q, u, v, x: q.k * (u.c - u.s) * (v.c - v.s),
         B=lambda u, v, x: 0.05 * diffusion(u.c, v.c),
         **options,
@@ -63,7 +63,7 @@ def test_the_block_matrix_is_that_of_two_models(mesh):
     stiff = model.form_B.matrix("v", "u")
     alone = lp.Model(
         lp.Field(mesh, ElementLineP2(), quadrature=model.order),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: 0.05 * diffusion(u, v),
     )
@@ -78,7 +78,7 @@ def test_boundary_values_of_each_component(mesh):
             "a": lp.Field(mesh, ElementLineHermite(), dirichlet={"left": lambda x, t: 2.0 + t}),
             "b": lp.Field(mesh, ElementLineP1(), dirichlet={"right": lp.Channel("z"), "left": 1.0}),
         },
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u.a * v.b,
     )
     u = model.impose(np.zeros(model.state_space.dim), Moment(3.0, Inputs({"z": 7.0})))
@@ -115,7 +115,7 @@ def test_sensors_name_their_component(mesh):
 
 @pytest.mark.parametrize("sparse", [True, False])
 def test_both_laws_learn_an_exchange_rate(mesh, sparse):
-    model = exchange(mesh, {"k": lp.Scalar(1.0, 1.0, bounds=(0.0, 20.0))})
+    model = exchange(mesh, {"k": lp.Normal(1.0, 1.0, bounds=(0.0, 20.0))})
     times = np.arange(0.0, 4.01, 0.05)
     inflow = lambda t: {"inflow": 1.0 + np.sin(2.0 * t)}  # noqa: E731
     if sparse:
@@ -170,7 +170,7 @@ def test_truth_on_another_mesh_and_by_formula(mesh):
 def test_nonlinear_reaction_system_conserves_what_it_turns_over(mesh):
     model = lp.Model(
         {"a": lp.Field(mesh, ElementLineP1()), "b": lp.Field(mesh, ElementLineP1())},
-        {"k": lp.Scalar(1.0)},
+        {"k": lp.Normal(1.0)},
         A=lambda q, u, v, x: q.k * u.a**2 * (v.a - v.b),
         B=lambda u, v, x: diffusion(u.a, v.a) + 0.1 * diffusion(u.b, v.b),
     )
@@ -193,7 +193,7 @@ def test_vector_fields():
     field = lp.Field(mesh, ElementVector(ElementTriP1()))
     model = lp.Model(
         {"w": field, "T": lp.Field(mesh, ElementTriP1())},
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * lp.fem.ddot(lp.grad(u.w), lp.grad(v.w)) + q * diffusion(u.T, v.T),
         f={"w": lambda x, t: np.stack([1.0 + 0 * x[0], 2.0 + 0 * x[0]])},
     )
@@ -211,14 +211,14 @@ def test_bad_states(mesh):
     good, other = lp.Field(mesh, ElementLineP1()), lp.Field(lp.interval(0, 1, 10), ElementLineP1())
     A = lambda q, u, v, x: q * u.a * v.a  # noqa: E731
     with pytest.raises(lp.errors.ModelError, match="share one mesh object"):
-        lp.Model({"a": good, "b": other}, lp.Scalar(), A)
+        lp.Model({"a": good, "b": other}, lp.Normal(), A)
     with pytest.raises(lp.errors.ModelError, match="must be a Field"):
-        lp.Model({"a": good, "b": lp.Scalar()}, lp.Scalar(), A)
+        lp.Model({"a": good, "b": lp.Normal()}, lp.Normal(), A)
     with pytest.raises(lp.errors.ModelError, match=r"both called \['a'\]"):
-        lp.Model({"a": good, "b": good}, {"a": lp.Scalar()}, A)
+        lp.Model({"a": good, "b": good}, {"a": lp.Normal()}, A)
     with pytest.raises(lp.errors.ModelError, match="give a mapping"):
-        lp.Model({"a": good, "b": good}, lp.Scalar(), A, f=1.0)
-    model = lp.Model({"a": good, "b": good}, lp.Scalar(), A)
+        lp.Model({"a": good, "b": good}, lp.Normal(), A, f=1.0)
+    model = lp.Model({"a": good, "b": good}, lp.Normal(), A)
     with pytest.raises(lp.errors.SpaceError, match="a function for each"):
         model.initial(lambda x: x[0])
     with pytest.raises(lp.errors.SpaceError, match="say which one is meant"):

@@ -20,7 +20,7 @@ K, C, LENGTH = 2.0, 4.0, 1.0
 
 
 def slab(dirichlet: Any = None) -> lp.Model:
-    return conduction(lp.interval(0.0, LENGTH, 40), lp.Scalar(K, 1.0), dirichlet, C=C)
+    return conduction(lp.interval(0.0, LENGTH, 40), lp.Normal(K, 1.0), dirichlet, C=C)
 
 
 def steady(model: lp.Model, values: Mapping[str, float], inputs: Any = None) -> Any:
@@ -34,7 +34,7 @@ def steady(model: lp.Model, values: Mapping[str, float], inputs: Any = None) -> 
 @pytest.mark.parametrize("kind", ["number", "channel", "unknown"])
 def test_a_flux_gives_the_exact_gradient(kind: str) -> None:
     amount = {"number": 6.0, "channel": lp.Channel("J"), "unknown": "J"}[kind]
-    unknowns = {"J": lp.Scalar(0.0, 1.0)} if kind == "unknown" else {}
+    unknowns = {"J": lp.Normal(0.0, 1.0)} if kind == "unknown" else {}
     model = with_conditions(slab({"right": 20.0}), {"left": Flux(amount)}, unknowns=unknowns)
     values = {"k": K} | ({"J": 6.0} if unknowns else {})
     inputs = (lambda t: {"J": 6.0}) if kind == "channel" else None
@@ -47,7 +47,7 @@ def test_a_flux_gives_the_exact_gradient(kind: str) -> None:
 @pytest.mark.parametrize("ambient", [50.0, "T_w"])
 def test_an_exchange_gives_the_exact_profile(coefficient: Any, ambient: Any) -> None:
     given = {"h": 3.0, "T_w": 50.0}
-    unknowns = {name: lp.Scalar(1.0, 1.0) for name in given if name in (coefficient, ambient)}
+    unknowns = {name: lp.Normal(1.0, 1.0) for name in given if name in (coefficient, ambient)}
     model = with_conditions(
         slab({"right": 0.0}), {"left": Exchange(coefficient, ambient)}, unknowns=unknowns
     )
@@ -76,7 +76,7 @@ def test_says_what_is_wrong_with_a_condition() -> None:
         ({"boundary": {"top": Flux(1.0)}}, "no boundary 'top'"),
         ({"boundary": {"right": Flux(1.0)}}, "has a value"),
         ({"boundary": {"left": Flux("J")}}, "none of the unknowns"),
-        ({"unknowns": {"J": lp.Scalar()}}, "no condition names the unknown 'J'"),
+        ({"unknowns": {"J": lp.Normal()}}, "no condition names the unknown 'J'"),
         ({"sources": {"s": Source(1.0, "core")}}, "no subdomain 'core'"),
         ({"sources": {"s": Source(1.0, lambda x: x[0] > 2.0)}}, "no cell"),
     ):
@@ -88,7 +88,7 @@ def test_terms_beside_a_given_derivative_are_refused() -> None:
     mesh = lp.interval(0.0, 1.0, 4)
     model = lp.Model(
         lp.Field(mesh, lp.linear(mesh)),
-        {"a": lp.Scalar()},
+        {"a": lp.Normal()},
         A=lambda q, u, v, x: q.a * u * v,
         dA=lambda q, u, du, v, x: q.a * du * v,
     )
@@ -226,7 +226,7 @@ def test_heat_takes_fluxes_over_the_heat_capacity() -> None:
     """The flux J/C into u_t = div(alpha grad u) is that of J into C u_t = div(k grad u)."""
     mesh = lp.interval(0.0, LENGTH, 40)
     one = with_conditions(slab({"right": 0.0}), {"left": Flux(6.0)})
-    two = heat(mesh, lp.Scalar(K / C, 1.0), {"right": 0.0})
+    two = heat(mesh, lp.Normal(K / C, 1.0), {"right": 0.0})
     two = with_conditions(two, {"left": Flux(6.0 / C)})
     assert steady(one, {"k": K}) == pytest.approx(steady(two, {"alpha": K / C}))
 
@@ -234,7 +234,7 @@ def test_heat_takes_fluxes_over_the_heat_capacity() -> None:
 def test_a_constant_input_equals_its_channel() -> None:
     mesh = lp.interval(0.0, LENGTH, 40)
     unknowns = {"k": K, "loss": 0.3, "transfer": 0.2}
-    scalars = {name: lp.Scalar(value, 1.0) for name, value in unknowns.items()}
+    scalars = {name: lp.Normal(value, 1.0) for name, value in unknowns.items()}
     model = conduction(mesh, dirichlet={"right": 0.0}, C=C, **scalars)
     constant = model.with_constant_inputs({"ambient": 7.0})
     assert (model.channels, constant.channels) == (("ambient",), ())
@@ -260,7 +260,7 @@ def test_a_source_with_a_constant_input_is_assembled_once() -> None:
     field = lp.Field(mesh, lp.linear(mesh))
     source = lp.Model(
         field,
-        {"a": lp.Scalar()},
+        {"a": lp.Normal()},
         A=lambda q, u, v, x: q.a * u * v,
         f=lp.On("left", lambda x, t: x.inputs["Q"]),
         inputs=["Q"],

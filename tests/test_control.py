@@ -35,7 +35,7 @@ def rod(cells: int = 20, **options: Any) -> lp.Model:
     }
     return lp.Model(
         state=lp.Field(mesh, ElementLineP1()),
-        parameter={"k": lp.Scalar(20.0, std=10.0, transform="log", bounds=(0.0, np.inf))},
+        parameter={"k": lp.LogNormal(20.0, std=10.0)},
         M=lambda u, v, x: 3.6e6 * u * v,
         **{"inputs": ["heater", "room"], **given},
     )
@@ -115,7 +115,7 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
     mesh = lp.interval(0.0, 1.0, 16)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 1.0}),
-        {"a": lp.Scalar(0.5, 0.2)},
+        {"a": lp.Normal(0.5, 0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
     )
     small = ct.reduce(model, lp.Points({"middle": 0.5, "end": 0.0}), ["hot"], modes=13)
@@ -185,7 +185,7 @@ def test_a_mesh_of_few_cells_is_reduced_to_itself():
     mesh = lp.interval(0.0, 1.0, 2)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 1.0}),
-        {"a": lp.Scalar(0.5, 0.2)},
+        {"a": lp.Normal(0.5, 0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
     )
     small = ct.reduce(model, lp.Points({"middle": 0.5}), ["hot"])
@@ -583,7 +583,7 @@ def test_what_may_be_negative_is_measured_by_its_prior():
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot")}),
-        {"s": lp.Scalar(0.0, std=1.0)},
+        {"s": lp.Normal(0.0, std=1.0)},
         A=lambda q, u, v, x: -q.s * v,
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
     )

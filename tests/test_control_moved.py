@@ -23,9 +23,9 @@ MPC = pytest.param("MPC", marks=pytest.mark.skipif(not find_spec("do_mpc"), reas
 
 def unknown(kind: str, mesh: Any) -> Any:
     if kind == "radiating":
-        return lp.Scalar(20.0, std=8.0, transform="log")
+        return lp.LogNormal(20.0, std=8.0)
     smooth = lp.Sobolev(1, length=0.05).pointwise(1)
-    return lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=20.0, std=8.0, transform="log")
+    return lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=lp.LogNormal(20.0, std=8.0))
 
 
 def rod(kind: str) -> lp.Model:

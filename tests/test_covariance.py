@@ -12,8 +12,10 @@ from livepde.laws.members import changed
 def learned(evolution=None, readings=60, size=1.0, noise=0.05):
     """Return the law's work and state after readings that scatter `size` times more than stated."""
     unknowns = {
-        "alpha": lp.Scalar(0.05, 0.03),
-        "far": lp.Scalar(0.0, 2.0, evolution=evolution) if evolution else lp.Scalar(0.0, 2.0),
+        "alpha": lp.Normal(0.05, 0.03),
+        "far": lp.Scalar(lp.Normal(0.0, 2.0), evolution=evolution)
+        if evolution
+        else lp.Normal(0.0, 2.0),
     }
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"left": 1.0}),

@@ -54,12 +54,14 @@ MESHES = {
 
 def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Identifier:
     mesh = MESHES[kind]()
-    alpha = lp.Scalar(0.1, 0.05, unit="m^2/s", transform="log")
+    alpha = lp.Scalar(lp.LogNormal(0.1, 0.05), unit="m^2/s")
     if field:
-        alpha = lp.Field(mesh, lp.linear(mesh), prior=0.1, unit="m^2/s")
+        alpha = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(0.1), unit="m^2/s")
     spot = [(x, *[0.4] * (mesh.dim() - 1)) if mesh.dim() > 1 else x for x in (0.6, 0.3)]
     return lp.Identifier(
-        heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=lp.Scalar(0.2, 0.1, unit="1/s")),
+        heat(
+            mesh, alpha, {"left": lp.Channel("T0")}, loss=lp.Scalar(lp.Normal(0.2, 0.1), unit="1/s")
+        ),
         lp.Points({"a": spot[0]}, noise=0.1, unit="degC"),
         law or lp.SensitivityLaw(start_window=0),
         withheld=lp.Points({"b": spot[1]}),

@@ -64,7 +64,7 @@ def test_a_form_that_is_not_analytic_is_found():
 def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1()),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q**2 * u * v,
     )
     report = check_model(model, u=1.0)
@@ -75,7 +75,7 @@ def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
 def test_a_form_that_is_not_analytic_in_q_is_found():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1()),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: abs(q) ** 1.5 * u * v,
     )
     assert any("/dq" in name for name in failed(check_model(model, u=1.0)))
@@ -84,7 +84,7 @@ def test_a_form_that_is_not_analytic_in_q_is_found():
 def test_an_unsymmetric_mass_is_refused():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * u * v,
         M=lambda u, v, x: u * v + 0.1 * lp.grad(u)[0] * v,
     )

@@ -14,8 +14,8 @@ from livepde.models import conduction, heat
 from livepde.stepping import Advance, Alexander2, simulate
 
 
-def number(value: float) -> lp.Scalar:
-    return lp.Scalar(value, max(abs(value), 1.0))
+def number(value: float) -> lp.Normal:
+    return lp.Normal(value, max(abs(value), 1.0))
 
 
 def run(model, u0, times, inputs=None):
@@ -59,7 +59,7 @@ def test_source_by_layer():
     """Steady: a parabola where heat is gained, straight lines elsewhere."""
     mesh = lp.interval(0.0, 1.0, 40)
     halves = {"warm": lambda x: x[0] < 0.5, "still": lambda x: x[0] >= 0.5}
-    source = lp.Piecewise(halves, 0.0, 1.0)
+    source = lp.Piecewise(halves, lp.Normal(0.0, 1.0))
     model = heat(mesh, number(0.5), {"boundary": 0.0}, source=source)
     q = model.initial_parameter({"alpha": 0.5, "source": [2.0, 0.0]})
     *_, (_, u) = simulate(model, q, 0.0, np.linspace(0, 40, 81), Advance(Alexander2()))
@@ -82,8 +82,8 @@ def test_conduction_is_heat_in_other_units():
     mesh = lp.interval(0.0, 0.5, 25)
     times = np.linspace(0, 86400, 49)
     sides = {"left": lambda x, t: 10 * np.sin(2 * np.pi * t / 86400), "right": 0.0}
-    one = run(heat(mesh, lp.Scalar(5e-7, 1e-7), sides), 0.0, times)
-    two = run(conduction(mesh, lp.Scalar(1.25, 1.0), sides, C=2.5e6), 0.0, times)
+    one = run(heat(mesh, lp.Normal(5e-7, 1e-7), sides), 0.0, times)
+    two = run(conduction(mesh, lp.Normal(1.25, 1.0), sides, C=2.5e6), 0.0, times)
     assert np.allclose(one, two, rtol=1e-10, atol=1e-12)
 
 
@@ -95,15 +95,15 @@ def test_random_heat_passes_the_checks(alpha, loss, transfer, seed):
     halves = {"a": lambda x: x[0] < 0.2, "b": lambda x: x[0] >= 0.2}
 
     def positive(value):
-        return lp.Scalar(value, value, transform="log")
+        return lp.LogNormal(value, value)
 
     model = heat(
         mesh,
-        lp.Piecewise(halves, alpha, alpha / 2, transform="log"),
+        lp.Piecewise(halves, lp.LogNormal(alpha, alpha / 2)),
         {"left": lp.Channel("T")},
         loss=positive(loss),
         transfer=positive(transfer),
-        source=lp.Piecewise(halves, 0.0, 1e-5, evolution=lp.MeanReverting(3600.0)),
+        source=lp.Piecewise(halves, lp.Normal(0.0, 1e-5), evolution=lp.MeanReverting(3600.0)),
     )
     inputs = {"T": 12.0, "ambient": 9.0}
     check_model(model, u=10.0, inputs=inputs, seed=seed).raise_if_failed()
@@ -114,7 +114,7 @@ def test_random_heat_passes_the_checks(alpha, loss, transfer, seed):
 @given(st.floats(0.1, 5.0), st.floats(5e5, 5e6), st.integers(0, 99))
 def test_random_conduction_passes_the_checks(k, C, seed):
     mesh = lp.rectangle((0.0, 1.0), (0.0, 0.5), (3, 2))
-    one = lp.Scalar(k, k, transform="log")
+    one = lp.LogNormal(k, k)
     model = conduction(mesh, one, {"left": 5.0}, C=lambda x: C * (1 + x[0]), transfer=number(5.0))
     check_model(model, u=10.0, inputs={"ambient": 3.0}, seed=seed).raise_if_failed()
 
@@ -128,7 +128,7 @@ def test_what_cannot_be_is_said():
 
 
 def test_the_surroundings_do_not_make_each_step_factorise_anew():
-    exchange = {"loss": lp.Scalar(0.1), "transfer": lp.Scalar(0.2)}
-    model = heat(lp.interval(0.0, 1.0, 4), lp.Scalar(1.0), {"left": 0.0}, **exchange)
+    exchange = {"loss": lp.Normal(0.1), "transfer": lp.Normal(0.2)}
+    model = heat(lp.interval(0.0, 1.0, 4), lp.Normal(1.0), {"left": 0.0}, **exchange)
     assert model.steady
     assert not model.constant

@@ -64,7 +64,7 @@ def test_bogner_fox_schmit_on_the_boundary(side):
         return (1 + t) * (x[0] ** 3 - x[0] * x[1] ** 2 + 2 * x[1] ** 3 - x[0] ** 3 * x[1] ** 3)
 
     field = lp.Field(mesh, ElementQuadBFS(), dirichlet={side: g})
-    model = lp.Model(field, lp.Scalar(), A=lambda q, u, v, x: q * u * v)
+    model = lp.Model(field, lp.Normal(), A=lambda q, u, v, x: q * u * v)
     u = model.impose(np.random.default_rng(0).standard_normal(model.X.dim), Moment(0.5))
     s = np.linspace(0.0, 1.0, 30)
     sides = {"left": (0 * s, 1.5 * s), "top": (2.0 * s, 0 * s + 1.5)}
@@ -79,7 +79,7 @@ def test_bogner_fox_schmit_on_the_boundary(side):
 def test_bogner_fox_schmit_with_zero_values_and_channels():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
     field = lp.Field(mesh, ElementQuadBFS(), dirichlet={"left": lp.Channel("T"), "right": 1.0})
-    model = lp.Model(field, lp.Scalar(), A=lambda q, u, v, x: q * u * v)
+    model = lp.Model(field, lp.Normal(), A=lambda q, u, v, x: q * u * v)
     u = model.impose(np.random.default_rng(0).standard_normal(model.X.dim), Moment(0.0, {"T": 3.0}))
     s = np.linspace(0.0, 1.0, 30)
     for x, value in ((0.0, 3.0), (1.0, 1.0)):

@@ -17,7 +17,7 @@ ZERO = {"boundary": 0.0}
 def conduction(prior=1.0, **options):
     return lp.Model(
         lp.Field(line(20), ElementLineP1(), dirichlet=ZERO),
-        lp.Scalar(prior),
+        lp.Normal(prior),
         A=diffusion,
         f=lambda x, t: 10 * (1 + np.sin(3 * t)) + 0 * x[0],
         **options,
@@ -54,7 +54,7 @@ def test_a_parameter_of_zero_is_no_failure(start):
     """q is nothing but rounding errors then, and has no relative accuracy."""
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet=ZERO),
-        lp.Scalar(0.0),
+        lp.Normal(0.0),
         A=product,
         B=laplace,
         f=1.0,
@@ -70,7 +70,7 @@ def test_a_parameter_of_zero_is_no_failure(start):
 def test_unknowns_of_very_different_units():
     model = lp.Model(
         lp.Field(line(8), ElementLineP1(), dirichlet=ZERO),
-        {"D": lp.Scalar(5e-7, 1e-7), "T": lp.Scalar(10.0, 10.0)},
+        {"D": lp.Normal(5e-7, 1e-7), "T": lp.Normal(10.0, 10.0)},
         A=lambda q, u, v, x: 1e7 * q.D * lp.dot(lp.grad(u), lp.grad(v)) - q.T * v,
     )
     check_model(model, u=1.0).raise_if_failed()
@@ -80,7 +80,7 @@ def test_a_form_that_is_affine_at_times_is_not_affine():
     def solve(bend):
         model = lp.Model(
             lp.Field(line(4), ElementLineP1()),
-            lp.Scalar(0.0),
+            lp.Normal(0.0),
             A=product,
             B=lambda u, v, x: (np.maximum(x.t - 1, 0) * u**3 + bend * u**2) * v,
         )
@@ -90,7 +90,7 @@ def test_a_form_that_is_affine_at_times_is_not_affine():
 
 
 def test_a_singular_stage_is_a_status():
-    model = lp.Model(lp.Field(line(4), ElementLineP1()), lp.Scalar(-1.0), A=product)
+    model = lp.Model(lp.Field(line(4), ElementLineP1()), lp.Normal(-1.0), A=product)
     law = lp.SensitivityLaw(noise=0.1)
     ident = lp.Identifier(model, lp.Points([0.5]), law, u0=1.0)
     assert ident.step(1.0, [2.0]).status.code in ("ok", "singular")
@@ -99,7 +99,7 @@ def test_a_singular_stage_is_a_status():
 def test_a_prediction_that_is_not_a_number_is_not_accepted():
     model = lp.Model(
         lp.Field(line(4), ElementLineP1()),
-        lp.Scalar(0.0),
+        lp.Normal(0.0),
         A=product,
         f=lambda x, t: np.nan if abs(t - 0.2) < 1e-9 else 1.0,
     )
@@ -145,7 +145,7 @@ def test_a_checkpoint_from_before_the_start_starts_again(tmp_path):
 def test_notes_of_a_law_never_hide_an_unknown():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet=ZERO),
-        {"residual": lp.Scalar(2.0)},
+        {"residual": lp.Normal(2.0)},
         A=lambda q, u, v, x: q.residual * u * v,
         B=laplace,
     )

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import livepde as lp
 from livepde.fem import line, linear
+from livepde.fem.evolution import CONSTANT
 from livepde.models import EQUATIONS, Option
 
 pytestmark = pytest.mark.slow
@@ -51,6 +52,7 @@ TYPICAL = {
 }
 
 EVOLUTIONS = (lp.RandomWalk(0.1), lp.MeanReverting(2.0), lp.fem.Periodic(3.0, harmonics=2))
+WITHOUT_HARMONICS = (*EVOLUTIONS[:2], CONSTANT)
 
 
 def number(name: str, typical: Typical) -> st.SearchStrategy[float]:
@@ -62,16 +64,19 @@ def unknown(draw: Any, name: str, text: str, mesh: Any, typical: Typical) -> Any
     """Draw an unknown of any kind that the equation says it takes, with any prior and evolution."""
     low, high = typical.ranges.get(name, (0.0, 10.0))
     prior = draw(number(name, typical))
-    options: dict[str, Any] = {"prior": prior, "transform": draw(st.sampled_from(["log", "logit"]))}
-    if name in typical.ranges or options["transform"] == "logit":
-        options |= {"transform": "logit", "bounds": (0.9 * low, 1.1 * high)}
-    # As they are, unknowns stay near their prior: nothing else keeps a divisor from zero.
+    options: dict[str, Any]
+    # A normal unknown stays near its mean: nothing else keeps a divisor from zero.
     if name not in typical.ranges and draw(st.booleans()):
-        options = {"prior": prior, "std": 0.05 * prior}
-        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS, lp.Scalar().evolution)))
+        evolution = draw(st.sampled_from((*EVOLUTIONS, CONSTANT)))
+        options = {"prior": lp.Normal(prior, 0.05 * prior), "evolution": evolution}
     else:
-        options["std"] = prior * draw(st.floats(0.05, 0.5))
-        options["evolution"] = draw(st.sampled_from((*EVOLUTIONS[:2], lp.Scalar().evolution)))
+        std, evolution = (
+            prior * draw(st.floats(0.05, 0.5)),
+            draw(st.sampled_from(WITHOUT_HARMONICS)),
+        )
+        between = lp.LogitNormal(prior, std, (0.9 * low, 1.1 * high))
+        inside = name in typical.ranges or draw(st.booleans())
+        options = {"prior": between if inside else lp.LogNormal(prior, std), "evolution": evolution}
     kinds = ["number"] * ("initial" not in text)
     kinds += ["field"] * ("field" in text)
     kinds += ["regions"] * ("by layer" in text or "by region" in text)
@@ -149,7 +154,7 @@ FORMS: dict[str, Callable[[Any, Any, Any, Any], Any]] = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.parametrize("transform", [None, "log", "logit"])
+@pytest.mark.parametrize("distribution", [lp.Normal, lp.LogNormal, lp.LogitNormal])
 @pytest.mark.parametrize("kind", KINDS)
 @settings(max_examples=8, deadline=None)
 @example(  # a value that is almost, but not quite, zero
@@ -165,7 +170,7 @@ FORMS: dict[str, Callable[[Any, Any, Any, Any], Any]] = {
 )
 def test_every_unknown_passes_the_checks_and_stays_inside(
     form: str,
-    transform: str | None,
+    distribution: Any,
     kind: str,
     lower: float,
     width: float,
@@ -174,14 +179,13 @@ def test_every_unknown_passes_the_checks_and_stays_inside(
     evolution: Any,
     seed: int,
 ) -> None:
-    upper = np.inf if transform == "log" else lower + width
-    options: dict[str, Any] = {"prior": lower + at * width, "std": share * width}
-    if transform or kind != "field":
-        options |= {"transform": transform, "bounds": (lower, upper)}
-    if evolution.copies == 1:
+    upper = np.inf if distribution is lp.LogNormal else lower + width
+    prior = distribution(lower + at * width, share * width, bounds=(lower, upper))
+    options: dict[str, Any] = {"prior": prior}
+    if distribution is lp.Normal and (kind == "field" or evolution.copies > 1):  # without bounds
+        options = {"prior": lp.Normal(prior.centre, prior.std)}
+    if distribution is lp.Normal or evolution.copies == 1:
         options["evolution"] = evolution
-    elif transform is None:  # harmonics go without bounds
-        options = {**options, "bounds": (-np.inf, np.inf), "evolution": evolution}
     term = FORMS[form]
 
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
@@ -189,7 +193,7 @@ def test_every_unknown_passes_the_checks_and_stays_inside(
 
     model = lp.Model(lp.Field(MESH, linear(MESH)), {"k": KINDS[kind](**options)}, A)
     lp.diagnostics.check_model(model, u=0.7, seed=seed).raise_if_failed()
-    if transform:
+    if distribution is not lp.Normal:
         latent = model.latent
         a = 20.0 * np.random.default_rng(seed).standard_normal(latent.dim)
         q = latent.value(a)

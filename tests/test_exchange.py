@@ -49,7 +49,7 @@ from livepde.models import heat
 
 def build():
     mesh = lp.interval(0.0, 0.4, 40)
-    model = heat(mesh, lp.Scalar(5e-5, std=3e-5, bounds=(1e-6, 1e-3)), {"left": lp.Channel("T")})
+    model = heat(mesh, lp.Normal(5e-5, std=3e-5, bounds=(1e-6, 1e-3)), {"left": lp.Channel("T")})
     sensors = lp.Points({"T_10": 0.1}, noise=0.05, unit="degC")
     return lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=20.0, dt_max=20.0)
 
@@ -257,7 +257,7 @@ def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
         "import livepde as lp\n"
         "from livepde.models import heat\n"
         "def build():\n"
-        "    alpha = lp.Scalar(5e-5, std=3e-5)\n"
+        "    alpha = lp.Normal(5e-5, std=3e-5)\n"
         "    model = heat(lp.interval(0.0, 0.4, 8), alpha, {'left': lp.Channel('hot')})\n"
         "    return lp.Identifier(model, lp.Points({'T': 0.1}, noise=0.1), lp.SensitivityLaw())\n"
     )
@@ -298,7 +298,7 @@ def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
         "from skfem import ElementLineP1\n"
         "def build():\n"
         "    field = lp.Field(lp.interval(0.0, 1.0, 10), ElementLineP1())\n"
-        "    model = lp.Model(field, {'k': lp.Scalar(1.0, std=0.5)},\n"
+        "    model = lp.Model(field, {'k': lp.Normal(1.0, std=0.5)},\n"
         "        A=lambda q, u, v, x: q.k * u * v, B=lambda u, v, x: -10 * np.exp(u) * v)\n"
         "    return lp.Identifier(model, lp.Points({'a': 0.5}, noise=0.1), lp.SensitivityLaw(),\n"
         "        u0=2.0)\n"
@@ -349,7 +349,7 @@ def test_missing_values_are_those_of_the_case(rod, tmp_path):
 def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 10), ElementLineP1()),
-        {"k": lp.Scalar(0.1, std=0.05, unit="1/h")},
+        {"k": lp.Scalar(lp.Normal(0.1, std=0.05), unit="1/h")},
         A=lambda q, u, v, x: q.k * u * v,
         time_unit="h",
     )
@@ -375,7 +375,7 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
         mesh = lp.interval(0.0, 1.0, cells)
         model = lp.Model(
             lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
-            lp.Field(mesh, ElementLineP1(), inner="H1", prior=1.0, std=0.5, unit="1/s"),
+            lp.Field(mesh, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=0.5), unit="1/s"),
             A=lambda q, u, v, x: q * u * v,
             B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
         )
@@ -666,7 +666,7 @@ def test_units_of_the_si():
 @pytest.mark.parametrize(("unit", "step"), [("degC", "K"), ("degF", "degR"), ("m", "m")])
 def test_a_deviation_has_the_unit_of_differences(unit, step):
     def build():
-        model = heat(lp.interval(0.0, 0.4, 8), lp.Scalar(1.0, std=0.5, unit=unit))
+        model = heat(lp.interval(0.0, 0.4, 8), lp.Scalar(lp.Normal(1.0, std=0.5), unit=unit))
         return lp.Identifier(model, lp.Points({"T": 0.1}, noise=0.1), lp.SensitivityLaw())
 
     units = {item.name: item.unit for item in of_code("own.py:build", build).outputs()}
@@ -683,7 +683,7 @@ def slab(sensors):
         lp.Field(
             lp.interval(0.0, 1.0, 10), ElementLineP1(), dirichlet={"left": lp.Channel("T_left")}
         ),
-        {"k": lp.Scalar(0.2, std=0.05, bounds=(0.01, 5.0))},
+        {"k": lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0))},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     return lp.Identifier(model, lp.Points(sensors, noise=0.01), lp.SensitivityLaw())

@@ -54,10 +54,10 @@ MESHES = {
 def identifier(kind: str = "line", field: bool = False) -> lp.Identifier:
     mesh = MESHES[kind]()
     halves = {"near side": lambda x: x[0] < 0.5, "far": lambda x: x[0] >= 0.5}
-    alpha = lp.Piecewise(halves, 0.1, 0.05, unit="m^2/s", transform="log")
+    alpha = lp.Piecewise(halves, lp.LogNormal(0.1, 0.05), unit="m^2/s")
     if field:
-        alpha = lp.Field(mesh, lp.linear(mesh), prior=0.1, unit="m^2/s")
-    loss = lp.Scalar(0.2, 0.1, unit="1/s")
+        alpha = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(0.1), unit="m^2/s")
+    loss = lp.Scalar(lp.Normal(0.2, 0.1), unit="1/s")
     points = [0.6, 0.3] if mesh.dim() == 1 else [(x, *[0.4] * (mesh.dim() - 1)) for x in (0.6, 0.3)]
     return lp.Identifier(
         heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=loss),

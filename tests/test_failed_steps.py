@@ -24,7 +24,7 @@ LAWS = {
 
 def rod(law: Any) -> lp.Identifier:
     ends = {"left": lp.Channel("left"), "right": 20.0}
-    model = heat(lp.interval(0.0, 1.0, 8), lp.Scalar(0.1, std=0.05), ends)
+    model = heat(lp.interval(0.0, 1.0, 8), lp.Normal(0.1, std=0.05), ends)
     return lp.Identifier(model, lp.Points({"a": 0.3, "b": 0.6}, noise=0.1), law, u0=20.0)
 
 

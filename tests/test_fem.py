@@ -158,7 +158,7 @@ def test_spaces_of_equal_size_are_not_confused():
 def test_hermite_functions_are_exact_far_from_the_origin(span):
     mesh = lp.interval(*span)
     start, stop, cells = span
-    model = lp.Model(lp.Field(mesh, ElementLineHermite()), lp.Scalar(), product)
+    model = lp.Model(lp.Field(mesh, ElementLineHermite()), lp.Normal(), product)
     slope = 1.0 / (stop - start)
     u = model.initial(lambda x: (x[0] - start) * slope)
     nodes = (mesh.p[0] - start) * slope
@@ -178,8 +178,8 @@ def test_one_element_object_on_two_meshes():
     """scikit-fem's global elements remember their first mesh."""
     element, argyris = ElementLineHermite(), ElementTriArgyris()
     for cells in (30, 7, 12):
-        mass = lp.Model(lp.Field(line(cells), element), lp.Scalar(), product).mass
-        fresh = lp.Model(lp.Field(line(cells), ElementLineHermite()), lp.Scalar(), product).mass
+        mass = lp.Model(lp.Field(line(cells), element), lp.Normal(), product).mass
+        fresh = lp.Model(lp.Field(line(cells), ElementLineHermite()), lp.Normal(), product).mass
         np.testing.assert_array_equal(mass.toarray(), fresh.toarray())
     for refined in (0, 1):
         mesh = MeshTri().refined(refined)
@@ -292,15 +292,15 @@ def test_fields_must_share_one_mesh():
 
 def test_piecewise_by_predicate_and_by_subdomain():
     mesh = lp.interval(0, 1, 10, regions={"top": lambda x: x[0] < 0.4})
-    predicate = lp.Piecewise({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] >= 0.4})
-    named = lp.Piecewise({"a": "top", "b": lambda x: x[0] >= 0.4})
+    predicate = lp.Piecewise({"a": lambda x: x[0] < 0.4, "b": lambda x: x[0] >= 0.4}, lp.Normal())
+    named = lp.Piecewise({"a": "top", "b": lambda x: x[0] >= 0.4}, lp.Normal())
     state = lp.Field(mesh, ElementLineP1())
     u = np.random.default_rng(8).standard_normal(11)
     both = [
         lp.Model(state, unknown, diffusion).A(u).matrix.toarray() for unknown in (predicate, named)
     ]
     np.testing.assert_array_equal(*both)
-    together = lp.Model(state, lp.Scalar(), diffusion).A(u).matrix.toarray()
+    together = lp.Model(state, lp.Normal(), diffusion).A(u).matrix.toarray()
     np.testing.assert_allclose(both[0].sum(axis=1, keepdims=True), together, atol=1e-13)
 
     On = lp.On("top", lambda q, u, v, x: q * u * v)
@@ -311,7 +311,7 @@ def test_piecewise_by_predicate_and_by_subdomain():
     with pytest.raises(
         lp.errors.SpaceError, match="Region 'a': the mesh has no subdomain 'bottom'"
     ):
-        lp.Model(state, lp.Piecewise({"a": "bottom"}), diffusion)
+        lp.Model(state, lp.Piecewise({"a": "bottom"}, lp.Normal()), diffusion)
     edge = lp.Model(state, named, lp.On("left", lambda q, u, v, x: q * u * v))
     assert edge.A(np.ones(edge.X.dim)).matrix.nnz
 
@@ -321,9 +321,11 @@ def test_product_of_unknowns():
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
         {
-            "D": lp.Scalar(prior=2.0, std=0.5, bounds=(0.0, 9.0), unit="m2/s"),
-            "k": lp.Field(mesh, ElementLineP2(), inner="H1", prior=1.5),
-            "R": lp.Piecewise({"in": lambda x: x[0] < 0.5, "out": lambda x: x[0] >= 0.5}),
+            "D": lp.Scalar(lp.Normal(2.0, std=0.5, bounds=(0.0, 9.0)), unit="m2/s"),
+            "k": lp.Field(mesh, ElementLineP2(), inner="H1", prior=lp.Normal(1.5)),
+            "R": lp.Piecewise(
+                {"in": lambda x: x[0] < 0.5, "out": lambda x: x[0] >= 0.5}, lp.Normal()
+            ),
         },
         A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.k * u * v + q.R * v,
     )
@@ -358,7 +360,7 @@ def test_product_of_unknowns():
 
 def test_names_of_single_unknowns():
     field = lp.Field(line(), ElementLineP1(), name="temperature")
-    model = lp.Model(field, lp.Scalar(), product)
+    model = lp.Model(field, lp.Normal(), product)
     assert list(model.state_space.blocks) == ["temperature"]
     assert list(model.parameter_space.blocks) == ["q"]
 
@@ -366,7 +368,7 @@ def test_names_of_single_unknowns():
 def test_interpolation_is_exact_in_the_space():
     for name, case in CASES.items():
         mesh = case.mesh()
-        model = lp.Model(lp.Field(mesh, case.state), lp.Scalar(), product)
+        model = lp.Model(lp.Field(mesh, case.state), lp.Normal(), product)
         u = model.initial(lambda x: 1 + 2 * x[0])
         inside = np.full((mesh.dim(), 3), 0.2) + 0.1 * np.arange(3)
         values = model.state_block.probe(inside) @ u
@@ -381,7 +383,7 @@ def test_probe_outside_of_the_mesh():
     ring = ring.restrict(
         ring.elements_satisfying(lambda x: (x[0] - 0.5) ** 2 + (x[1] - 0.5) ** 2 > 0.06)
     )
-    block = lp.Model(lp.Field(ring, ElementTriP1()), lp.Scalar(), product).state_block
+    block = lp.Model(lp.Field(ring, ElementTriP1()), lp.Normal(), product).state_block
     with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[0.5, 0.5\] lies outside"):
         block.probe(np.array([[0.1, 0.5], [0.1, 0.5]]))
     with pytest.raises(lp.errors.ObservationError, match=r"point 0 at \[1.5, 0.5\].*unit"):

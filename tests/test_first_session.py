@@ -99,7 +99,7 @@ def measured(path: Path) -> None:
         return {"left": 22.0 + 18.0 * np.sin(2 * np.pi * t / 1500.0), "right": 22.0}
 
     values = {name: lp.Channel(name) for name in ("left", "right")}
-    model = heat(lp.interval(0.0, 0.4, 80), lp.Scalar(DIFFUSIVITY), values)
+    model = heat(lp.interval(0.0, 0.4, 80), lp.Normal(DIFFUSIVITY), values)
     q, block = model.initial_parameter({"alpha": DIFFUSIVITY}), model.state_block
     rng = np.random.default_rng(7)
     rows = ["when,T_left,probe near furnace,T_20,T_30,T_right"]

@@ -15,7 +15,7 @@ from livepde.diagnostics import check_model
 from livepde.models import EQUATIONS, fisher_kpp, porous_fisher
 from livepde.stepping import Advance, Alexander2, simulate
 
-ONE = lp.Scalar(1.0, 1.0)
+ONE = lp.Normal(1.0, 1.0)
 CASE = Path(__file__).parents[1] / "cases" / "scratch_assay.toml"
 
 
@@ -62,7 +62,7 @@ def test_the_sharp_wave_of_porous_fisher():
 )
 @pytest.mark.slow
 def test_checks_pass_for_random_parameters(D, r, K, m, porous):
-    unknowns = (lp.Scalar(value, value, transform="log") for value in (D, r))
+    unknowns = (lp.LogNormal(value, value) for value in (D, r))
     options = {"m": m} if porous else {}
     function = porous_fisher if porous else fisher_kpp
     model = function(lp.interval(0.0, 2.0, 10), *unknowns, K=K, **options)
@@ -73,7 +73,7 @@ def test_checks_pass_for_random_parameters(D, r, K, m, porous):
 def test_the_equations_build_by_region_and_in_the_plane(name):
     equation = EQUATIONS[name]
     halves = {"a": lambda x: x[0] < 1.0, "b": lambda x: x[0] >= 1.0}
-    unknowns = {"D": lp.Piecewise(halves, 0.01, 0.01, transform="log"), "r": lp.Scalar(1.0, 0.5)}
+    unknowns = {"D": lp.Piecewise(halves, lp.LogNormal(0.01, 0.01)), "r": lp.Normal(1.0, 0.5)}
     mesh = lp.rectangle((0.0, 2.0), (0.0, 1.0), (4, 2))
     options = {"K": 1700.0} | ({"m": 1.5} if name == "porous_fisher" else {})
     model = equation.build(mesh, unknowns, {"left": 100.0}, **options)

@@ -20,17 +20,18 @@ from livepde.models import heat
 from livepde.result import Result
 
 SENSORS = lp.Points({"T_1": 0.3, "T_2": 0.5, "T_3": 0.8}, noise=0.02)
-POSITIVE = {"transform": "log", "bounds": (0.0, np.inf)}
+ALPHA = lp.Normal(0.5, std=0.25)
+BOUNDED = lp.Normal(0.5, std=0.25, bounds=(0.45, 0.55))
 
 
-def rod(**alpha):
+def rod(prior=ALPHA, **alpha):
     """Two unknowns; inputs in the boundary values and beside an unknown."""
     ends = {"left": lp.Channel("T_0"), "right": 0.0}
     return heat(
         line(16),
-        lp.Scalar(0.5, std=0.25, unit="m^2/s", **alpha),
+        lp.Scalar(prior, unit="m^2/s", **alpha),
         ends,
-        loss=lp.Scalar(0.3, std=0.2),
+        loss=lp.Normal(0.3, std=0.2),
     )
 
 
@@ -38,7 +39,7 @@ def sources():
     """Sources that depend on time, without inputs; elements of second order."""
     return lp.Model(
         lp.Field(line(12), ElementLineP2(), dirichlet={"boundary": 0.0}),
-        {"a": lp.Scalar(0.5, std=2.0), "b": lp.Scalar(-1.0, std=0.5)},
+        {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
         A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
         B=laplace,
     )
@@ -49,7 +50,7 @@ def layers():
     halves = {"top": lambda x: x[0] < 0.4, "bottom": lambda x: x[0] >= 0.4}
     return lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0")}),
-        {"k": lp.Piecewise(halves, 0.6, 0.2), "c": lp.Scalar(0.0, std=0.1)},
+        {"k": lp.Piecewise(halves, lp.Normal(0.6, 0.2)), "c": lp.Normal(0.0, std=0.1)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - q.c * u * v,
         f=lambda x, t: 0.1 * x.inputs["sun"] * np.cos(t) * x[0],
         inputs=["sun"],
@@ -65,7 +66,7 @@ def walks():
         "d": None,
     }
     unknowns = {
-        name: lp.Scalar(0.5, std=0.2, **({"evolution": kind} if kind else {}))
+        name: lp.Scalar(lp.Normal(0.5, std=0.2), **({"evolution": kind} if kind else {}))
         for name, kind in evolutions.items()
     }
     return lp.Model(
@@ -81,7 +82,7 @@ def walks():
 MODELS = {
     "walks": walks,
     "rod": rod,
-    "logarithm": lambda: rod(**POSITIVE),
+    "logarithm": lambda: rod(lp.LogNormal(0.5, 0.25)),
     "sources": sources,
     "layers": layers,
 }
@@ -208,7 +209,7 @@ def test_members_start_where_they_are_told_to():
 def test_an_unknown_initial_state_learns_from_a_first_sample():
     model = lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"right": 0.0}),
-        {"a": lp.Scalar(0.5, std=0.2), "u0": lp.Scalar(0.0, std=1.0)},
+        {"a": lp.Normal(0.5, std=0.2), "u0": lp.Normal(0.0, std=1.0)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.u0 * v,
     )
@@ -224,7 +225,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
 
 @pytest.mark.slow
 def test_a_bound_is_kept_and_left_again():
-    model = rod(bounds=(0.45, 0.55))
+    model = rod(BOUNDED)
     fleet, estimate = compare(model, law(start_window=4), members=6)
     assert fleet.together
     alpha, _ = estimate.parameters["alpha"]
@@ -246,7 +247,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
     for model, guards in (
         (rod(), None),
         (rod(), lp.laws.Guards()),
-        (rod(bounds=(0.45, 0.55)), None),
+        (rod(BOUNDED), None),
     ):
         fleet, estimate = compare(model, law(guards=guards, start_window=4), stream)
         assert fleet.together
@@ -275,7 +276,7 @@ def test_other_laws_step_one_by_one_and_say_so(law, why):
 def nonlinear():
     return lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"left": lp.Channel("T_0"), "right": 0.0}),
-        {"a": lp.Scalar(0.5, std=0.2)},
+        {"a": lp.Normal(0.5, std=0.2)},
         A=lambda q, u, v, x: q.a * (1 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
     )
 
@@ -283,7 +284,7 @@ def nonlinear():
 def curved_in_inputs():
     return lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"a": lp.Scalar(0.5, std=0.2)},
+        {"a": lp.Normal(0.5, std=0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: x.inputs["T_0"] ** 2,
         inputs=["T_0"],
@@ -293,7 +294,7 @@ def curved_in_inputs():
 def moving_matrix():
     return lp.Model(
         lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"a": lp.Scalar(0.5, std=0.2)},
+        {"a": lp.Normal(0.5, std=0.2)},
         A=lambda q, u, v, x: (1.0 + x.inputs["T_0"]) * q.a * lp.dot(lp.grad(u), lp.grad(v)),
         f=1.0,
         inputs=["T_0"],
@@ -316,7 +317,7 @@ def test_other_models_step_one_by_one_and_say_so(build, why):
 
 @pytest.mark.slow
 def test_sensors_that_see_an_unknown_step_one_by_one():
-    model = rod().with_unknowns({"offset": lp.Scalar(0.0, std=0.1)})
+    model = rod().with_unknowns({"offset": lp.Normal(0.0, std=0.1)})
     sensors = lp.Points(
         {"T_1": 0.3, "T_2": 0.5, "T_3": 0.8},
         noise=0.02,

@@ -25,7 +25,7 @@ LAWS = {
 def rod(law, **unknown):
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"left": 0.0, "right": lp.Channel("T_end")}),
-        {"k": lp.Scalar(0.2, std=0.05, bounds=(0.01, 5.0), **unknown)},
+        {"k": lp.Scalar(lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0)), **unknown)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: x.inputs["heat"],
         inputs=("heat",),
@@ -37,7 +37,7 @@ def plate(law):
     mesh = MeshTri().refined(2).with_boundaries({"left": lambda x: x[0] == 0.0})
     model = lp.Model(
         lp.Field(mesh, ElementTriP1(), dirichlet={"left": lp.Channel("T_end")}),
-        {"k": lp.Scalar(0.2, std=0.05, bounds=(0.01, 5.0))},
+        {"k": lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0))},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.1 * u * q.k * v,
         f=lambda x, t: x.inputs["heat"],
         inputs=("heat",),
@@ -192,14 +192,14 @@ def test_a_bad_forecast_is_one_sentence(times, inputs, error, words):
 
 
 def test_a_forecast_too_far_away_says_so():
-    model = heat(line(10), lp.Scalar(0.1, std=0.05))
+    model = heat(line(10), lp.Normal(0.1, std=0.05))
     identifier = lp.Identifier(model, SENSORS, lp.GradientLaw(), dt_max=1e-3)
     with pytest.raises(lp.errors.SampleError, match="substeps"):
         identifier.forecast(1e6)
 
 
 def test_a_sensor_that_does_not_exist_is_told():
-    model = heat(line(10), lp.Scalar(0.1, std=0.05))
+    model = heat(line(10), lp.Normal(0.1, std=0.05))
     found = lp.Identifier(model, SENSORS, lp.GradientLaw()).forecast(1.0)
     with pytest.raises(lp.errors.SampleError, match="no sensor is called 'T_99'; there are"):
         found["T_99"]
@@ -208,7 +208,7 @@ def test_a_sensor_that_does_not_exist_is_told():
 def test_a_step_that_fails_is_the_status_of_the_forecast():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1()),
-        {"k": lp.Scalar(1.0, std=0.5)},
+        {"k": lp.Normal(1.0, std=0.5)},
         A=lambda q, u, v, x: q.k * u * v,
         B=lambda u, v, x: -10 * np.exp(u) * v,  # infinite soon after t = 0.01
     )

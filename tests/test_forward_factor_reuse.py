@@ -246,7 +246,7 @@ def transport(share):
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet={"left": 0.0}),
-        lp.Scalar(0.0),
+        lp.Normal(0.0),
         A=lambda q, u, v, x: share(q) * lp.grad(u)[0] * v,
         B=lambda u, v, x: 1e-16 * lp.dot(lp.grad(u), lp.grad(v)),
     )
@@ -285,7 +285,7 @@ def test_units_of_components_do_not_hide_what_is_not_symmetric():
     field = lp.Field(mesh, lp.linear(mesh))
     two = lp.Model(
         {"a": field, "b": field},
-        lp.Scalar(0.0),
+        lp.Normal(0.0),
         A=lambda q, u, v, x: q * u.b * v.b,
         M=lambda u, v, x: 1e15 * u.a * v.a + u.b * v.b,
         B=lambda u, v, x: 1e15 * u.a * v.a + lp.grad(u.b)[0] * v.b,

@@ -12,7 +12,7 @@ LAWS = {"sensitivity": lp.SensitivityLaw, "auto": lp.AutoLaw}
 
 
 def rod(law):
-    model = heat(lp.interval(0.0, 1.0, 12), lp.Scalar(0.05, 0.03))
+    model = heat(lp.interval(0.0, 1.0, 12), lp.Normal(0.05, 0.03))
     start = lambda x: 10.0 * np.sin(np.pi * x[0])  # noqa: E731
     return lp.Identifier(model, lp.Points([0.3, 0.7], noise=NOISE), law, u0=start)
 

@@ -379,7 +379,7 @@ def test_bounds_of_numbers_are_kept():
     """Data of q = 3 drive q up to its bound, and no further."""
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        lp.Scalar(prior=0.5, bounds=(0.0, 1.0)),
+        lp.Normal(0.5, bounds=(0.0, 1.0)),
         A=lambda q, u, v, x: q * u * v,
         B=laplace,
         f=1.0,
@@ -474,7 +474,7 @@ def test_bad_gains():
 
 
 def test_sensors_that_see_the_parameter_are_refused():
-    model = lp.Model(lp.Field(line(), ElementLineP1()), lp.Scalar(), lambda q, u, v, x: q * u * v)
+    model = lp.Model(lp.Field(line(), ElementLineP1()), lp.Normal(), lambda q, u, v, x: q * u * v)
     sensors = lp.Points({"a": 0.5}, direct={"a": lambda q, x: q})
     with pytest.raises(lp.errors.LawError, match="use SensitivityLaw"):
         identifier(model, lp.GradientLaw(), sensors)

@@ -31,8 +31,8 @@ def theis(r: Any, t: Any, T: float, S: float, rate: float) -> Any:
     return rate / (4 * np.pi * T) * exp1(r**2 * S / (4 * T * t))
 
 
-def positive(value: float) -> lp.Scalar:
-    return lp.Scalar(value, value, transform="log")
+def positive(value: float) -> lp.LogNormal:
+    return lp.LogNormal(value, value)
 
 
 def radial(cells: int = 80) -> lp.Model:
@@ -101,7 +101,7 @@ def test_water_is_kept_whatever_the_fields():
     """No flow across the boundary: what the wells take is what the storage gives."""
     mesh = lp.rectangle((0.0, 100.0), (0.0, 80.0), (10, 8))
     element = ElementQuad1()
-    T, S = (lp.Field(mesh, element, prior=v, std=v, transform="log") for v in (1e-2, 1e-3))
+    T, S = (lp.Field(mesh, element, prior=lp.LogNormal(v, std=v)) for v in (1e-2, 1e-3))
     model = groundwater(
         mesh, T, S, wells={"Q": (40.0, 40.0)}, radius=25.0, recharge=1e-8, element=element
     )
@@ -121,7 +121,7 @@ def test_water_is_kept_whatever_the_fields():
 def test_a_constant_field_of_storativity_is_a_number():
     mesh = lp.rectangle((0.0, 100.0), (0.0, 80.0), (10, 8))
     element, given = ElementQuad1(), {"wells": {"Q": (40.0, 40.0)}, "radius": 25.0}
-    S = lp.Field(mesh, element, prior=1e-3, std=1e-3, transform="log")
+    S = lp.Field(mesh, element, prior=lp.LogNormal(1e-3, std=1e-3))
     model = groundwater(mesh, positive(1e-2), S, {"left": 0.0}, **given)
     known = groundwater(mesh, positive(1e-2), positive(1e-3), {"left": 0.0}, **given)
     u = model.initial(lambda x: np.sin(x[0] / 20) * x[1] / 80)
@@ -149,7 +149,7 @@ def test_flow_in_the_plane_passes_the_checks(log_T: float, log_S: float, field: 
 
     def unknown(value: float) -> Any:
         if field:
-            return lp.Field(mesh, element, prior=value, std=0.5 * value, transform="log")
+            return lp.Field(mesh, element, prior=lp.LogNormal(value, std=0.5 * value))
         return positive(value)
 
     model = groundwater(
@@ -172,7 +172,7 @@ def test_what_is_wrong_is_said():
     with pytest.raises(ModelError, match=r"radius=21.2 or more \(got 1\)"):
         groundwater(mesh, T, T, wells={"Q": (30.0, 10.0)}, radius=1.0)
     with pytest.raises(ModelError, match="S by region is not possible"):
-        groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, 1.0, 1.0))
+        groundwater(mesh, T, lp.Piecewise({"a": lambda x: x[0] > 30.0}, lp.Normal(1.0, 1.0)))
     with pytest.raises(ModelError, match="thickness, must be positive"):
         pumping_test(lp.interval(0.1, 10.0, 5, geometric=True), T, T, b=0.0)
     with pytest.raises(ModelError, match="needs a mesh of a plane"):
@@ -200,6 +200,6 @@ def test_the_tomography_of_horkheim_passes_the_checks():
     pumping = module_from_spec(place)
     place.loader.exec_module(pumping)
     mesh = grid([-600.0, -90.0, -12.0, -4.0, 4.0, 12.0, 90.0], [-700.0, -30.0, -6.0, 6.0, 700.0])
-    one = lp.Field(mesh, ElementQuad1(), prior=1.0, std=1.0, transform="log")
+    one = lp.Field(mesh, ElementQuad1(), prior=lp.LogNormal(1.0, std=1.0))
     unknowns = {"T": positive(0.03), "S": positive(0.02), "Y": one, "Z": one}
     check_model(pumping.four_tests(mesh, unknowns, {}, length=8.0), u=1.0).raise_if_failed()

@@ -27,7 +27,7 @@ GUARDED = ("iterated", "tempered", "held", "restarted", "runaway")
 def explosive() -> lp.Model:
     """u_t - u_xx = q exp(u): no steady state beyond q = 3.5, and no step far beyond."""
     return driven_rod(
-        {"q": lp.Scalar(1.0, 1.0)},
+        {"q": lp.Normal(1.0, 1.0)},
         lambda t: 0.3 * np.sin(t),
         MESH,
         lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
@@ -35,7 +35,7 @@ def explosive() -> lp.Model:
 
 
 def rod(driven: Any = lambda t: 1.0, **unknown: Any) -> lp.Model:
-    a = {"a": lp.Scalar(0.2, 0.2, **unknown)}
+    a = {"a": lp.Scalar(lp.Normal(0.2, 0.2), **unknown)}
     return driven_rod(a, lambda t: driven(t) * np.sin(3 * t), MESH)
 
 
@@ -148,7 +148,7 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
     state = lp.Field(MESH, ElementLineP1(), dirichlet={"left": lp.Channel("T"), "right": 0.0})
     model = lp.Model(
         state,
-        {"q": lp.Scalar(1.0, 1.0)},
+        {"q": lp.Normal(1.0, 1.0)},
         A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.q * np.exp(u) * v,
     )
     identifier = lp.Identifier(model, POINTS, lp.SensitivityLaw(), u0=0.0)
@@ -237,7 +237,7 @@ def test_a_gain_too_large_for_the_noise_is_said(gain: float):
     ends = {"left": lambda x, t: 1 + np.sin(t) + 0.0 * x[0], "right": 1.0}
     model = lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet=ends),
-        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=1.0)},
+        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(1.0))},
         A=lambda q, u, v, x: q.c * u * v,
         B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
     )
@@ -260,7 +260,7 @@ def reaction(drive: Any) -> lp.Model:
     }
     return lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet=ends),
-        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=1.0)},
+        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(1.0))},
         A=lambda q, u, v, x: q.c * u * v,
         B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
     )

@@ -171,8 +171,8 @@ def test_the_flux_of_the_truth_walks_as_the_estimator_believes():
     ends = np.array([problem.latents["J"].value(problem.draw(rng)[0], 40) for _ in range(400)])
     model = problem.model()
     (walk,) = [p for p in model.latent.parts.values() if p.evolution.moves]
-    gained = walk.evolution.growth(problem.length, walk.unknown.latent_std)[0]
-    expected = walk.unknown.latent_std * np.sqrt(1.0 + gained)
+    gained = walk.evolution.growth(problem.length, walk.unknown.prior.latent_std)[0]
+    expected = walk.unknown.prior.latent_std * np.sqrt(1.0 + gained)
     assert ends.std() == pytest.approx(expected, rel=0.1)
     assert np.linalg.norm(problem.latents["J"].directions(40)) == pytest.approx(expected)
 

@@ -38,7 +38,7 @@ def report(*args: Any, **options: Any) -> Identifiability:
 
 
 def test_pinned_and_flat():
-    found = report({"a": lp.Scalar(0.0, 1.0), "b": lp.Scalar(0.0, 1.0)}, lambda q: q.a)
+    found = report({"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     assert [item.verdict for item in found.unknowns] == ["pinned", "flat"]
     assert found.unknowns[1].left == pytest.approx(1.0)
     assert (found.pairs, found.directions, found.sentences) == ((), (), [])
@@ -46,7 +46,7 @@ def test_pinned_and_flat():
 
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_two_that_only_their_difference_shows_are_named_whatever_their_units(scale: float):
-    unknowns = {"a": lp.Scalar(0.0, 1.0), "b": lp.Scalar(0.0, scale)}
+    unknowns = {"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, scale)}
     found = report(unknowns, lambda q: q.a - q.b / scale)
     assert [item.verdict for item in found.unknowns] == ["partly", "partly"]
     assert [item.left for item in found.unknowns] == pytest.approx([0.5**0.5] * 2, abs=1e-3)
@@ -57,7 +57,7 @@ def test_two_that_only_their_difference_shows_are_named_whatever_their_units(sca
 
 
 def test_three_of_which_only_a_sum_shows():
-    unknowns = {name: lp.Scalar(0.0, 1.0) for name in "abc"}
+    unknowns = {name: lp.Normal(0.0, 1.0) for name in "abc"}
     found = report(unknowns, lambda q: q.a + q.b + q.c)
     assert found.pairs == ()
     (direction,) = found.directions
@@ -67,7 +67,7 @@ def test_three_of_which_only_a_sum_shows():
 
 @pytest.mark.slow
 def test_modes_of_a_field_and_a_number_that_stands_for_its_mean():
-    field = lp.Field(MESH, ElementLineP1(), inner="H1", std=1.0)
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(std=1.0))
     alone = report({"q": field}, lambda q: q.q)
     pinned, flat, count = alone.unknowns[0].modes
     assert count == 8
@@ -78,31 +78,31 @@ def test_modes_of_a_field_and_a_number_that_stands_for_its_mean():
     ]
     more = report({"q": field}, lambda q: q.q, points=(0.1, 0.3, 0.5, 0.7, 0.9))
     assert more.unknowns[0].left < alone.unknowns[0].left
-    both = report({"q": field, "a": lp.Scalar(0.0, 1.0)}, lambda q: q.q + q.a)
+    both = report({"q": field, "a": lp.Normal(0.0, 1.0)}, lambda q: q.q + q.a)
     assert [pair[:2] for pair in both.pairs] == [("a", "q")]
 
 
 def test_a_number_at_its_bound():
-    found = report({"a": lp.Scalar(0.5, 1.0, bounds=(0.2, 2.0))}, lambda q: q.a, z=1.5)
+    found = report({"a": lp.Normal(0.5, 1.0, bounds=(0.2, 2.0))}, lambda q: q.a, z=1.5)
     assert found.unknowns[0].verdict == "at its bound"
     assert found.unknowns[0].bound == 0.2
 
 
 def test_one_that_moves_is_never_flat_for_good():
-    walk = lp.Scalar(0.0, 1.0, evolution=lp.RandomWalk(1.0))
+    walk = lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.RandomWalk(1.0))
     (known,) = report({"a": walk}, lambda q: 0.0 * q.a).unknowns
     assert known.left > 1.0
     assert known.verdict == "partly"
 
 
 def test_the_width_counts():
-    model, belief = learned({"a": lp.Scalar(0.0, 1.0)}, lambda q: q.a)
+    model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     (known,) = identifiability(model, belief).unknowns
     (wider,) = identifiability(model, replace(belief, q_factor=3.0 * belief.q_factor)).unknowns
     assert wider.left == pytest.approx(3 * known.left)
 
 
 def test_a_law_without_covariance():
-    model, belief = learned({"a": lp.Scalar(0.0, 1.0)}, lambda q: q.a)
+    model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     with pytest.raises(lp.errors.ConfigurationError, match="run SensitivityLaw or AutoLaw"):
         identifiability(model, replace(belief, q_factor=None))

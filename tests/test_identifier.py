@@ -19,7 +19,7 @@ def rod(**options):
             dirichlet={"left": 0.0, "right": lp.Channel("T_end")},
             unit="degC",
         ),
-        {"k": lp.Scalar(1.0, std=0.5, bounds=(0.1, 5.0), unit="m^2/s")},
+        {"k": lp.Scalar(lp.Normal(1.0, std=0.5, bounds=(0.1, 5.0)), unit="m^2/s")},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["heat"] * v * 0,
         f=lambda x, t: x.inputs["heat"],
         inputs=("heat",),
@@ -144,7 +144,7 @@ def cubic_decay(law, u0=1.0, **options):
     """Return an identifier of a nonlinear reaction, u_t + u^3 + q u = 0, seen in a part."""
     model = lp.Model(
         lp.Field(line(6), ElementLineP1(), quadrature=6),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: u**3 * v,
     )
@@ -402,7 +402,9 @@ def test_a_stream_that_gives_no_samples(kind):
 
 def test_numbers_where_something_else_is_expected():
     mesh = lp.interval(0.0, 1.0, 4)
-    with pytest.raises(lp.errors.SpaceError, match=r"got 0\.5 as an unknown; expected Scalar"):
+    with pytest.raises(
+        lp.errors.SpaceError, match=r"got 0\.5 as an unknown; write Normal\(0\.5, std\)"
+    ):
         lp.Model(lp.Field(mesh, ElementLineP1()), {"k": 0.5}, A=lambda q, u, v, x: q.k * u * v)
     with pytest.raises(lp.errors.SpaceError, match=r"cells >= 1, whole"):
         lp.interval(0.0, 1.0, 2.5)

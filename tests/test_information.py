@@ -41,7 +41,7 @@ def rod(
             mesh,
             element(),
             inner=lambda p, v, at: (p * v + 0.1 * x**2 * lp.dot(lp.grad(p), lp.grad(v))) / x,
-            std=q,
+            prior=lp.Normal(std=q),
         ),
         lambda p, w, v, at: p / (q * t) * w * v,
         lambda w, v, at: D * lp.dot(lp.grad(w), lp.grad(v)),
@@ -288,7 +288,7 @@ def test_averages_and_a_number() -> None:
     mesh = lp.interval(0, 1, 20)
     model = lp.Model(
         lp.Field(mesh, ElementLineP2(), dirichlet={"left": 0.0}),
-        lp.Scalar(prior=1.0, std=1.0),
+        lp.Normal(1.0, std=1.0),
         lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: np.sin(t) + 0 * x[0],
     )
@@ -341,12 +341,12 @@ def test_what_cannot_be_is_one_sentence() -> None:
     mesh = lp.interval(0, 1, 4)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
-        lp.Scalar(prior=1.0, evolution=lp.RandomWalk(0.1)),
+        lp.Scalar(lp.Normal(1.0), evolution=lp.RandomWalk(0.1)),
         lambda q, u, v, x: q * u * v,
     )
     both = lp.Model(
         {"a": lp.Field(mesh, ElementLineP1()), "b": lp.Field(mesh, ElementLineP1())},
-        lp.Scalar(prior=1.0),
+        lp.Normal(1.0),
         lambda q, u, v, x: q * (u.a * v.a + u.b * v.b),
     )
     lp.Identifier(both, lp.Full(of="a"), AUTO, u0=0.0)
@@ -364,7 +364,7 @@ def test_missing_sensors_are_no_noise_that_turns_back():
     ends = {"left": lambda x, t: np.sin(t) + 0.0 * x[0], "right": 0.0}
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet=ends),
-        lp.Field(mesh, ElementLineP1(), inner="H1", prior=1.0, std=1.0),
+        lp.Field(mesh, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=1.0)),
         lambda q, u, v, x: q * u * v,
         lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - 5.0 * v,
     )
@@ -426,7 +426,7 @@ def test_an_unknown_far_from_its_prior_is_a_failed_step() -> None:
     failed = [estimate for estimate in found if not estimate.status.ok]
     assert failed
     assert {estimate.status.code for estimate in failed} == {"departed"}
-    assert "std=" in str(failed[0].status)
+    assert "a std that allows" in str(failed[0].status)
     good = [estimate for estimate in found if estimate.status.ok]
     assert max(estimate.notes.get("departure", 0.0) for estimate in good) <= 1.0
     # A failed step leaves the unknowns where they were, and takes the sample.

@@ -26,7 +26,7 @@ def rod(std: float = 0.3, flux: bool = False, cube: float = 0.0) -> lp.Model:
             ElementLineP1(),
             dirichlet={"left": lp.Channel("left")} if not flux else {},
         ),
-        parameter={"k": lp.Scalar(1.0, std=std)},
+        parameter={"k": lp.Normal(1.0, std=std)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + cube * u**3 * v,
         f=sources,
         inputs=["Q"] if flux else [],
@@ -151,7 +151,7 @@ def made_of_readings(law, errors, u_true, **unknowns):
     names = [f"T_{k}" for k in range(4)]
     model = lp.Model(
         state=lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1()),
-        parameter={"k": lp.Scalar(1.0, std=0.3), **unknowns},
+        parameter={"k": lp.Normal(1.0, std=0.3), **unknowns},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     z = u_true(at) + errors
@@ -176,7 +176,7 @@ def test_the_readings_of_the_start_count_once():
 
 
 def test_an_offset_is_not_learned_from_the_state_that_was_made_with_it():
-    extra = {"offset": lp.Scalar(0.0, std=0.5)}
+    extra = {"offset": lp.Normal(0.0, std=0.5)}
     one, _ = made_of_readings(lp.SensitivityLaw(), np.zeros(4), lambda x: 1.0 + x, **extra)
     belief = one.latent_belief()
     assert np.sqrt((belief.q_factor[1] ** 2).sum()) == pytest.approx(0.5)

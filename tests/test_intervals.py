@@ -36,7 +36,7 @@ def run(ident: lp.Identifier) -> tuple[Any, Any]:
 
 
 def test_a_plain_number_has_value_and_deviations():
-    estimate, data = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    estimate, data = run(identifier(a=lp.Normal(0.3, 0.1)))
     value, std = estimate.parameters["a"]
     assert estimate["a"].interval() == pytest.approx(
         (value - 1.959964 * std, value + 1.959964 * std)
@@ -46,7 +46,7 @@ def test_a_plain_number_has_value_and_deviations():
 
 
 def test_a_logarithm_has_quantiles_of_a_log_normal_number():
-    estimate, data = run(identifier(a=lp.Scalar(0.3, 0.3, transform="log")))
+    estimate, data = run(identifier(a=lp.LogNormal(0.3, 0.3)))
     value, std = estimate.parameters["a"]
     low, high = estimate["a"].interval()
     assert low > 0
@@ -58,30 +58,30 @@ def test_a_logarithm_has_quantiles_of_a_log_normal_number():
 
 
 def test_bounds_cut_an_interval_off():
-    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.28, 0.33))))
+    estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1, bounds=(0.28, 0.33))))
     low, high = estimate["a"].interval(0.9999)
     assert (low, high) == (0.28, 0.33)
-    inside = identifier(a=lp.Scalar(0.3, 0.1, bounds=(0.1, 0.6), transform="logit"))
+    inside = identifier(a=lp.LogitNormal(0.3, 0.1, bounds=(0.1, 0.6)))
     low, high = run(inside)[0]["a"].interval(0.999999)
     assert 0.1 < low < high < 0.6
 
 
 def test_where_rounding_hides_the_latent_value_the_interval_is_open():
-    free = {"transform": "logit", "bounds": (0.0, 1.0), "within": np.inf}
-    assert lp.Scalar(0.3, 0.1, **free).interval(1.0, 0.0) == (0.0, 1.0)
-    positive = lp.Scalar(0.3, 0.1, transform="log", within=np.inf)
+    share = lp.Scalar(lp.LogitNormal(0.3, 0.1, bounds=(0.0, 1.0)), within=np.inf)
+    assert share.interval(1.0, 0.0) == (0.0, 1.0)
+    positive = lp.Scalar(lp.LogNormal(0.3, 0.1), within=np.inf)
     assert positive.interval(0.0, 0.0) == (0.0, np.inf)
 
 
 def test_an_interval_ends_where_latent_values_do():
-    positive = lp.Scalar(0.3, 0.1, transform="log", within=4.0)
+    positive = lp.Scalar(lp.LogNormal(0.3, 0.1), within=4.0)
     ends = (0.3 * np.exp(-4 / 3), 0.3 * np.exp(4 / 3))
     assert positive.interval(0.3, 1e6) == pytest.approx(ends)
     assert positive.interval(0.0, 0.0) == pytest.approx((0.0, ends[1]))  # it holds the value
 
 
 def test_fields_have_an_interval_for_each_coefficient():
-    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=0.3, std=0.2, transform="log")
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.3, std=0.2))
     estimate, data = run(identifier(a=field))
     low, high = estimate["a"].interval()
     assert low.shape == estimate.q.shape
@@ -94,17 +94,17 @@ def test_fields_have_an_interval_for_each_coefficient():
 
 
 def test_without_covariance_there_is_no_interval():
-    estimate, data = run(identifier(lp.GradientLaw(), a=lp.Scalar(0.3, 0.1, bounds=(0.0, 1.0))))
+    estimate, data = run(identifier(lp.GradientLaw(), a=lp.Normal(0.3, 0.1, bounds=(0.0, 1.0))))
     assert np.isnan(estimate["a"].interval()).all()
     assert tables(data)[0].rows[0][3] == "–"
 
 
 def test_an_unknown_is_read_by_its_label():
-    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1)))
     value, std = estimate.parameters["a"]
     assert (estimate["a"].mean, estimate["a"].std) == (value, std)
     assert str(estimate["a"]) == f"{value:.4g} ± {std:.2g}"
-    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=0.2, std=0.1)
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(0.2, std=0.1))
     estimate, _ = run(identifier(a=field))
     assert estimate["a"].mean.shape == estimate["a"].std.shape == (9,)
     low, high = estimate["a"].interval()
@@ -113,7 +113,7 @@ def test_an_unknown_is_read_by_its_label():
 
 
 def test_bad_questions():
-    estimate, _ = run(identifier(a=lp.Scalar(0.3, 0.1)))
+    estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1)))
     with pytest.raises(lp.errors.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):
         estimate["b"].interval()
     with pytest.raises(lp.errors.SpaceError, match="level must lie between 0 and 1"):

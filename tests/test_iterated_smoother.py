@@ -15,7 +15,9 @@ TIMES = 0.1 * np.arange(41)
 
 def sourced(evolution=None):
     """Return a rod with an unknown source: linear in u and in what is unknown."""
-    strength = lp.Scalar(0.0, 2.0, evolution=evolution) if evolution else lp.Scalar(0.0, 2.0)
+    strength = (
+        lp.Scalar(lp.Normal(0.0, 2.0), evolution=evolution) if evolution else lp.Normal(0.0, 2.0)
+    )
     return lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"left": 0.0}),
         {"s": strength},
@@ -29,8 +31,8 @@ def logistic(evolution):
     return lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP2(), quadrature=6),
         {
-            "D": lp.Scalar(0.02, 0.02, transform="log"),
-            "r": lp.Scalar(1.0, 1.0, evolution=evolution),
+            "D": lp.LogNormal(0.02, 0.02),
+            "r": lp.Scalar(lp.Normal(1.0, 1.0), evolution=evolution),
         },
         A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) - q.r * u * (1.0 - u) * v,
     )
@@ -65,9 +67,9 @@ def test_a_poor_prior_leaves_no_error_behind():
     """From priors far off on both sides the estimate is the same, within what is left uncertain."""
     found = []
     for mean in (0.02, 0.5):
-        model = heat(lp.interval(0.0, 1.0, 16), lp.Scalar(mean, 0.5 * mean, transform="log"))
+        model = heat(lp.interval(0.0, 1.0, 16), lp.LogNormal(mean, 0.5 * mean))
         start = lambda x: np.sin(2.0 * np.pi * x[0])  # noqa: E731
-        right = heat(lp.interval(0.0, 1.0, 16), lp.Scalar(0.1, 0.1))
+        right = heat(lp.interval(0.0, 1.0, 16), lp.Normal(0.1, 0.1))
         samples = readings(right, [0.1], start)
         end = ends(model, lp.SensitivityLaw(), samples, start)[-1]
         found.append(end.parameters["alpha"])
@@ -195,7 +197,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
     layers = {"k_0": lambda x: x[0] < 0.5, "k_1": lambda x: x[0] >= 0.5}
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"k": lp.Piecewise(layers, 1.0, 0.2)},
+        {"k": lp.Piecewise(layers, lp.Normal(1.0, 0.2))},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=10.0,
     )

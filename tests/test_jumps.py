@@ -19,7 +19,7 @@ NOISE = 0.01
 
 
 def rod() -> lp.Model:
-    return driven_rod({"a": lp.Scalar(0.2, 0.2)}, lambda t: np.sin(3 * t), line(16))
+    return driven_rod({"a": lp.Normal(0.2, 0.2)}, lambda t: np.sin(3 * t), line(16))
 
 
 def samples(

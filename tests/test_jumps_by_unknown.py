@@ -24,7 +24,7 @@ RATE = 0.2
 def rod(cells: int) -> lp.Model:
     """A rod with an unknown conductivity and an unknown flux at its left end."""
     state = lp.Field(lp.interval(0.0, 1.0, cells), ElementLineP1(), dirichlet={"right": 0.0})
-    unknowns = {"k": lp.Scalar(0.3, 0.15, transform="log"), "v": lp.Scalar(1.0, 1.0)}
+    unknowns = {"k": lp.LogNormal(0.3, 0.15), "v": lp.Normal(1.0, 1.0)}
     conduction = lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v))  # noqa: E731
     flux = lp.On("left", lambda q, u, v, x: -q.v * v)
     return lp.Model(state, unknowns, [conduction, flux])

@@ -88,8 +88,8 @@ def nonlinear(mesh, element):
             lp.Field(mesh, element),
             {
                 "a": lp.Field(mesh, element),
-                "b": lp.Scalar(1.0),
-                "c": lp.Piecewise({"core": "core"}),
+                "b": lp.Normal(1.0),
+                "c": lp.Piecewise({"core": "core"}, lp.Normal()),
             },
             A=[
                 lambda q, u, v, x: (x.h * q.a**2 + q.b * x.t) * u**2 * v + q.c * v,
@@ -126,7 +126,7 @@ def test_an_integrand_that_is_nonlinear_in_a_corner_only(pieces):
     def corner(u, v, x):
         return u * v + ((x[0] > 0.9) & (x[1] > 0.9)) * u**2 * v
 
-    model = lp.Model(lp.Field(mesh, ElementTriP1()), lp.Scalar(), lambda q, u, v, x: q * v, corner)
+    model = lp.Model(lp.Field(mesh, ElementTriP1()), lp.Normal(), lambda q, u, v, x: q * v, corner)
     assert not model.form_B.affine
 
 
@@ -171,7 +171,7 @@ def test_an_unknown_that_the_equation_does_not_read(monkeypatch):
     """Only sensors do, as those with offsets: its tensors are all zero."""
     monkeypatch.setattr(forms, "LARGEST_TENSOR", 0)
     field = lp.Field(triangles(), ElementTriP1())
-    form = lp.Model(field, lp.Scalar(0.0), A=lambda q, u, v, x: 0.0 * q * u * v).form_A
+    form = lp.Model(field, lp.Normal(0.0), A=lambda q, u, v, x: 0.0 * q * u * v).form_A
     u, q = np.ones(form.spaces["u"].dim), np.ones(1)
     assert not form.vector("v", q=q, u=u).any()
     assert not form.matrix("v", "u", q=q).count_nonzero()

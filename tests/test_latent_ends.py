@@ -42,12 +42,11 @@ SPIKE[12] = 9999.0
 
 
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(guards=None), lp.SensitivityLaw()])
-@pytest.mark.parametrize("transform", ["log", "logit"])
-def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(transform: str, law: Any):
-    bounds = (0.0, 1.0) if transform == "logit" else (-np.inf, np.inf)
-    unknown = lp.Scalar(0.4, 0.1, bounds, transform=transform, within=4.0)
+@pytest.mark.parametrize("prior", [lp.LogNormal(0.4, 0.1), lp.LogitNormal(0.4, 0.1, (0.0, 1.0))])
+def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(prior: Any, law: Any):
+    unknown = lp.Scalar(prior, within=4.0)
     least, largest = (
-        float(unknown.map.value(np.array(unknown.latent_prior + s * 4.0 * unknown.latent_std)))
+        float(prior.transform.value(np.array(prior.latent_mean + s * 4.0 * prior.latent_std)))
         for s in (-1.0, 1.0)
     )
     result = run(decay(unknown), stream(SPIKE), law)
@@ -61,13 +60,13 @@ def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(transform: str, la
 
 @pytest.mark.slow
 def test_what_is_reached_is_told():
-    unknown = lp.Scalar(0.5, 0.01, transform="log")
+    unknown = lp.LogNormal(0.5, 0.01)
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]  # four times the prior: 139 deviations
     data = run(decay(unknown), stream(far)).to_xarray()
     assert data["k"].values[-1] == pytest.approx(0.5 * np.exp(10 * 0.02))
     assert data["bounded"].values[-1] == 1.0
     assert any("were held there: the prior is much too narrow" in text for text in doubts(data))
-    fair = run(decay(lp.Scalar(0.5, 0.5, transform="log")), stream(far)).to_xarray()
+    fair = run(decay(lp.LogNormal(0.5, 0.5)), stream(far)).to_xarray()
     assert "bounded" not in fair
     assert fair["k"].values[-1] == pytest.approx(2.0, rel=0.2)
     assert not any("held" in text for text in doubts(fair))
@@ -76,11 +75,11 @@ def test_what_is_reached_is_told():
 @pytest.mark.slow
 def test_a_stated_number_counts_and_infinity_is_no_end():
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
-    narrow = {"prior": 0.5, "std": 0.01, "transform": "log"}
+    narrow = lp.LogNormal(0.5, 0.01)
     law = lp.SensitivityLaw(gate=np.inf)
-    near = run(decay(lp.Scalar(**narrow, within=3.0)), stream(far), law).to_xarray()
+    near = run(decay(lp.Scalar(narrow, within=3.0)), stream(far), law).to_xarray()
     assert near["k"].values[-1] == pytest.approx(0.5 * np.exp(3 * 0.02))
-    free = run(decay(lp.Scalar(**narrow, within=np.inf)), stream(far), law).to_xarray()
+    free = run(decay(lp.Scalar(narrow, within=np.inf)), stream(far), law).to_xarray()
     assert free["k"].values[-1] > 1.5
     assert "bounded" not in free
 
@@ -91,7 +90,7 @@ def test_the_filter_stays_linear_so_that_nothing_is_lost():
     values = [5.0] * 3 + [0.0] * 60
     law = lp.SensitivityLaw(guards=None, gate=np.inf, shadows=None)
     held, free = (
-        run(source(lp.Scalar(0.0, 0.2, within=within)), stream(values), law, 0.0)
+        run(source(lp.Scalar(lp.Normal(0.0, 0.2), within=within)), stream(values), law, 0.0)
         for within in (2.0, np.inf)
     )
     a, b = held.to_xarray(), free.to_xarray()
@@ -106,7 +105,7 @@ def test_the_filter_stays_linear_so_that_nothing_is_lost():
 
 @pytest.mark.slow
 def test_a_walk_has_no_end():
-    walk = lp.Scalar(0.0, 0.1, evolution=lp.RandomWalk(1.0))
+    walk = lp.Scalar(lp.Normal(0.0, 0.1), evolution=lp.RandomWalk(1.0))
     data = run(source(walk), stream([5.0] * 30), u0=0.0).to_xarray()
     assert data["v"].values[-1] > 2.0
     assert "bounded" not in data
@@ -116,7 +115,7 @@ def test_a_walk_has_no_end():
 def test_a_field_stays_within_its_ends(pointwise: bool):
     inner = lp.Sobolev(1, 0.3).pointwise(1) if pointwise else lp.Sobolev(1, 0.3)
     field = lp.Field(
-        MESH, ElementLineP1(), inner=inner, prior=0.5, std=0.1, transform="log", within=3.0
+        MESH, ElementLineP1(), inner=inner, prior=lp.LogNormal(0.5, std=0.1), within=3.0
     )
     model = decay(field)
     law = lp.SensitivityLaw(gate=np.inf)
@@ -134,14 +133,14 @@ def test_a_field_stays_within_its_ends(pointwise: bool):
 
 def test_the_gradient_law_knows_no_such_ends():
     """They belong to a covariance: the paper's law has none, and keeps to bounds alone."""
-    model = decay(lp.Scalar(0.5, 0.01, within=1.0))
+    model = decay(lp.Scalar(lp.Normal(0.5, 0.01), within=1.0))
     assert np.isinf(model.latent.bounds[1]).all()
 
 
 @pytest.mark.parametrize("within", [0.0, -1.0, np.nan])
 def test_a_number_that_is_not_positive_is_refused(within: float):
     with pytest.raises(lp.errors.SpaceError, match="Scalar: within must be a positive number"):
-        lp.Scalar(within=within)
+        lp.Scalar(lp.Normal(), within=within)
 
 
 def test_a_case_states_it(tmp_path: Path):

@@ -20,8 +20,8 @@ from livepde.result import interval_ends
 
 def rod(unknown=None, law=None, withheld=None):
     ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
-    alpha = unknown or lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0))
-    model = heat(lp.interval(0.0, 1.0, 30), alpha, ends, source=lp.Scalar(0.0, std=1.0))
+    alpha = unknown or lp.Normal(0.02, std=0.01, bounds=(1e-3, 1.0))
+    model = heat(lp.interval(0.0, 1.0, 30), alpha, ends, source=lp.Normal(0.0, std=1.0))
     sensors = lp.Points({f"T_{k}": k / 6 for k in range(1, 6)}, noise=0.01)
     law = law or lp.SensitivityLaw()
     return lp.Identifier(model, sensors, law, withheld=withheld, u0=1.0)
@@ -36,10 +36,10 @@ def samples(count, extra=()):
 
 
 UNKNOWNS = [
-    lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0)),
-    lp.Scalar(0.02, std=0.01),
-    lp.Scalar(0.02, std=0.01, transform="log"),
-    lp.Scalar(0.02, std=0.01, bounds=(1e-3, 1.0), transform="logit"),
+    lp.Normal(0.02, std=0.01, bounds=(1e-3, 1.0)),
+    lp.Normal(0.02, std=0.01),
+    lp.LogNormal(0.02, std=0.01),
+    lp.LogitNormal(0.02, std=0.01, bounds=(1e-3, 1.0)),
 ]
 
 

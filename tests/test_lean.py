@@ -104,7 +104,7 @@ def test_a_process_without_constant_matrices_is_refused():
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
         lp.Field(mesh, linear(mesh)),
-        {"a": lp.Scalar(1.0, 0.1)},
+        {"a": lp.Normal(1.0, 0.1)},
         A=lambda q, u, v, x: q.a * u * u * v,
     )
     with pytest.raises(lean.NotAffineError, match="affine"):
@@ -115,7 +115,7 @@ def test_unknowns_that_enter_nonlinearly_have_no_slope():
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
         lp.Field(mesh, linear(mesh)),
-        {"a": lp.Scalar(1.0, 0.1, transform="log")},
+        {"a": lp.LogNormal(1.0, 0.1)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
     )
     matrices = lean.Matrices.of(model, np.eye(1), 0.1)

@@ -23,7 +23,7 @@ MESH = lp.interval(0.0, 1.0, 14)
 def rod(ends: Any, f: Any = 0.0, A: Any = None, element: Any = None, inputs: Any = ()) -> lp.Model:
     return lp.Model(
         lp.Field(MESH, element or ElementLineP1(), dirichlet=ends),
-        {"a": lp.Scalar(0.2, 0.1), "s": lp.Scalar(0.5, 0.2)},
+        {"a": lp.Normal(0.2, 0.1), "s": lp.Normal(0.5, 0.2)},
         A=A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v * x[0]),
         B=lambda u, v, x: 0.1 * u * v,
         f=f,
@@ -81,7 +81,7 @@ def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, m
 def test_other_stages_step_members_one_by_one():
     model = lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0}),
-        lp.Scalar(0.2, 0.1),
+        lp.Normal(0.2, 0.1),
         A=lambda q, u, v, x: q * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
     )
     assert "affine" in BandedStage.refuses(model)
@@ -162,7 +162,7 @@ def test_a_bank_goes_on_where_the_step_of_a_member_fails():
     """All step alone then: logs of members stay in line, and the others have their sample."""
     model = lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0, "right": 0.0}),
-        {"a": lp.Scalar(0.2, 0.1)},
+        {"a": lp.Normal(0.2, 0.1)},
         A=lambda q, u, v, x: q.a * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
     )
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), lp.AutoLaw(), u0=0.0)

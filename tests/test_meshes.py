@@ -97,7 +97,7 @@ def gmsh(tmp_path):
 def area(mesh, name=None):
     model = lp.Model(
         lp.Field(mesh, linear(mesh)),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v,
         f=lp.On(name, lambda x, t: 1.0) if name else lambda x, t: 1.0,
     )
@@ -129,7 +129,7 @@ def test_a_model_on_a_file(gmsh):
     mesh = lp.read_mesh(gmsh, scale=1e-3)
     model = lp.Model(
         lp.Field(mesh, ElementTriP1(), dirichlet={"inlet": 1.0}),
-        {"k": lp.Piecewise({"upper": "sand", "lower": "clay"}, 1.0)},
+        {"k": lp.Piecewise({"upper": "sand", "lower": "clay"}, lp.Normal(1.0))},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         B=lp.On("wall", lambda u, v, x: u * v),
     )
@@ -187,12 +187,12 @@ def test_the_size_of_cells():
     for where, expected in ((None, 1 + 4 + 16 + 64), ("far", 64), ("left", 1.0), ("right", 8.0)):
         density = lambda x, t: x.h  # noqa: E731
         f = lp.On(where, density) if where else density
-        model = lp.Model(field, lp.Scalar(), A=lambda q, u, v, x: q * u * v, f=f)
+        model = lp.Model(field, lp.Normal(), A=lambda q, u, v, x: q * u * v, f=f)
         assert model.F().sum() == pytest.approx(expected)
     plate = lp.rectangle((0.0, 4.0), (0.0, 3.0), (1, 1))
     model = lp.Model(
         lp.Field(plate, linear(plate)),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v / x.h,
         f=lambda x, t: x.h,
     )
@@ -206,7 +206,7 @@ def test_a_penalty_imposes_an_unknown_boundary_value():
     mesh = lp.interval(0.0, 1.0, 20)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0}),
-        {"T0": lp.Scalar(1.0, 2.0)},
+        {"T0": lp.Normal(1.0, 2.0)},
         A=lp.On("left", lambda q, u, v, x: -100.0 / x.h * q.T0 * v),
         B=[
             lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),

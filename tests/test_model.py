@@ -99,9 +99,9 @@ def test_quadrature_order():
     mesh = line(6)
     assert reaction(mesh, ElementLineHermite()).order == 9
     state = lp.Field(mesh, ElementLineP2())
-    assert lp.Model(state, lp.Scalar(), product).order == 4
+    assert lp.Model(state, lp.Normal(), product).order == 4
     chosen = lp.Field(mesh, ElementLineP2(), quadrature=7)
-    assert lp.Model(chosen, lp.Scalar(), product).order == 7
+    assert lp.Model(chosen, lp.Normal(), product).order == 7
 
 
 def test_bilinear_operators():
@@ -118,9 +118,7 @@ def test_initial_parameter():
     q = model.initial_parameter(lambda x: 1 + x[0])
     assert (q[0], q[-1]) == (0.0, 0.0)
     np.testing.assert_allclose(q[1:-1], 1 + mesh.p[0, 1:-1], atol=1e-12)
-    bounded = lp.Model(
-        lp.Field(mesh, ElementLineP1()), lp.Scalar(prior=1.0, bounds=(0.0, 2.0)), product
-    )
+    bounded = lp.Model(lp.Field(mesh, ElementLineP1()), lp.Normal(1.0, bounds=(0.0, 2.0)), product)
     assert bounded.initial_parameter() == [1.0]
     with pytest.raises(lp.errors.ModelError, match="outside of the bounds"):
         bounded.initial_parameter(3.0)
@@ -142,7 +140,7 @@ def test_a_name_that_is_no_unknown_is_said():
     with pytest.raises(lp.errors.ModelError, match=r"there is no 'd'; there are \['D', 'r'\]"):
         lp.Model(
             lp.Field(line(), ElementLineP1()),
-            {"D": lp.Scalar(1.0), "r": lp.Scalar(1.0)},
+            {"D": lp.Normal(1.0), "r": lp.Normal(1.0)},
             A=lambda q, u, v, x: q.d * u * v,
         )
 

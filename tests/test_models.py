@@ -17,7 +17,7 @@ def last(stream):
 
 def test_heat_decays_as_the_first_mode_does():
     mesh = lp.interval(0.0, 1.0, 40)
-    model = heat(mesh, lp.Scalar(0.1, 1.0), {"boundary": 0.0})
+    model = heat(mesh, lp.Normal(0.1, 1.0), {"boundary": 0.0})
     times = np.linspace(0, 2, 81)
     u = last(
         simulate(
@@ -31,8 +31,8 @@ def test_heat_decays_as_the_first_mode_does():
 @pytest.mark.parametrize(
     "alpha",
     [
-        lp.Scalar(0.1, 1.0),
-        lp.Piecewise({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] >= 0.5}, 0.1, 1.0),
+        lp.Normal(0.1, 1.0),
+        lp.Piecewise({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] >= 0.5}, lp.Normal(0.1, 1.0)),
     ],
 )
 def test_heat_by_layer_in_the_plane(alpha):
@@ -46,8 +46,8 @@ def test_heat_by_layer_in_the_plane(alpha):
 def test_heat_takes_a_field():
     mesh = lp.interval(0.0, 1.0, 10)
     element = EQUATIONS["heat"].element(mesh)
-    model = heat(mesh, lp.Field(mesh, element, prior=2.0), {"boundary": 0.0})
-    known = heat(mesh, lp.Scalar(2.0, 1.0), {"boundary": 0.0})
+    model = heat(mesh, lp.Field(mesh, element, prior=lp.Normal(2.0)), {"boundary": 0.0})
+    known = heat(mesh, lp.Normal(2.0, 1.0), {"boundary": 0.0})
     u = model.initial(lambda x: x[0] ** 2 * (1 - x[0]))
     q = model.initial_parameter()
     assert np.allclose(model.A(u)(q), known.A(u)(np.array([2.0])))
@@ -59,7 +59,7 @@ def test_borehole_follows_the_line_source():
 
     H, rho_c, k, power = 20.0, 2e6, 2.5, 1000.0
     mesh = lp.interval(0.02, 12.0, 80, geometric=True)
-    model = borehole(mesh, lp.Scalar(k, 1.0), lp.Scalar(0.1, 0.1), H=H, rho_c=rho_c, T0=10.0)
+    model = borehole(mesh, lp.Normal(k, 1.0), lp.Normal(0.1, 0.1), H=H, rho_c=rho_c, T0=10.0)
     times = np.linspace(0, 60 * 3600.0, 361)
     q = np.array([k, 0.1])
     u = last(simulate(model, q, 10.0, times, Advance(Alexander2()), lambda t: {"Q": power}))
@@ -71,7 +71,7 @@ def test_borehole_follows_the_line_source():
 
 def test_fluid_sees_the_resistance():
     mesh = lp.interval(0.05, 5.0, 20, geometric=True)
-    model = borehole(mesh, lp.Scalar(2.0, 1.0), lp.Scalar(0.1, 0.1), H=20.0, rho_c=2e6, T0=10.0)
+    model = borehole(mesh, lp.Normal(2.0, 1.0), lp.Normal(0.1, 0.1), H=20.0, rho_c=2e6, T0=10.0)
     points = lp.Points({"T": 0.05}, direct={"T": fluid(20.0)})
     observed = points.bind(model.state_space, model.X, model.parameter_space)
     moment = lp.fem.Moment(0.0, {"Q": 1000.0})
@@ -81,7 +81,7 @@ def test_fluid_sees_the_resistance():
 
 def test_reaction_diffusion_is_the_papers_example():
     mesh = lp.interval(0.0, 1.0, 20)
-    unknown = lp.Scalar(3.0, 1.0)
+    unknown = lp.Normal(3.0, 1.0)
     model = reaction_diffusion(mesh, unknown, D=0.5, f=lambda x, t: 0.0 * x[0])
     times = np.linspace(0, 1, 101)
     u0 = lambda x: np.sin(np.pi * x[0])  # noqa: E731

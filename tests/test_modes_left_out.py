@@ -21,7 +21,9 @@ def model(length: float = 0.2) -> lp.Model:
     inner = lp.Sobolev(1, length).pointwise(1)
     return lp.Model(
         state=lp.Field(MESH, ElementLineP1(), dirichlet={"left": 0.0, "right": 0.0}),
-        parameter={"s": lp.Field(MESH, ElementLineP1(), prior=0.0, std=1.0, inner=inner)},
+        parameter={
+            "s": lp.Field(MESH, ElementLineP1(), prior=lp.Normal(0.0, std=1.0), inner=inner)
+        },
         A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
     )
 

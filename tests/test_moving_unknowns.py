@@ -38,9 +38,9 @@ mesh = lp.interval(0.0, 1.0, 6)
 def linear_model(evolution: Any) -> lp.Model:
     """Return a rod with an unknown source, offsets of two sensors, and an unknown initial state."""
     unknowns = {
-        "s": lp.Scalar(0.5, 0.7, evolution=evolution),
-        "off": lp.Scalars(("a", "b"), 0.1, 0.2, evolution=lp.MeanReverting(1.5)),
-        "u0": lp.Field(mesh, ElementLineP1(), inner="H1", prior=0.3, std=0.6),
+        "s": lp.Scalar(lp.Normal(0.5, 0.7), evolution=evolution),
+        "off": lp.Scalars(("a", "b"), lp.Normal(0.1, 0.2), evolution=lp.MeanReverting(1.5)),
+        "u0": lp.Field(mesh, ElementLineP1(), inner="H1", prior=lp.Normal(0.3, std=0.6)),
     }
     return lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lambda x, t: np.sin(t) + 0 * x[0]}),
@@ -91,7 +91,7 @@ class Dense:
             F, gained = np.zeros((k, k)), np.zeros((k, k))
             for p in model.latent.parts.values():
                 F[p.part, p.part] = np.kron(p.evolution.transition(h), np.eye(p.size))
-                grown = np.repeat(p.evolution.growth(h, p.unknown.latent_std), p.size)
+                grown = np.repeat(p.evolution.growth(h, p.unknown.prior.latent_std), p.size)
                 gained[p.part, p.part] = grown[:, None] * self.prior[p.part, p.part]
             prior = model.latent.prior
             a = prior + F @ (self.x[n:] - prior)
@@ -178,7 +178,7 @@ def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Pat
 def test_an_initial_state_may_read_channels():
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
-        {"gain": lp.Scalar(0.0, 1.0)},
+        {"gain": lp.Normal(0.0, 1.0)},
         A=lambda q, u, v, x: 0.1 * u * v + 0.0 * q.gain * v,
         initial=lambda q, v, x: q.gain * x.inputs["T"] * v,
         inputs=["T"],
@@ -193,7 +193,7 @@ def test_an_initial_state_may_read_channels():
     ("replay", "first"), [(None, True), (lp.Replay(first=2), True), (lp.Replay(first=2), False)]
 )
 def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
-    unknown = lp.Scalar(1.0, 1.0, transform="log")
+    unknown = lp.LogNormal(1.0, 1.0)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
         {"u0": unknown},
@@ -218,15 +218,15 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
-    def rod(unknown: lp.Scalar) -> lp.Model:
+    def rod(unknown: lp.fem.Unknown) -> lp.Model:
         return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
 
-    model = rod(lp.Scalar(0.2, 0.2, evolution=lp.fem.Periodic(10.0)))
+    model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
     points = lp.Points(SENSORS, noise=0.01)
     law = lp.SensitivityLaw(replay=lp.Replay(first=8))
     identifier = lp.Identifier(model, points, law)
     errors = []
-    for t, z in readings(rod(lp.Scalar(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
+    for t, z in readings(rod(lp.Normal(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
         value, std = identifier.step(t, z).parameters["a"]
         errors.append([value - a(t), std])
     late = np.array(errors[200:])
@@ -240,7 +240,7 @@ def test_a_moving_field_keeps_its_boundary_value(law: Any):
         mesh,
         ElementLineP1(),
         inner="H1",
-        prior=1.0,
+        prior=lp.Normal(1.0),
         dirichlet={"left": 0.0},
         evolution=lp.MeanReverting(1.0),
     )
@@ -258,10 +258,10 @@ def test_a_moving_field_keeps_its_boundary_value(law: Any):
     np.testing.assert_array_equal(estimate.q[fixed], 0.0)
 
 
-def reacting(first: lp.Scalar) -> lp.Model:
+def reacting(first: lp.fem.Unknown) -> lp.Model:
     return lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"right": 0.0}),
-        {"a": first, "b": lp.Scalar(0.3, 0.2)},
+        {"a": first, "b": lp.Normal(0.3, 0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v,
     )
 
@@ -275,8 +275,10 @@ def theory(model: lp.Model) -> Any:
 
 
 def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
-    _, plain = theory(reacting(lp.Scalar(0.4, 0.2)))
-    twin, report = theory(reacting(lp.Scalar(0.4, 0.2, evolution=lp.fem.Periodic(1.0, 2))))
+    _, plain = theory(reacting(lp.Normal(0.4, 0.2)))
+    twin, report = theory(
+        reacting(lp.Scalar(lp.Normal(0.4, 0.2), evolution=lp.fem.Periodic(1.0, 2)))
+    )
     assert report.constants is not None
     assert report.constants.C_A > 0.99 * plain.constants.C_A
     (sheet,) = (table for table in report.tables if "Excitation" in table.title)
@@ -287,12 +289,12 @@ def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
 
 
 def test_the_theory_does_not_speak_of_models_nonlinear_in_what_is_estimated():
-    _, report = theory(reacting(lp.Scalar(0.4, 0.2, transform="log")))
+    _, report = theory(reacting(lp.LogNormal(0.4, 0.2)))
     assert report.constants is None
     assert any("not linear in what is estimated" in note for note in report.notes)
 
 
-def starting(unknown: lp.Scalar) -> lp.Model:
+def starting(unknown: lp.fem.Unknown) -> lp.Model:
     return lp.Model(
         lp.Field(mesh, ElementLineP1()),
         {"u0": unknown},
@@ -302,7 +304,7 @@ def starting(unknown: lp.Scalar) -> lp.Model:
 
 
 def test_a_twin_starts_where_its_model_says():
-    model, times = starting(lp.Scalar(1.0, 1.0)), [0.0, 0.1, 0.2]
+    model, times = starting(lp.Normal(1.0, 1.0)), [0.0, 0.1, 0.2]
     twin = Twin(model=model, observation=lp.Points([0.3]), q_true={"u0": 5.0}, times=times)
     assert next(iter(twin)).z == pytest.approx([5.0])
     with pytest.raises(lp.errors.ConfigurationError, match="leave out u0"):
@@ -312,7 +314,7 @@ def test_a_twin_starts_where_its_model_says():
 @pytest.mark.parametrize("law", [lp.GradientLaw(), lp.laws.KueglerLaw(), lp.laws.BaumeisterLaw()])
 def test_an_unknown_initial_state_is_not_for_the_gradient_law(law: Any):
     with pytest.raises(lp.errors.LawError, match="which this law cannot learn: use SensitivityLaw"):
-        lp.Identifier(starting(lp.Scalar(1.0, 1.0)), lp.Full(), law)
+        lp.Identifier(starting(lp.Normal(1.0, 1.0)), lp.Full(), law)
 
 
 def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
@@ -379,9 +381,9 @@ def test_replays_find_the_most_probable_parameter():
     model = lp.Model(
         state,
         {
-            "a": lp.Scalar(0.2, 0.15, transform="log"),
-            "w": lp.Scalar(0.5, 0.5, transform="log"),
-            "off": lp.Scalars(("a", "b"), 0.0, 0.1),
+            "a": lp.LogNormal(0.2, 0.15),
+            "w": lp.LogNormal(0.5, 0.5),
+            "off": lp.Scalars(("a", "b"), lp.Normal(0.0, 0.1)),
         },
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
@@ -420,7 +422,7 @@ def test_replays_find_the_most_probable_parameter():
 def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
-        lp.Scalar(2.0, 1.0, transform="log"),
+        lp.LogNormal(2.0, 1.0),
         A=lambda q, u, v, x: q * u * v,
     )
     full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
@@ -439,7 +441,7 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
     """A logarithm that sensors see directly: the first samples overshot, and widened all."""
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lambda x, t: np.sin(t) + 0 * x[0]}),
-        {"a": lp.Scalar(0.3, 0.1), "c": lp.Scalar(0.1, 0.05, transform="log")},
+        {"a": lp.Normal(0.3, 0.1), "c": lp.LogNormal(0.1, 0.05)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
     )
     points = lp.Points({"z": 0.5}, noise=NOISE, direct={"z": lambda q, x: 20.0 * q.c})

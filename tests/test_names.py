@@ -27,7 +27,7 @@ def decay(names: list[str], state: str = "") -> lp.Model:
         return sum(getattr(q, name) for name in names) * u * v
 
     field = lp.Field(MESH, ElementLineP1(), name=state)
-    return lp.Model(field, {name: lp.Scalar(0.5, 0.1) for name in names}, A)
+    return lp.Model(field, {name: lp.Normal(0.5, 0.1) for name in names}, A)
 
 
 def run(model: lp.Model, law: Any = None) -> lp.Result:
@@ -80,7 +80,7 @@ def test_what_stands_beside_a_field_is_refused(end: str):
 
     field = lp.Field(MESH, ElementLineP1())
     with pytest.raises(lp.errors.ModelError, match=f"'c{end}' would be"):
-        lp.Model(field, {"c": field, f"c{end}": lp.Scalar()}, A)
+        lp.Model(field, {"c": field, f"c{end}": lp.Normal()}, A)
 
 
 @pytest.mark.parametrize(("state", "name"), [("", "u"), ("", "u_std"), ("T", "T")])
@@ -104,7 +104,7 @@ def test_directions_of_a_vector_and_cells_are_refused():
 
     def model(name: str) -> lp.Model:
         A = lambda q, u, v, x: getattr(q, name) * lp.dot(u, v)  # noqa: E731
-        return lp.Model(state, {name: lp.Scalar()}, A)
+        return lp.Model(state, {name: lp.Normal()}, A)
 
     for name in ("u_x", "u_y_std", "y", "cell", "sensor_x", *cells(mesh)):
         with pytest.raises(lp.errors.ModelError, match=f"'{name}' would be"):
@@ -115,15 +115,15 @@ def test_directions_of_a_vector_and_cells_are_refused():
 
 def test_unknowns_of_sensors_are_checked_too():
     with pytest.raises(lp.errors.ModelError, match="'k_std' would be"):
-        decay(["k"]).with_unknowns({"k_std": lp.Scalar()})
+        decay(["k"]).with_unknowns({"k_std": lp.Normal()})
 
 
 def test_every_name_that_a_dataset_has_is_known_to_the_check():
     """So that what is written later is refused, too: nothing here is copied by hand."""
-    field = lp.Field(MESH, ElementLineP1(), prior=1.0, std=0.1, transform="log")
+    field = lp.Field(MESH, ElementLineP1(), prior=lp.LogNormal(1.0, std=0.1))
     model = lp.Model(
         lp.Field(MESH, ElementLineP1()),
-        {"c": field, "k": lp.Scalar(0.5, 0.1, bounds=(0.0, 1.0)), "s": lp.Scalar(0.5, 0.1)},
+        {"c": field, "k": lp.Normal(0.5, 0.1, bounds=(0.0, 1.0)), "s": lp.Normal(0.5, 0.1)},
         A=lambda q, u, v, x: (q.c + q.k + q.s) * u * v,
     )
     result = run(model)

@@ -28,7 +28,7 @@ NAN = math.nan
 
 
 def rod() -> lp.Model:
-    return heat(lp.interval(0.0, 1.0, 16), lp.Scalar(0.1, std=0.05), {"left": 0.0, "right": 0.0})
+    return heat(lp.interval(0.0, 1.0, 16), lp.Normal(0.1, std=0.05), {"left": 0.0, "right": 0.0})
 
 
 def identifier(law=None, noise=0.05, model=None) -> lp.Identifier:
@@ -76,7 +76,7 @@ def test_readings_of_any_noise_give_the_weighted_least_squares():
     """The amplitude of a source, in which the readings are linear."""
     model = lp.Model(
         state=lp.Field(lp.interval(0.0, 1.0, 16), ElementLineP1(), dirichlet={"left": 0.0}),
-        parameter={"s": lp.Scalar(0.0, std=10.0)},
+        parameter={"s": lp.Normal(0.0, std=10.0)},
         A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
     )
     one, unit = identifier(model=model), {}
@@ -153,7 +153,7 @@ def test_a_law_without_covariance_refuses_it():
 
 
 def test_a_pair_belongs_to_a_sensor():
-    model = heat(lp.interval(0.0, 1.0, 8), lp.Scalar(0.1, std=0.05), {"left": lp.Channel("left")})
+    model = heat(lp.interval(0.0, 1.0, 8), lp.Normal(0.1, std=0.05), {"left": lp.Channel("left")})
     one = lp.Identifier(model, lp.Points({"a": 0.3}, noise=0.1), lp.SensitivityLaw(), u0=0.0)
     with pytest.raises(SampleError, match=r"'left': got .* of a sensor a pair"):
         one.step(0.0, {"a": 1.0, "left": (0.0, 0.1)})
@@ -161,7 +161,7 @@ def test_a_pair_belongs_to_a_sensor():
 
 def test_a_channel_with_the_name_of_noise_is_refused():
     name = noise_channel("a")
-    model = heat(lp.interval(0.0, 1.0, 8), lp.Scalar(0.1, std=0.05), {"left": lp.Channel(name)})
+    model = heat(lp.interval(0.0, 1.0, 8), lp.Normal(0.1, std=0.05), {"left": lp.Channel(name)})
     with pytest.raises(ConfigurationError, match="has the name of the noise of a reading"):
         lp.Identifier(model, lp.Points({"a": 0.3}, noise=0.1), lp.SensitivityLaw(), u0=0.0)
 

@@ -121,7 +121,7 @@ def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
     """z = (u + R Q)^2 with the direct part inside of g: R and k are both found."""
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1(), dirichlet={"left": 1.0}),
-        {"k": lp.Scalar(0.5, std=0.3, bounds=(0.01, 5.0)), "R": lp.Scalar(0.0, std=1.0)},
+        {"k": lp.Normal(0.5, std=0.3, bounds=(0.01, 5.0)), "R": lp.Normal(0.0, std=1.0)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.0 * q.R * v,
         f=1.0,
     )

@@ -18,7 +18,7 @@ from livepde.diagnostics import check_model
 from livepde.models import EQUATIONS, allen_cahn, burgers, kdv, kuramoto_sivashinsky
 from livepde.stepping import Advance, Alexander2, simulate
 
-ONE = lp.Scalar(1.0, 1.0)
+ONE = lp.Normal(1.0, 1.0)
 
 
 def cole_hopf(x, t, nu):
@@ -108,8 +108,8 @@ def test_small_waves_of_kuramoto_sivashinsky_grow_as_they_must():
 
 
 def unknowns(mesh, *values):
-    start = lp.Field(mesh, ElementLineHermite(), inner="H1", std=1.0)
-    return *(lp.Scalar(v, v, transform="log") for v in values), start
+    start = lp.Field(mesh, ElementLineHermite(), inner="H1", prior=lp.Normal(std=1.0))
+    return *(lp.LogNormal(v, v) for v in values), start
 
 
 @pytest.mark.slow
@@ -187,8 +187,8 @@ def test_burgers_from_a_published_field(data_dir, noise, share, bound):
     t, columns = reader()(data_dir, "pde_find/burgers.mat", noise=noise, share=share)
     z = np.array(list(columns.values())).T[:, ::2]
     mesh = lp.interval(-8.0, 8.0, 80)
-    start = lp.Field(mesh, ElementLineHermite(), inner="H1", std=1.0)
-    model = burgers(mesh, lp.Scalar(0.3, 0.3, transform="log"), lp.Scalar(0.5, 0.5), start)
+    start = lp.Field(mesh, ElementLineHermite(), inner="H1", prior=lp.Normal(std=1.0))
+    model = burgers(mesh, lp.LogNormal(0.3, 0.3), lp.Normal(0.5, 0.5), start)
     sensors = lp.Points(list(np.arange(-8.0, 8.0, 0.125)), noise=max(0.1814 * noise, 2e-4))
     law = lp.SensitivityLaw(modes=40, replay=lp.Replay(first=25))
     identifier = lp.Identifier(model, sensors, law, scheme=Alexander2(), dt_max=0.05)

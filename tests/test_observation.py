@@ -155,7 +155,7 @@ def test_omega_of_one_component_is_where_that_one_is_known():
     mesh, field = line(10), ElementLineP1()
     model = lp.Model(
         {"a": lp.Field(mesh, field), "b": lp.Field(mesh, field)},
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * u.a * v.b,
     )
     one = observe(model, lp.Subdomain(inside, of="a")).split()
@@ -234,7 +234,7 @@ def test_splits_are_kept_but_not_without_end():
 def borehole():
     return lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={}),
-        {"k": lp.Scalar(prior=2.0), "R": lp.Piecewise({"a": inside, "b": inside})},
+        {"k": lp.Normal(2.0), "R": lp.Piecewise({"a": inside, "b": inside}, lp.Normal())},
         A=lambda q, u, v, x: q.k * u * v,
         inputs=["Q"],
     )
@@ -253,7 +253,7 @@ def test_sensors_that_see_the_parameter():
     np.testing.assert_allclose(observed.predict(u, q, moment), [3.0, 0.0 + 8.0 - 1.0], atol=1e-12)
     assert observe(model, lp.Points([0.3])).jacobian(u, q, moment)[1] is None
 
-    single = lp.Model(lp.Field(line(10), ElementLineP1()), lp.Scalar(), product)
+    single = lp.Model(lp.Field(line(10), ElementLineP1()), lp.Normal(), product)
     seen = observe(single, lp.Points({"s": 0.5}, direct={"s": lambda q, x: 3 * q}))
     np.testing.assert_array_equal(seen.jacobian(u, q[:1], moment)[1], [[3.0]])
 

@@ -26,7 +26,7 @@ def reaction(cells: int) -> lp.Model:
     smooth = lp.Sobolev(1.0, length=0.1).pointwise(1)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=3.0, std=3.0)},
+        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=lp.Normal(3.0, std=3.0))},
         A=lambda q, u, v, x: q.q * u * v,
         B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: 5 + 2 * np.sin(t) + 3 * np.cos(0.7 * t) * np.sin(2 * np.pi * x[0]),
@@ -120,19 +120,20 @@ def test_what_modes_leave_out_moves_like_the_rest():
     mesh = lp.interval(0.0, 1.0, 10)
     points, state = lp.Points([0.5], noise=1e3), lp.Field(mesh, lp.linear(mesh))
 
-    def deviation(modes: int, evolution: Any, **options: Any) -> Array:
-        q = lp.Field(mesh, lp.linear(mesh), inner="H1", std=2.0, evolution=evolution, **options)
+    def deviation(modes: int, evolution: Any, prior: lp.fem.Prior) -> Array:
+        q = lp.Field(mesh, lp.linear(mesh), inner="H1", prior=prior, evolution=evolution)
         model = lp.Model(state, {"q": q}, A=lambda q, u, v, x: q.q * u * v)
         identifier = lp.Identifier(model, points, lp.SensitivityLaw(modes=modes), u0=0.0)
         for t in (0.5, 1.0, 3.0):
             identifier.step(t, [0.0])
         return np.asarray(identifier.estimate().q_std)
 
+    normal = lp.Normal(0.0, 2.0)
     for evolution in (lp.RandomWalk(0.7), lp.MeanReverting(2.0), lp.fem.Periodic(4.0)):
-        few, all_ = deviation(3, evolution), deviation(11, evolution)
+        few, all_ = deviation(3, evolution, normal), deviation(11, evolution, normal)
         assert few == pytest.approx(all_, rel=1e-3)
-    log = {"prior": 1.0, "transform": "log"}
-    few, all_ = (deviation(n, lp.RandomWalk(0.7), **log) for n in (3, 11))
+    log = lp.LogNormal(1.0, 2.0)
+    few, all_ = (deviation(n, lp.RandomWalk(0.7), log) for n in (3, 11))
     assert few == pytest.approx(all_, rel=1e-2)
 
 

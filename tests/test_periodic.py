@@ -46,7 +46,7 @@ def square(element, kind="quad"):
 
 def advection(field, speed=1.0):
     return lp.Model(
-        field, {"b": lp.Scalar(speed, 1.0)}, A=lambda q, u, v, x: q.b * lp.grad(u)[0] * v
+        field, {"b": lp.Normal(speed, 1.0)}, A=lambda q, u, v, x: q.b * lp.grad(u)[0] * v
     )
 
 
@@ -87,7 +87,7 @@ def test_translation_by_a_cell_commutes_with_the_operators(element):
     """A shifted function has the shifted image: the seam is like every other vertex."""
     model = lp.Model(
         ring(element()),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
         B=lambda u, v, x: lp.grad(u)[0] * v,
     )
@@ -131,7 +131,7 @@ def test_the_speed_of_a_wave_is_found():
 
 
 def test_a_periodic_parameter_and_the_observation_of_all():
-    field = ring(ElementLineP1(), inner="H1", prior=1.0)
+    field = ring(ElementLineP1(), inner="H1", prior=lp.Normal(1.0))
     state = lp.Field(field.mesh, ElementLineP2(), periodic=RING)
     model = lp.Model(state, field, A=lambda q, u, v, x: q * u * v)
     assert model.Q.dim == 24

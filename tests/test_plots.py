@@ -285,7 +285,7 @@ def test_result_plots_itself() -> None:
     mesh = lp.interval(0, 1, 4)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     identifier = lp.Identifier(model, lp.Points([0.5]), lp.SensitivityLaw(noise=0.1), u0=1.0)

@@ -20,7 +20,7 @@ def rod() -> lp.Model:
             ElementLineP1(),
             dirichlet={"left": lp.Channel("left"), "right": 0.0},
         ),
-        parameter={"k": lp.Scalar(0.1, std=0.03)},
+        parameter={"k": lp.Normal(0.1, std=0.03)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
 
@@ -97,7 +97,7 @@ def test_in_two_dimensions_each_coordinate_has_a_shift():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (6, 6))
     model = lp.Model(
         state=lp.Field(mesh, ElementQuad1(), dirichlet={"left": 0.0}),
-        parameter={"k": lp.Scalar(1.0, std=0.3)},
+        parameter={"k": lp.Normal(1.0, std=0.3)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=1.0,
     )
@@ -115,7 +115,7 @@ def test_calibrated_sensors_keep_their_positions():
     base = lp.Points(AT, position_std=0.02)
     model = lp.Model(
         state=rod().state,
-        parameter={"k": lp.Scalar(0.1, std=0.03), "gain": lp.Scalar(1.0, std=0.1)},
+        parameter={"k": lp.Normal(0.1, std=0.03), "gain": lp.Normal(1.0, std=0.1)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     shown = lp.observation.Calibrated(base, lambda y, q, x: q.gain * y, noise=0.005)
@@ -171,7 +171,11 @@ def case(folder, place: str):
 def test_a_case_states_it(tmp_path):
     prepared = case(tmp_path, 'at = "30 cm", at_std = "1 cm"').prepare()
     unknown = prepared.case.model.parameter_space.unknowns["position"]
-    assert (list(unknown.names), unknown.std, unknown.unit) == (["T"], pytest.approx(0.01), "m")
+    assert (list(unknown.names), unknown.prior.std, unknown.unit) == (
+        ["T"],
+        pytest.approx(0.01),
+        "m",
+    )
     identifier = prepared.identifier
     assert "position[T]_std" in identifier.run(prepared.stream).to_xarray()
     _, factor = identifier.latent_belief().q_factor

@@ -143,7 +143,7 @@ def test_in_the_plane_linear_states_pass_and_noise_does_not(element):
     if element is ElementTriP2:
         mesh = mesh.to_meshtri()
     field = lp.Field(mesh, element())
-    model = lp.Model(field, lp.Scalar(1.0), lambda q, u, v, x: q * u * v)
+    model = lp.Model(field, lp.Normal(1.0), lambda q, u, v, x: q * u * v)
     observed = bind(model, lp.Full(reconstruction=Tikhonov("V", 1e-3)))
     z = observed.G @ model.state_space.interpolate(lambda x: 1 + x[0] - 2 * x[1])
     assert model.X.norm(observed.reconstruct(z).u - z) < 1e-9

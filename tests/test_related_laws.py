@@ -124,7 +124,7 @@ def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
 def test_no_sensor_of_the_parameter(kind: Any) -> None:
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * u * v,
     )
     sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})

@@ -14,7 +14,7 @@ SENSORS = lp.Points([0.3, 0.7], noise=0.05)
 
 
 def rod(**replay):
-    model = heat(MESH, lp.Scalar(0.05, 0.03))
+    model = heat(MESH, lp.Normal(0.05, 0.03))
     law = lp.SensitivityLaw(replay=lp.Replay(**replay))
     return lp.Identifier(model, SENSORS, law, u0=lambda x: 10.0 * np.sin(np.pi * x[0]))
 
@@ -97,7 +97,7 @@ def test_a_run_interrupted_within_a_replay_goes_on_to_the_bit():
 def test_a_fleet_ends_as_its_members_do():
     law = lp.SensitivityLaw(replay=lp.Replay(slice=2, iterations=1))
     fleet = lp.Fleet(
-        heat(MESH, lp.Scalar(0.05, 0.03)),
+        heat(MESH, lp.Normal(0.05, 0.03)),
         SENSORS,
         law,
         members=["a", "b"],

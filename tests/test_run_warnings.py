@@ -47,7 +47,7 @@ def as_tuple(item: Any) -> tuple[float, Any]:
 
 @pytest.mark.slow
 def test_the_right_model_raises_no_doubts():
-    model = rod(lp.Scalar(0.2, 0.1))
+    model = rod(lp.Normal(0.2, 0.1))
     data = run(model, model)
     assert doubts(data) == []
     assert measures(data)["innovation_ratio"] == pytest.approx(1.0, abs=0.3)
@@ -55,13 +55,13 @@ def test_the_right_model_raises_no_doubts():
 
 @pytest.mark.slow
 def test_a_process_that_is_missing_is_said():
-    found = doubts(run(rod(lp.Scalar(0.2, 0.1)), rod(lp.Scalar(0.2), loss=1.0)))
+    found = doubts(run(rod(lp.Normal(0.2, 0.1)), rod(lp.Normal(0.2), loss=1.0)))
     assert "The model does not explain the data" in found[0]
 
 
 @pytest.mark.slow
 def test_a_sensor_that_is_always_off_is_named():
-    model = rod(lp.Scalar(0.2, 0.1))
+    model = rod(lp.Normal(0.2, 0.1))
     found = doubts(run(model, model, shift=[0.0, 1.0, 0.0], replay=lp.Replay()))
     assert "The model does not explain the data" in found[0]
     assert "Most likely sensor B reads" in found[0]
@@ -71,25 +71,25 @@ def test_a_sensor_that_is_always_off_is_named():
 
 @pytest.mark.slow
 def test_an_estimate_at_its_bound_is_said():
-    narrow = rod(lp.Scalar(0.2, 0.1, bounds=(0.0, 0.25)))
-    found = doubts(run(narrow, rod(lp.Scalar(0.2))))
+    narrow = rod(lp.Normal(0.2, 0.1, bounds=(0.0, 0.25)))
+    found = doubts(run(narrow, rod(lp.Normal(0.2))))
     assert any("a ends at its bound 0.25" in sentence for sentence in found)
 
 
 @pytest.mark.slow
 def test_an_unknown_that_nothing_shows_is_said():
-    unseen = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
-    data = run(rod(unseen), rod(lp.Scalar(0.2)))
+    unseen = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
+    data = run(rod(unseen), rod(lp.Normal(0.2)))
     assert doubts(data) == [
         "b: the data have told hardly anything, 100% of its prior standard deviation is left. "
         "Longer data, with larger changes nearer to the sensors, would tell more."
     ]
-    moving = {**unseen, "b": lp.Scalar(1.0, 0.5, evolution=lp.MeanReverting(1.0))}
-    assert doubts(run(rod(moving), rod(lp.Scalar(0.2)))) == []
+    moving = {**unseen, "b": lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.MeanReverting(1.0))}
+    assert doubts(run(rod(moving), rod(lp.Normal(0.2)))) == []
 
 
 def test_the_gradient_law_has_no_innovations_to_judge():
-    model = rod(lp.Scalar(0.2, 0.1))
+    model = rod(lp.Normal(0.2, 0.1))
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=0.0)
     z = np.zeros(identifier.observed.size)
     assert doubts(identifier.run([(0.1, z), (0.2, z)]).to_xarray()) == []
@@ -98,16 +98,16 @@ def test_the_gradient_law_has_no_innovations_to_judge():
 
 @pytest.mark.slow
 def test_a_replay_that_did_not_converge_is_said():
-    far = rod(lp.Scalar(3.0, 3.0, transform="log"))
+    far = rod(lp.LogNormal(3.0, 3.0))
     once = lp.Replay(first=300, iterations=1)
-    found = doubts(run(far, rod(lp.Scalar(0.2)), replay=once))
+    found = doubts(run(far, rod(lp.Normal(0.2)), replay=once))
     assert any("The last replay has not converged" in sentence for sentence in found)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("count", "said"), [(5, False), (50, True)])
 def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
-    model = rod(lp.Scalar(0.5, 0.3))
+    model = rod(lp.Normal(0.5, 0.3))
     data = run(model, model)
     data["drifting"] = ("time", np.where(np.arange(data.sizes["time"]) < count, 0.9, 0.1))
     assert any("unknowns that drift" in note for note in doubts(data)) == said
@@ -115,7 +115,7 @@ def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
 
 @pytest.mark.slow
 def test_samples_of_which_nothing_could_be_learned_are_said():
-    model = rod(lp.Scalar(0.5, 0.3))
+    model = rod(lp.Normal(0.5, 0.3))
     data = run(model, model)
     data["residual"] = ("time", np.zeros(data.sizes["time"]))
     held = np.full(data.sizes["time"], np.nan)
@@ -130,7 +130,7 @@ def reaction(cells: int) -> lp.Model:
     smooth = lp.Sobolev(1.0, 0.3).pointwise(1)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=3.0, std=1.5)},
+        {"q": lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=lp.Normal(3.0, std=1.5))},
         A=lambda q, u, v, x: q.q * u * v,
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
         f=seed_excited.f,
@@ -168,7 +168,7 @@ def test_an_equation_error_that_is_no_noise_does_not_drive_a_field_out_of_its_pr
 @pytest.mark.slow
 @pytest.mark.parametrize(("last", "said"), [(0.9, False), (1.1, True)])
 def test_only_the_end_counts_for_what_has_left_its_prior(last: float, said: bool):
-    model = rod(lp.Scalar(0.5, 0.3))
+    model = rod(lp.Normal(0.5, 0.3))
     data = run(model, model)
     ratio = np.full(data.sizes["time"], 5.0)
     ratio[-2:] = last, np.nan  # a step that fails notes nothing

@@ -37,7 +37,9 @@ TIMES = range(6)
 
 def identifier(unknown=None, withheld=True):
     mesh = lp.interval(0.0, 1.0, 8)
-    model = heat(mesh, unknown or lp.Scalar(0.1, 0.05, unit="m^2/s"), {"left": lp.Channel("T0")})
+    model = heat(
+        mesh, unknown or lp.Scalar(lp.Normal(0.1, 0.05), unit="m^2/s"), {"left": lp.Channel("T0")}
+    )
     return lp.Identifier(
         model,
         lp.Points({"a": 0.25}, noise=0.1, unit="degC"),
@@ -173,7 +175,9 @@ def test_fields_and_runs_without_withheld_channels(tmp_path, field):
         mesh = lp.interval(0.0, 1.0, 8)
         from livepde.models import EQUATIONS
 
-        unknown = lp.Field(mesh, EQUATIONS["heat"].element(mesh), inner="H1", prior=0.1, std=0.05)
+        unknown = lp.Field(
+            mesh, EQUATIONS["heat"].element(mesh), inner="H1", prior=lp.Normal(0.1, std=0.05)
+        )
         model = heat(mesh, unknown, {"left": lp.Channel("T0")})
         one = lp.Identifier(model, lp.Points({"a": 0.25}, noise=0.1), lp.SensitivityLaw(modes=3))
     data = written(tmp_path / "run", drive(one, samples()))

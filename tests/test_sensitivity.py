@@ -18,7 +18,7 @@ def source_model(**options):
     """Two unknown source amplitudes: the output is linear in the parameter."""
     return lp.Model(
         lp.Field(line(16), ElementLineP2(), dirichlet={"boundary": 0.0}),
-        {"a": lp.Scalar(0.5, std=2.0), "b": lp.Scalar(-1.0, std=0.5)},
+        {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
         A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
         B=laplace,
         **options,
@@ -68,7 +68,7 @@ def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
 def conductivity(prior=1.0, bounds=(0.05, 10.0)):
     return lp.Model(
         lp.Field(line(16), ElementLineP2(), dirichlet={"left": 0.0, "right": lp.Channel("T")}),
-        lp.Scalar(prior, std=1.0, bounds=bounds),
+        lp.Normal(prior, std=1.0, bounds=bounds),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
         f=1.0,
     )
@@ -186,7 +186,7 @@ def test_a_field_beside_a_number():
     mesh = line(12)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"c": lp.Scalar(0.0), "s": lp.Field(mesh, ElementLineP1(), inner="H1")},
+        {"c": lp.Normal(0.0), "s": lp.Field(mesh, ElementLineP1(), inner="H1")},
         A=lambda q, u, v, x: q.c * u * v - q.s * v,
         B=laplace,
     )
@@ -205,7 +205,7 @@ def test_a_field_beside_a_number():
 def test_a_sensor_that_sees_a_parameter():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"s": lp.Scalar(0.0, std=2.0), "offset": lp.Scalar(0.0, std=1.0)},
+        {"s": lp.Normal(0.0, std=2.0), "offset": lp.Normal(0.0, std=1.0)},
         A=lambda q, u, v, x: -q.s * np.sin(x.t) * v,
         B=laplace,
     )
@@ -237,7 +237,7 @@ def test_passes_the_shipped_check(law, scheme):
 def test_a_nonlinear_model_finds_its_rate():
     model = lp.Model(
         lp.Field(line(12), ElementLineP2(), quadrature=6),
-        lp.Scalar(1.0, std=1.0),
+        lp.Normal(1.0, std=1.0),
         A=lambda q, u, v, x: -q * u * (1 - u) * v,
         B=lambda u, v, x: 0.1 * laplace(u, v, x),
     )

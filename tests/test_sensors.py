@@ -29,7 +29,7 @@ PLANE = MeshTri.init_tensor(np.linspace(0, 1, 6), np.linspace(0, 1, 5)).with_bou
 
 
 def rod(cells=10, element=None, **unknowns):
-    unknowns = unknowns or {"k": lp.Scalar(2.0, std=0.5)}
+    unknowns = unknowns or {"k": lp.Normal(2.0, std=0.5)}
     return lp.Model(
         lp.Field(lp.interval(0.0, 1.0, cells, regions=REGIONS), element or ElementLineP2()),
         unknowns,
@@ -40,7 +40,7 @@ def rod(cells=10, element=None, **unknowns):
 def plate(element=None, mesh=PLANE):
     return lp.Model(
         lp.Field(mesh, element or ElementTriP2()),
-        {"k": lp.Scalar(2.0, std=0.5)},
+        {"k": lp.Normal(2.0, std=0.5)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
 
@@ -148,7 +148,7 @@ def test_functionals_are_integrals_of_forms():
 
 
 def test_functionals_of_fields_and_single_unknowns():
-    field = lp.Field(lp.interval(0.0, 1.0, 5), ElementLineP1(), prior=1.0)
+    field = lp.Field(lp.interval(0.0, 1.0, 5), ElementLineP1(), prior=lp.Normal(1.0))
     model = lp.Model(lp.Field(field.mesh, ElementLineP2()), field, A=lambda q, u, v, x: q * u * v)
     z = read(
         model,
@@ -215,11 +215,11 @@ def gained(y, q, x):
     return q.gain * y + q.R[0] * x.inputs["Q"] * y**2
 
 
-CALIBRATION = {"gain": lp.Scalar(1.2), "R": lp.Piecewise({"a": "core"}, prior=0.5)}
+CALIBRATION = {"gain": lp.Normal(1.2), "R": lp.Piecewise({"a": "core"}, lp.Normal(0.5))}
 
 
 def test_calibrated_sensors():
-    model = rod(**{**CALIBRATION, "R": lp.Piecewise({"a": "core", "b": "core"}, prior=0.5)})
+    model = rod(**{**CALIBRATION, "R": lp.Piecewise({"a": "core", "b": "core"}, lp.Normal(0.5))})
     sensors = lp.observation.Calibrated(lp.Points([0.3, 0.6]), gained, inputs=("Q",), noise=0.1)
     z = read(model, sensors, lambda x: x[0], moment=at(Q=2.0))
     np.testing.assert_allclose(z, [0.36 + 0.09, 0.72 + 0.36], rtol=1e-12)
@@ -335,7 +335,7 @@ def heated(**more):
     """A rod heated at its left end by a channel, cooled at its right end."""
     return lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 20), ElementLineP1(), dirichlet={"right": 0.0}),
-        {"k": lp.Scalar(1.0, std=0.5, bounds=(0.05, 10.0)), **more},
+        {"k": lp.Normal(1.0, std=0.5, bounds=(0.05, 10.0)), **more},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=[0.0, lp.On("left", lambda x, t: 1.0 + np.sin(3 * t))],
     )
@@ -383,7 +383,7 @@ def test_a_moving_sensor_finds_the_conductivity():
 
 @pytest.mark.slow
 def test_offsets_by_direct_and_gain_by_calibration():
-    model = heated(a=lp.Scalar(0.0, std=0.3), b=lp.Scalar(0.0, std=0.3))
+    model = heated(a=lp.Normal(0.0, std=0.3), b=lp.Normal(0.0, std=0.3))
     direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}
     offsets = lp.Points({"A": 0.2, "B": 0.5, "C": 0.8}, direct, noise=0.005)
     identified(model, offsets, {"k": 0.6, "a": 0.2, "b": -0.1}, 0.005)
@@ -392,7 +392,7 @@ def test_offsets_by_direct_and_gain_by_calibration():
         lambda y, q, x: y * np.array([q.gain, 1.0]),
         noise=0.005,
     )
-    identified(heated(gain=lp.Scalar(1.0, std=0.2)), gains, {"k": 0.6, "gain": 1.15}, 0.005)
+    identified(heated(gain=lp.Normal(1.0, std=0.2)), gains, {"k": 0.6, "gain": 1.15}, 0.005)
 
 
 def test_positions_are_inputs_that_may_be_missing(tmp_path):

@@ -24,7 +24,7 @@ def rod(cells: int, **k: Any) -> lp.Model:
     """Return a rod with unknown conductivity and loss, heated by a channel at its left end."""
     mesh = lp.interval(0.0, 1.0, cells)
     field = lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0})
-    unknowns = {"k": lp.Scalar(1.0, std=0.3, **k), "h": lp.Scalar(1.0, std=0.3)}
+    unknowns = {"k": lp.Scalar(lp.Normal(1.0, std=0.3), **k), "h": lp.Normal(1.0, std=0.3)}
     return lp.Model(
         field,
         unknowns,
@@ -103,7 +103,7 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
     mesh = lp.interval(0.0, 0.4, 20)
     model = heat(
         mesh,
-        alpha=lp.Scalar(5e-5, 3e-5, transform="log"),
+        alpha=lp.LogNormal(5e-5, 3e-5),
         dirichlet={"left": lambda x, t: 20.0 + 30.0 * (t % 3600.0 < 600.0)},
     )
     sensors = lp.Points([0.1, 0.2], noise=0.05)
@@ -153,7 +153,7 @@ def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
         return float(np.sin(3.0 * t))
 
     points, times = lp.Points([0.25, 0.5, 0.75], noise=0.01), 0.05 * np.arange(401)
-    unknown, ends = {"a": lp.Scalar(0.2, std=0.2)}, {}
+    unknown, ends = {"a": lp.Normal(0.2, std=0.2)}, {}
     models = {n: driven_rod(unknown, left, lp.interval(0.0, 1.0, n)) for n in (16, 64)}
     rows = readings(models[16], points, lambda t: 0.3, times, 0.01, 0)
     for cells, model in models.items():
@@ -259,7 +259,7 @@ def test_a_field_is_prolonged() -> None:
     line = lp.linear(mesh)
     model = lp.Model(
         lp.Field(mesh, line, dirichlet={"left": lp.Channel("T"), "right": 0.0}),
-        lp.Field(mesh, line, inner="H1", prior=1.0, std=0.1),
+        lp.Field(mesh, line, inner="H1", prior=lp.Normal(1.0, std=0.1)),
         A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     law = lp.SensitivityLaw(modes=4)
@@ -273,7 +273,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
         lp.Field(mesh, lp.fem.quadratic(mesh), dirichlet={"left": lp.Channel("T"), "right": 0.0}),
-        lp.Scalar(1.0, std=0.3),
+        lp.Normal(1.0, std=0.3),
         A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     given = lp.Identifier(model, SENSORS, lp.SensitivityLaw(), u0=0.0)

@@ -49,7 +49,7 @@ def separately(model, items, rule, **options):
 
 
 def shard(model, rule=None, members=MEMBERS):
-    return lp.Shard(model, SENSORS, rule or law(), members, u0=0.0)
+    return lp.fleet.Shard(model, SENSORS, rule or law(), members, u0=0.0)
 
 
 def run(one, pieces):

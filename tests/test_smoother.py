@@ -38,7 +38,7 @@ def sources(evolution):
     """Return a rod with two unknown sources, one of which moves: linear."""
     return lp.Model(
         lp.Field(MESH, ElementLineP1(), dirichlet={"left": lambda x, t: np.sin(t) + 0 * x[0]}),
-        {"s": lp.Scalar(0.5, 0.7, evolution=evolution), "c": lp.Scalar(0.2, 0.5)},
+        {"s": lp.Scalar(lp.Normal(0.5, 0.7), evolution=evolution), "c": lp.Normal(0.2, 0.5)},
         A=lambda q, u, v, x: -(q.s * (1 + x[0]) + q.c * x[0] ** 2) * v,
         B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)) + 0.4 * u * v,
     )
@@ -144,7 +144,7 @@ TIMES = 0.1 * np.arange(101)
 def conducting(evolution=None):
     """Return a rod with an unknown conductivity `a` whose left end swings."""
     moves = {} if evolution is None else {"evolution": evolution}
-    a = lp.Scalar(0.1, 0.05, transform="log", **moves)
+    a = lp.Scalar(lp.LogNormal(0.1, 0.05), **moves)
     return driven_rod({"a": a}, lambda t: np.sin(1.3 * t) + 0.5 * np.sin(3.1 * t), ROD)
 
 

@@ -103,7 +103,10 @@ def test_names_of_orders():
 
 def test_the_prior_deviation_scales_the_space():
     mesh, element = line(), ElementLineP1()
-    fields = [lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), std=std) for std in (1.0, 2.0)]
+    fields = [
+        lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), prior=lp.Normal(std=std))
+        for std in (1.0, 2.0)
+    ]
     one, two = (lp.Model(lp.Field(mesh, element), field, product).Q for field in fields)
     np.testing.assert_allclose(one.gram.toarray(), 4 * two.gram.toarray(), rtol=1e-9)
 
@@ -113,7 +116,7 @@ def test_products_with_other_unknowns():
     mesh, element = line(), ElementLineP1()
     parts = {
         "a": lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), dirichlet={"left": 0.0}),
-        "k": lp.Scalar(std=0.5),
+        "k": lp.Normal(std=0.5),
         "b": lp.Field(mesh, element, inner="H1"),
     }
     model = lp.Model(lp.Field(mesh, element), parts, A=lambda q, u, v, x: (q.a + q.b + q.k) * u * v)
@@ -223,7 +226,7 @@ def test_bad_orders():
 )
 def test_the_prior_deviation_is_that_at_a_point(mesh, s):
     inner = lp.Sobolev(s, length=0.1).pointwise(len(mesh.p))
-    field = lp.Field(mesh, lp.linear(mesh), inner=inner, std=0.7)
+    field = lp.Field(mesh, lp.linear(mesh), inner=inner, prior=lp.Normal(std=0.7))
     model = lp.Model(lp.Field(mesh, lp.linear(mesh)), field, A=lambda q, u, v, x: q * u * v)
     centre = np.argmin(np.abs(mesh.p - 0.5).sum(axis=0))
     unit = np.zeros(model.Q.dim)

@@ -61,7 +61,7 @@ def test_user_given_inner_product():
 
 def test_std_divides_the_inner_product():
     mesh = line()
-    field = lp.Field(mesh, ElementLineP1(), inner="H1", std=3.0)
+    field = lp.Field(mesh, ElementLineP1(), inner="H1", prior=lp.Normal(std=3.0))
     wide = lp.Model(lp.Field(mesh, ElementLineP1()), field, product)
     unit = reaction(mesh, ElementLineP1())
     np.testing.assert_allclose(9 * wide.Q.gram.toarray(), unit.Q.gram.toarray())
@@ -83,7 +83,7 @@ def test_singular_inner_product_is_one_sentence():
 def test_singularity_does_not_depend_on_units(scale):
     mesh = line(40)
     for inner, regular in (("H1", True), (laplace, False)):
-        field = lp.Field(mesh, ElementLineHermite(), inner=inner, std=scale)
+        field = lp.Field(mesh, ElementLineHermite(), inner=inner, prior=lp.Normal(std=scale))
         model = lp.Model(lp.Field(mesh, ElementLineHermite()), field, product)
         assert check_space(model.Q).ok == regular
 
@@ -174,27 +174,27 @@ def test_bad_unknowns():
         lp.Field(mesh, element, dirichlet={"top": 0.0})
     for std in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(lp.errors.SpaceError, match="std must be a positive number"):
-            lp.Scalar(std=std)
+            lp.Normal(std=std)
     with pytest.raises(lp.errors.SpaceError, match="lower < upper"):
-        lp.Scalar(bounds=(1.0, 1.0))
-    with pytest.raises(lp.errors.SpaceError, match=r"prior 3\.0 lies outside"):
-        lp.Piecewise({"a": lambda x: x[0] < 1}, prior=3.0, bounds=(0.0, 2.0))
+        lp.Normal(bounds=(1.0, 1.0))
+    with pytest.raises(lp.errors.SpaceError, match=r"mean 3\.0 lies outside"):
+        lp.Piecewise({"a": lambda x: x[0] < 1}, lp.Normal(3.0, bounds=(0.0, 2.0)))
     with pytest.raises(lp.errors.SpaceError, match="at least one region"):
-        lp.Piecewise({})
+        lp.Piecewise({}, lp.Normal())
     for bad in ((1.0, 0.0, 4), (0.0, 1.0, 0), (0.0, np.nan, 4)):
         with pytest.raises(lp.errors.SpaceError, match="needs stop > start and cells >= 1"):
             lp.interval(*bad)
     with pytest.raises(lp.errors.SpaceError, match="at least one unknown"):
         lp.Model(lp.Field(mesh, element), {}, product)
     with pytest.raises(lp.errors.SpaceError, match="'R b': the name must be a Python identifier"):
-        lp.Model(lp.Field(mesh, element), {"R b": lp.Scalar()}, product)
+        lp.Model(lp.Field(mesh, element), {"R b": lp.Normal()}, product)
 
 
 @pytest.mark.slow
 def test_prior_variances_are_the_diagonal_of_the_inverse():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
     for inner in ("H1", lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):
-        unknown = {"q": lp.Field(mesh, lp.linear(mesh), inner=inner, std=2.0)}
+        unknown = {"q": lp.Field(mesh, lp.linear(mesh), inner=inner, prior=lp.Normal(std=2.0))}
         model = lp.Model(lp.Field(mesh, lp.linear(mesh)), unknown, A=lambda q, u, v, x: q.q * u * v)
         exact = np.diag(np.linalg.inv(model.Q.gram.toarray()))
         assert model.Q.variance == pytest.approx(exact)

@@ -49,7 +49,7 @@ def rod(parameter=None, dirichlet=ZERO, element=None, cells=24, **options):
         lp.Field(mesh, element or ElementLineP2(), dirichlet=dirichlet),
         lp.Field(mesh, ElementLineP1(), inner="H1")
         if parameter == "field"
-        else parameter or lp.Scalar(),
+        else parameter or lp.Normal(),
         product,
         B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
         **options,
@@ -78,7 +78,7 @@ def test_lipschitz_constant_of_reaction_and_diffusion(q):
 
 def test_norm_of_A_for_a_number():
     """A(u) q = q u with q of deviation s: ||A(u)|| = s ||u||, and the gain enters as its root."""
-    model = rod(lp.Scalar(std=2.0), dirichlet={})
+    model = rod(lp.Normal(std=2.0), dirichlet={})
     spaces = dg.Spaces(model, observe(model, lp.Full()))
     u = np.full(model.X.dim, 3.0)
     c = dg.constants(spaces, np.zeros(1), [u], gain=4.0)
@@ -587,7 +587,7 @@ def test_the_page_with_truth():
 
 
 def test_the_page_without_truth_says_what_needs_it():
-    model = rod(lp.Scalar(1.0), cells=8)
+    model = rod(lp.Normal(1.0), cells=8)
     identifier = lp.Identifier(model, lp.Points([0.4]), lp.SensitivityLaw(noise=0.1), u0=1.0)
     found = dg.theory_report(identifier, [(t, [np.exp(-t)]) for t in 0.1 * np.arange(9)])
     assert any("Without the truth" in note for note in found.notes)
@@ -599,7 +599,7 @@ def test_the_page_without_truth_says_what_needs_it():
 
 
 def test_the_page_of_a_run_without_any_measurement():
-    model = rod(lp.Scalar(1.0), cells=8)
+    model = rod(lp.Normal(1.0), cells=8)
     identifier = lp.Identifier(model, lp.Points([0.4]), lp.GradientLaw(), u0=1.0)
     found = dg.theory_report(identifier, [(t, [np.nan]) for t in (0.1, 0.2, 0.3)])
     assert found.constants is None

@@ -68,7 +68,7 @@ def powered(x: Any, t: float) -> Any:
 
 def rod(cells: int = 30, **options: Any) -> lp.Model:
     """Return a rod with two unknowns, whose left end and source change with time."""
-    unknowns = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
+    unknowns = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
     given = {"unknowns": unknowns, "A": conduction, "f": heating, **options}
     return driven_rod(left=lambda t: np.sin(2.0 * t), mesh=line(cells), **given)
 
@@ -79,7 +79,7 @@ def powered_rod() -> lp.Model:
 
 def positive_rod() -> lp.Model:
     """Return a rod with unknowns that stay positive, so that A is not linear in the latent ones."""
-    unknowns = {"a": lp.Scalar(0.2, 0.1, transform="log"), "b": lp.Scalar(1.0, 0.5)}
+    unknowns = {"a": lp.LogNormal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
     return rod(unknowns=unknowns)
 
 
@@ -112,7 +112,7 @@ def large_square() -> lp.Model:
 def plate() -> lp.Model:
     """Return a square of 81 nodes with a nonlinear A and two unknown numbers."""
     field = lp.Field(MeshTri().refined(3), ElementTriP1(), dirichlet={"boundary": 0.0})
-    unknowns = {"a": lp.Scalar(0.2, 0.1), "b": lp.Scalar(1.0, 0.5)}
+    unknowns = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
     return lp.Model(
         field,
         unknowns,

@@ -17,13 +17,13 @@ from livepde.models import EQUATIONS, advection_dispersion, mobile_immobile
 from livepde.stepping import Advance, Alexander2, simulate
 
 D, V = 0.15, 2.5
-ONE = lp.Scalar(1.0, 1.0)
+ONE = lp.Normal(1.0, 1.0)
 CASE = Path(__file__).parents[1] / "cases" / "soil_column.toml"
-SHARE = lp.Scalar(0.5, 0.2, bounds=(0.0, 1.0), transform="logit")
+SHARE = lp.LogitNormal(0.5, 0.2, bounds=(0.0, 1.0))
 
 
 def positive(value):
-    return lp.Scalar(value, value, transform="log")
+    return lp.LogNormal(value, value)
 
 
 def ogata_banks(x, t, R=1.0):
@@ -114,9 +114,9 @@ def test_nothing_is_lost():
 )
 def test_checks_pass_for_random_parameters(dispersion, v, phi, omega, which):
     mesh = lp.interval(0.0, 10.0, 10)
-    spread, speed = positive(dispersion), lp.Scalar(v, 1.0)
+    spread, speed = positive(dispersion), lp.Normal(v, 1.0)
     if which == "immobile":
-        share = lp.Scalar(phi, 0.1, bounds=(0.0, 1.0), transform="logit")
+        share = lp.LogitNormal(phi, 0.1, bounds=(0.0, 1.0))
         model = mobile_immobile(mesh, spread, speed, share, positive(omega))
     else:
         model = advection_dispersion(mesh, spread, speed, R=1.5, decay=0.1, inlet=which)

@@ -189,7 +189,7 @@ def test_errors_of_one_of_several_unknowns() -> None:
     mesh = lp.interval(0, 1, 4)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"D": lp.Scalar(1.0), "c": lp.Scalar(2.0)},
+        {"D": lp.Normal(1.0), "c": lp.Normal(2.0)},
         A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.c * u * v,
     )
     stream = twin(model=model, q_true={"D": 2.0, "c": 4.0}, observation=SENSORS)
@@ -225,7 +225,7 @@ def test_inputs_travel_with_the_samples() -> None:
     mesh = lp.interval(0, 1, 8)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("T0")}),
-        lp.Scalar(1.0),
+        lp.Normal(1.0),
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     stream = Twin(
@@ -274,7 +274,7 @@ def test_a_truth_that_cannot_be_computed_says_so() -> None:
     mesh = lp.interval(0, 1, 4)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: -(1e6 + u**2) * v,  # blows up: no implicit step has a real root
     )

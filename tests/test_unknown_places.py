@@ -85,7 +85,7 @@ def model_of(place: str) -> lp.Model:
     prior, std, _, terms, initial = PLACES[place]
     base = [lambda q, u, v, x: conduction(u, v) + 0.0 * q.a * u * v]
     state = lp.Field(MESH, ElementLineP1())
-    return lp.Model(state, {"a": lp.Scalar(prior, std)}, A=[*base, *terms], initial=initial)
+    return lp.Model(state, {"a": lp.Normal(prior, std)}, A=[*base, *terms], initial=initial)
 
 
 def found(
@@ -125,18 +125,18 @@ def test_an_unknown_is_found_wherever_it_stands(place: str):
 def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
     reaction = PLACES["reaction"][3]
     base = [lambda q, u, v, x: conduction(u, v), *reaction]
-    unknowns: dict[str, Any] = {"a": lp.Scalar(0.0, 1.0)}
+    unknowns: dict[str, Any] = {"a": lp.Normal(0.0, 1.0)}
     truth: dict[str, Any] = {"a": 0.7}
     points = lp.Points({"A": 0.1, "B": 0.4, "C": 0.8}, noise=None)
     if what == "offset":
-        unknowns["offset"] = lp.Scalars(("A", "C"), 0.0, 0.5)
+        unknowns["offset"] = lp.Scalars(("A", "C"), lp.Normal(0.0, 0.5))
         truth["offset"] = [0.3, -0.2]
         direct = {name: lambda q, x, name=name: q.offset[name] for name in ("A", "C")}
         sensors: lp.observation.Observation = lp.Points(
             dict(points.points), direct=direct, noise=NOISE
         )
     elif what == "gain":
-        unknowns["gain"] = lp.Scalars(("A", "B"), 1.0, 0.2)
+        unknowns["gain"] = lp.Scalars(("A", "B"), lp.Normal(1.0, 0.2))
         truth["gain"] = [1.1, 0.9]
         sensors = lp.observation.Calibrated(
             points,
@@ -144,7 +144,7 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
             noise=NOISE,
         )
     else:
-        unknowns["R"] = lp.Scalar(0.1, 0.1)
+        unknowns["R"] = lp.Normal(0.1, 0.1)
         truth["R"] = 0.25
         sensors = lp.observation.Calibrated(
             points, lambda y, q, x: y + np.array([q.R, 0.0, 0.0]) * swing(x), noise=NOISE
@@ -158,12 +158,10 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
 
 
 def test_a_scalar_and_a_field_are_found_together():
-    field = lp.Field(
-        MESH, ElementLineP1(), inner="H1", prior=0.2, std=0.1, transform="log", name="D"
-    )
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.2, std=0.1), name="D")
     model = lp.Model(
         lp.Field(MESH, ElementLineP1()),
-        {"D": field, "r": lp.Scalar(0.0, 1.0)},
+        {"D": field, "r": lp.Normal(0.0, 1.0)},
         A=[
             lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.r * u * v,
             lp.On("left", lambda q, u, v, x: -swing(x) * v),

@@ -34,7 +34,7 @@ def rod(parameter: Any, A: Any = None, **options: Any) -> lp.Model:
 
 def data(a: Any, times: Any, noise: float = NOISE, seed: int = 0) -> list[tuple[float, Any]]:
     """Return noisy samples of the sensors for a diffusivity a(t)."""
-    found = readings(rod({"a": lp.Scalar(1.0)}), lp.Points(SENSORS), a, times, noise, seed)
+    found = readings(rod({"a": lp.Normal(1.0)}), lp.Points(SENSORS), a, times, noise, seed)
     return [(float(times[0]), np.zeros(len(SENSORS))), *found]
 
 
@@ -80,22 +80,25 @@ def test_a_mean_reverting_unknown_keeps_its_prior_variance():
 
 
 UNKNOWNS = {
-    "log": lp.Scalar(0.4, 0.2, transform="log"),
-    "logit": lp.Scalar(0.4, 0.2, bounds=(0.1, 0.9), transform="logit"),
+    "log": lp.LogNormal(0.4, 0.2),
+    "logit": lp.LogitNormal(0.4, 0.2, bounds=(0.1, 0.9)),
     "layers": lp.Piecewise(
-        {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}, 0.4, 0.2, transform="log"
+        {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}, lp.LogNormal(0.4, 0.2)
     ),
-    "field": lp.Field(mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.2, transform="log"),
-    "periodic": lp.Scalar(0.4, 0.1, evolution=lp.fem.Periodic(5.0, 2)),
+    "field": lp.Field(mesh, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.4, std=0.2)),
+    "periodic": lp.Scalar(lp.Normal(0.4, 0.1), evolution=lp.fem.Periodic(5.0, 2)),
     "periodic field": lp.Field(
-        mesh, ElementLineP1(), inner="H1", prior=0.4, std=0.1, evolution=lp.fem.Periodic(5.0)
+        mesh,
+        ElementLineP1(),
+        inner="H1",
+        prior=lp.Normal(0.4, std=0.1),
+        evolution=lp.fem.Periodic(5.0),
     ),
-    "walk": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(0.1)),
+    "walk": lp.Scalar(lp.Normal(0.4, 0.2), evolution=lp.RandomWalk(0.1)),
     "own": lp.Piecewise(
         {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5},
-        0.4,
-        0.2,
-        own={"r": lp.Scalar(0.3, 0.1, transform="log", evolution=lp.MeanReverting(3.0))},
+        lp.Normal(0.4, 0.2),
+        own={"r": lp.Scalar(lp.LogNormal(0.3, 0.1), evolution=lp.MeanReverting(3.0))},
     ),
 }
 
@@ -110,8 +113,8 @@ def test_models_in_latent_coefficients_pass_the_checks(name: str):
 @given(st.floats(0.2, 3.0), st.floats(0.2, 3.0), st.integers(0, 100))
 def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int):
     unknowns = {
-        "k": lp.Scalar(k, 0.3 * k, transform="log"),
-        "S": lp.Scalar(s, 0.3 * s, transform="log"),
+        "k": lp.LogNormal(k, 0.3 * k),
+        "S": lp.LogNormal(s, 0.3 * s),
     }
 
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
@@ -124,7 +127,7 @@ def test_residuals_nonlinear_in_q_pass_the_checks(k: float, s: float, seed: int)
 
 def test_latent_coefficients_round_trip_and_report_what_is_outside():
     names = {name.replace(" ", "_"): item for name, item in UNKNOWNS.items()}
-    space = FunctionSpace.of({**names, "n": lp.Scalars(("x", "y"), 0.1)}, "q")
+    space = FunctionSpace.of({**names, "n": lp.Scalars(("x", "y"), lp.Normal(0.1))}, "q")
     latent = Latent(space)
     q = space.prior
     np.testing.assert_allclose(latent.value(latent.inverse(q)), q, atol=1e-14)
@@ -134,32 +137,48 @@ def test_latent_coefficients_round_trip_and_report_what_is_outside():
     np.testing.assert_array_equal(space.interpolate(given)[-4:], [0.1, 0.7, 0.5, 0.5])
     q = q.copy()
     q[0] = -1.0
-    with pytest.raises(SpaceError, match="'log': a value lies outside"):
+    with pytest.raises(
+        SpaceError, match=r"'log': a value is not strictly inside of the bounds \(0.0, inf\)"
+    ):
         latent.inverse(q)
 
 
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: lp.Scalar(0.0, 1.0, transform="log"), "not inside of what"),
-        (lambda: lp.Scalar(1.0, 1.0, transform="sqrt"), "expected 'log' or 'logit'"),
-        (lambda: lp.Scalar(1.0, 1.0, transform="logit"), "two finite bounds"),
-        (lambda: lp.Scalar(1.0, 1.0, (0, 2), transform="log"), "no upper bound"),
-        (lambda: lp.Scalar(1.0, evolution="random-walk"), "expected RandomWalk"),
-        (lambda: lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Scalar()}), "by a penalty"),
-        (lambda: lp.Scalars(("a", "a")), "names must be given and differ"),
-        (lambda: lp.Scalars(()), "names must be given and differ"),
+        (lambda: lp.LogNormal(0.0, 1.0), r"median 0.0 needs .* strictly inside of \(0.0, inf\)"),
+        (lambda: lp.LogNormal(-1.0, 1.0), r"median -1.0 lies outside of its bounds \(0.0, inf\)"),
+        (lambda: lp.LogNormal(1.0, 1.0, bounds=(0, 2)), "with an upper one take LogitNormal"),
+        (lambda: lp.LogNormal(1.0, 1.0, bounds=(-np.inf, np.inf)), "with a finite lower one"),
+        (lambda: lp.LogitNormal(1.0, 1.0, bounds=(0, np.inf)), "two finite bounds"),
+        (lambda: lp.LogitNormal(1.0, 1.0, bounds=(0, 1)), r"strictly inside of \(0, 1\)"),
+        (lambda: lp.Normal(np.nan), r"mean nan lies outside of its bounds"),
+        (lambda: lp.Normal(np.inf), r"mean inf needs to be finite"),
+        (lambda: lp.Normal(1.0, 0.0), "Normal: std must be a positive number; got 0.0"),
+        (lambda: lp.Scalar(0.5), r"Scalar: prior=0.5; write Normal\(0.5, std\), or LogNormal"),
+        (
+            lambda: lp.Field(mesh, ElementLineP1(), prior="x"),
+            r"Field: prior='x'; write Normal\(mean",
+        ),
+        (lambda: rod({"a": 0.5}), r"got 0.5 as an unknown; write Normal\(0.5, std\), or"),
+        (lambda: lp.Scalar(lp.Normal(1.0), evolution="random-walk"), "expected RandomWalk"),
+        (lambda: lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Normal()}), "by a penalty"),
+        (lambda: lp.Scalars(("a", "a"), lp.Normal()), "names must be given and differ"),
+        (lambda: lp.Scalars((), lp.Normal()), "names must be given and differ"),
         (lambda: lp.RandomWalk(0.0), "rate must be a positive number"),
         (lambda: lp.MeanReverting(-1.0), "time must be a positive number"),
         (lambda: lp.fem.Periodic(1.0, 0), "harmonics must be at least 1"),
-        (lambda: lp.Field(mesh, ElementLineP1(), bounds=(0, 1)), "bounds need transform"),
         (
-            lambda: lp.Field(mesh, ElementLineHermite(), prior=1.0, transform="log"),
+            lambda: lp.Field(mesh, ElementLineP1(), prior=lp.Normal(bounds=(0, 1))),
+            "bounds need a LogNormal or LogitNormal",
+        ),
+        (
+            lambda: lp.Field(mesh, ElementLineHermite(), prior=lp.LogNormal(1.0, std=1.0)),
             "element of first order",
         ),
         (
-            lambda: lp.Scalar(1.0, 1.0, transform="log", evolution=lp.fem.Periodic(1.0)),
-            "together with Periodic",
+            lambda: lp.Scalar(lp.LogNormal(1.0, 1.0), evolution=lp.fem.Periodic(1.0)),
+            "Periodic needs a prior without bounds and transform",
         ),
     ],
 )
@@ -168,10 +187,45 @@ def test_priors_that_cannot_be_meant_are_one_sentence(build: Any, words: str):
         build()
 
 
+@pytest.mark.parametrize(
+    ("prior", "mean", "std", "bounds"),
+    [
+        (lp.Normal(2.0, 0.5, bounds=(0.0, 3.0)), 2.0, 0.5, (0.0, 3.0)),
+        (lp.LogNormal(2.0, 0.5), np.log(2.0), 0.25, (-np.inf, np.inf)),
+        (lp.LogNormal(2.0, 0.5, bounds=(1.0, np.inf)), 0.0, 0.5, (-np.inf, np.inf)),
+        (lp.LogitNormal(0.5, 0.1, bounds=(0.0, 1.0)), 0.0, 0.4, (-np.inf, np.inf)),
+    ],
+)
+def test_priors_are_gaussian_in_their_latent_values(prior: Any, mean: Any, std: Any, bounds: Any):
+    assert (prior.latent_mean, prior.latent_std) == pytest.approx((mean, std))
+    assert prior.latent_bounds == bounds
+    assert prior.transform.value(np.array(prior.latent_mean)) == pytest.approx(prior.centre)
+
+
+@pytest.mark.parametrize(
+    "prior", [lp.Normal(0.5, 0.2), lp.LogNormal(0.5, 0.2), lp.LogitNormal(0.5, 0.2, (0.1, 0.9))]
+)
+def test_a_prior_alone_is_one_number(prior: Any):
+    samples = data(lambda t: 0.3, np.linspace(0.0, 1.0, 11))
+    both = [{"a": prior}, {"a": lp.Scalar(prior)}]
+    alone, scalar = (estimates(rod(a), lp.SensitivityLaw(), samples)[-1] for a in both)
+    np.testing.assert_array_equal(alone.q, scalar.q)
+    np.testing.assert_array_equal(alone.q_std, scalar.q_std)
+    assert alone["a"].interval() == scalar["a"].interval()
+    assert FunctionSpace.of(prior, "q").prior == [0.5]
+
+
+def test_a_prior_alone_holds_for_a_region():
+    own = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), unit="m", own={"r": lp.LogNormal(0.3, 0.1)})
+    left, right = own.separated("a").values()
+    assert (left.prior, right.prior) == (lp.Normal(0.4, 0.1), lp.LogNormal(0.3, 0.1))
+    assert (left.unit, right.unit) == ("m", "m")
+
+
 def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)
     samples = data(lambda t: 0.05, times)
-    model = rod({"a": lp.Scalar(1.0, 1.0, transform="log")})
+    model = rod({"a": lp.LogNormal(1.0, 1.0)})
     found = estimates(model, lp.SensitivityLaw(replay=lp.Replay(first=8)), samples)
     values = [estimate.parameters["a"][0] for estimate in found]
     assert min(values) > 0.0
@@ -182,13 +236,13 @@ def test_positive_unknowns_are_found_and_stay_positive():
 
 @pytest.mark.slow
 def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
-    model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(2.0, 1.0)}, A=None)
+    model = rod({"a": UNKNOWNS["field"], "c": lp.Normal(2.0, 1.0)}, A=None)
     assert model.latent.dim == 22
 
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
         return (q.a + 0.1 * q.c**2) * lp.dot(lp.grad(u), lp.grad(v))
 
-    model = rod({"a": UNKNOWNS["field"], "c": lp.Scalar(1.0, 0.01)}, A)
+    model = rod({"a": UNKNOWNS["field"], "c": lp.Normal(1.0, 0.01)}, A)
     full = lp.Full()
     law = lp.GradientLaw(gain=100.0, damping=lp.laws.ResidualDamping(10.0))
     identifier = lp.Identifier(model, full, law)
@@ -226,8 +280,8 @@ def test_a_periodic_unknown_is_followed_without_delay():
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
     samples = data(a, np.arange(0.0, 30.0, 0.05))
-    periodic = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.fem.Periodic(10.0))})
-    walking = rod({"a": lp.Scalar(0.2, 0.2, evolution=lp.RandomWalk(0.1))})
+    periodic = rod({"a": lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0))})
+    walking = rod({"a": lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.RandomWalk(0.1))})
     error, deviations = rms(estimates(periodic, BARE, samples), a, 10.0)
     slower, _ = rms(estimates(walking, BARE, samples), a, 10.0)
     assert error < 0.004
@@ -241,7 +295,7 @@ def test_a_random_walk_is_followed_with_an_honest_deviation():
     rng = np.random.default_rng(3)
     walk = 0.4 + rate * np.sqrt(0.05) * np.cumsum(rng.standard_normal(len(times)))
     samples = data(lambda t: float(np.interp(t, times, walk)), times)
-    model = rod({"a": lp.Scalar(0.4, 0.2, evolution=lp.RandomWalk(rate))})
+    model = rod({"a": lp.Scalar(lp.Normal(0.4, 0.2), evolution=lp.RandomWalk(rate))})
     found = estimates(model, BARE, samples)
     error, deviations = rms(found, lambda t: float(np.interp(t, times, walk)), 5.0)
     assert 0.7 < deviations < 1.3
@@ -255,10 +309,10 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
 
     errors = {}
     for name, evolution in (("periodic", lp.fem.Periodic(10.0)), ("constant", CONSTANT)):
-        model = rod({"a": lp.Scalar(0.2, 0.2, evolution=evolution)})
+        model = rod({"a": lp.Scalar(lp.Normal(0.2, 0.2), evolution=evolution)})
         law = lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(10.0))
         identifier = lp.Identifier(model, lp.Full(), law)
-        forward, u = ForwardStage(rod({"a": lp.Scalar(0.3)})), model.initial(0.0)
+        forward, u = ForwardStage(rod({"a": lp.Normal(0.3)})), model.initial(0.0)
         times, found = np.arange(0.0, 40.0, 0.05), []
         for t0, t1 in itertools.pairwise(times):
             u = forward.solve(u, np.array([a(t1)]), t1 - t0, lp.fem.Moment(t1))
@@ -273,9 +327,9 @@ def test_an_unknown_initial_state_is_found_with_the_diffusivity():
         mesh,
         ElementLineP1(),
         inner=lambda u, v, x: 2.5 * u * v + 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
-        std=0.7,
+        prior=lp.Normal(std=0.7),
     )
-    model = rod({"a": lp.Scalar(0.2, 0.1), "u0": start}, initial=lambda q, v, x: q.u0 * v)
+    model = rod({"a": lp.Normal(0.2, 0.1), "u0": start}, initial=lambda q, v, x: q.u0 * v)
     truth = model.initial_parameter({"a": 0.1, "u0": lambda x: np.sin(np.pi * x[0])})
     forward, rng = ForwardStage(model), np.random.default_rng(0)
     u = model.initial_state(truth)
@@ -294,7 +348,7 @@ def test_an_unknown_initial_state_is_found_with_the_diffusivity():
 
 
 def test_an_initial_state_is_given_once():
-    model = rod({"a": lp.Scalar(0.2)}, initial=lambda q, v, x: q.a * v)
+    model = rod({"a": lp.Normal(0.2)}, initial=lambda q, v, x: q.a * v)
     with pytest.raises(ConfigurationError, match="leave out u0"):
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=1.0)
 
@@ -305,7 +359,7 @@ def test_the_gate_refuses_outliers_and_believes_what_lasts():
     samples = data(lambda t: 0.3, times)
     for k in (50, 80, 81, 110):
         samples[k][1][1] += 1.0
-    model = rod({"a": lp.Scalar(0.2, 0.2)})
+    model = rod({"a": lp.Normal(0.2, 0.2)})
     open_gate = lp.SensitivityLaw(gate=np.inf)
     plain = estimates(model, open_gate, samples)[-1].parameters["a"][0]
     found = estimates(model, lp.SensitivityLaw(gate=5.0), samples)
@@ -331,23 +385,23 @@ def test_gates_that_cannot_be_meant_are_one_sentence(options: Any, words: str):
 
 
 def test_a_factor_too_narrow_for_its_unknowns_is_refused():
-    model = rod({"a": lp.Scalar(0.2), "b": lp.Scalar(0.2)})
+    model = rod({"a": lp.Normal(0.2), "b": lp.Normal(0.2)})
     with pytest.raises(LawError, match="rank must be at least the 2"):
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(rank=1))
 
 
 def test_a_model_takes_more_unknowns_for_its_sensors():
-    model = rod({"a": lp.Scalar(0.2)}, inputs=["Q"], initial=lambda q, v, x: q.a * v)
-    more = model.with_unknowns({"offset": lp.Scalars(("A", "B"), 0.0, 0.3)})
+    model = rod({"a": lp.Normal(0.2)}, inputs=["Q"], initial=lambda q, v, x: q.a * v)
+    more = model.with_unknowns({"offset": lp.Scalars(("A", "B"), lp.Normal(0.0, 0.3))})
     assert list(more.parameter_space.labels) == ["a", "offset[A]", "offset[B]"]
     assert more.channels == ("Q",)
     np.testing.assert_array_equal(
         more.initial_state(more.initial_parameter()), model.initial_state(np.array([0.2]))
     )
     with pytest.raises(lp.errors.ModelError, match="'a' is taken"):
-        model.with_unknowns({"a": lp.Scalar()})
+        model.with_unknowns({"a": lp.Normal()})
     with pytest.raises(lp.errors.ModelError, match="has no name"):
-        rod(lp.Scalar(), lambda q, u, v, x: q * u * v).with_unknowns({"b": lp.Scalar()})
+        rod(lp.Normal(), lambda q, u, v, x: q * u * v).with_unknowns({"b": lp.Normal()})
 
 
 @pytest.mark.parametrize(
@@ -363,12 +417,12 @@ def test_functions_with_kinks_have_their_derivatives(kink: Any):
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
         return (q.a**2 + lp.fem.absolute(q.a - 3.0)) * kink(u) * v
 
-    check_model(rod({"a": lp.Scalar(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
+    check_model(rod({"a": lp.Normal(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
 
 
 def test_a_first_sample_at_the_start_says_what_is_unknown_there():
     model = rod(
-        {"u0": lp.Scalar(1.0, 1.0)},
+        {"u0": lp.Normal(1.0, 1.0)},
         lambda q, u, v, x: 0.1 * u * v + 0.0 * q.u0 * v,
         initial=lambda q, v, x: q.u0 * v,
     )
@@ -391,7 +445,7 @@ HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
 
 
 def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
-    common = {"prior": 0.5, "std": 0.2, "transform": "log", "evolution": lp.RandomWalk(0.01)}
+    common = {"prior": lp.LogNormal(0.5, 0.2), "evolution": lp.RandomWalk(0.01)}
     both = [lp.Piecewise(HALVES, **common, own=own) for own in ({}, {"r": lp.Scalar(**common)})]
     samples = data(lambda t: 0.3, np.linspace(0.0, 2.0, 21))
     plain, own = (estimates(rod({"a": a}), lp.SensitivityLaw(), samples)[-1] for a in both)
@@ -401,8 +455,8 @@ def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
 
 
 def test_a_region_moves_and_another_does_not():
-    walk = lp.Scalar(0.5, 0.3, evolution=lp.RandomWalk(0.2))
-    a = lp.Piecewise(HALVES, 0.4, 0.1, own={"r": walk})
+    walk = lp.Scalar(lp.Normal(0.5, 0.3), evolution=lp.RandomWalk(0.2))
+    a = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), own={"r": walk})
     model = rod({"a": a})
     before = estimates(model, lp.SensitivityLaw(), data(lambda t: 0.3, np.linspace(0.0, 0.5, 6)))[0]
     assert before.q_std == pytest.approx([0.1, 0.3])
@@ -416,7 +470,7 @@ def test_a_region_moves_and_another_does_not():
 
 
 def test_jumps_of_a_region_or_of_all():
-    a = lp.Piecewise(HALVES, 0.4, 0.1, own={"r": lp.Scalar(0.5, 0.3)})
+    a = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), own={"r": lp.Normal(0.5, 0.3)})
     identifier = lp.Identifier(rod({"a": a}), lp.Points(SENSORS), lp.SensitivityLaw(noise=NOISE))
     reduction = Reduction.of(identifier.problem, "auto")
     assert reduction.stay == [("a[l]", 0), ("a[r]", 1)]
@@ -427,9 +481,12 @@ def test_jumps_of_a_region_or_of_all():
 @pytest.mark.parametrize(
     ("build", "words"),
     [
-        (lambda: lp.Piecewise(HALVES, own={"c": lp.Scalar()}), "the name of a region, one of"),
-        (lambda: lp.Piecewise(HALVES, own={"l": 2.0}), "and a Scalar"),
-        (lambda: rod(lp.Piecewise(HALVES, own={"l": lp.Scalar()})), "needs a name"),
+        (
+            lambda: lp.Piecewise(HALVES, lp.Normal(), own={"c": lp.Normal()}),
+            "the name of a region, one of",
+        ),
+        (lambda: lp.Piecewise(HALVES, lp.Normal(), own={"l": 2.0}), "and a prior or a Scalar"),
+        (lambda: rod(lp.Piecewise(HALVES, lp.Normal(), own={"l": lp.Normal()})), "needs a name"),
     ],
 )
 def test_priors_of_regions_that_are_refused(build: Any, words: str):

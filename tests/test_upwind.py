@@ -22,7 +22,7 @@ def test_exact_at_the_vertices_of_a_boundary_layer(kappa, b):
     mesh = lp.interval(0.0, 1.0, 10)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1(), dirichlet={"left": 0.0, "right": 1.0}),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: (
             (kappa + upwind(b, kappa, x.h)) * lp.dot(lp.grad(u), lp.grad(v)) + b * lp.grad(u)[0] * v
@@ -63,7 +63,7 @@ def test_no_wiggles_in_the_plane():
     b, kappa = (1.0, 0.0), 1e-4
     model = lp.Model(
         lp.Field(mesh, ElementQuad1(), dirichlet={"left": 0.0, "right": 1.0}),
-        lp.Scalar(),
+        lp.Normal(),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: (
             kappa * lp.dot(lp.grad(u), lp.grad(v))

@@ -26,7 +26,7 @@ def stress(q: Any, u: Any, v: Any, x: Any) -> Any:
 
 def elastic(dirichlet: Any, element: Any = ELEMENTS["Q1"]) -> lp.Model:
     return lp.Model(
-        lp.Field(MESH, element, dirichlet=dirichlet), {"mu": lp.Scalar(1.0, 0.5)}, stress
+        lp.Field(MESH, element, dirichlet=dirichlet), {"mu": lp.Normal(1.0, 0.5)}, stress
     )
 
 
@@ -128,13 +128,13 @@ def test_a_wrong_number_of_components_is_one_sentence(value: Any, message: str):
 def test_fields_without_components_say_so():
     scalar = lp.Field(MESH, ElementQuad1(), dirichlet={"left": (1.0, 2.0)})
     with pytest.raises(lp.errors.SpaceError, match=r"a value for each component, .* no vector"):
-        lp.Model(scalar, lp.Scalar(), lambda q, u, v, x: q * u * v)
+        lp.Model(scalar, lp.Normal(), lambda q, u, v, x: q * u * v)
     mesh = MeshTri().refined(1)
     normal = lp.Field(mesh, ElementTriRT1(), dirichlet={"boundary": lambda x, t: (1.0, x[1])})
     with pytest.raises(lp.errors.SpaceError, match="the field has no components: give a number"):
-        lp.Model(normal, lp.Scalar(), lambda q, u, v, x: q * lp.dot(u, v))
+        lp.Model(normal, lp.Normal(), lambda q, u, v, x: q * lp.dot(u, v))
 
 
 def test_an_unknown_component_is_refused():
     with pytest.raises(lp.errors.SpaceError, match="the value on 'left' is unknown"):
-        elastic({"left": (0.0, lp.Scalar())})
+        elastic({"left": (0.0, lp.Normal())})

@@ -26,7 +26,7 @@ def rod(loss: float = 0.0) -> lp.Model:
     mesh = lp.interval(0.0, 1.0, 24)
     return lp.Model(
         lp.Field(mesh, lp.linear(mesh), dirichlet=ENDS),
-        {"k": lp.Scalar(0.1, std=0.03, transform="log")},
+        {"k": lp.LogNormal(0.1, std=0.03)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         B=lambda u, v, x: loss * u * v,
     )
@@ -235,7 +235,7 @@ def test_directions_move_the_estimate_by_what_they_say():
     def estimated(offset: float) -> tuple[lp.Identifier, lp.Estimate]:
         model = lp.Model(
             lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-            {"s": lp.Scalar(0.0, std=1.0)},
+            {"s": lp.Normal(0.0, std=1.0)},
             A=lambda q, u, v, x: -q.s * v,
             B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
         )

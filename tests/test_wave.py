@@ -24,7 +24,7 @@ def energy(model, u, c2=1.0):
 
 
 def test_a_standing_wave_has_its_period():
-    model = wave(STRING, lp.Scalar(4.0), dirichlet=FIXED, element=ElementLineP2())
+    model = wave(STRING, lp.Normal(4.0), dirichlet=FIXED, element=ElementLineP2())
     start = {"w": lambda x: np.sin(np.pi * x[0])}
     run = simulate(model, np.array([4.0]), start, [0.0, 0.25, 1.0], Advance(Alexander2(), 0.01))
     first, quarter, last = (u for _, u in run)
@@ -35,7 +35,7 @@ def test_a_standing_wave_has_its_period():
 
 @pytest.mark.parametrize("d", [0.0, 0.8])
 def test_the_energy_decays_only_by_damping(d):
-    model = wave(STRING, lp.Scalar(1.0), d, FIXED)
+    model = wave(STRING, lp.Normal(1.0), d, FIXED)
     start = {"w": lambda x: np.sin(np.pi * x[0])}
     run = simulate(model, np.ones(1), start, np.linspace(0, 2, 21), Advance(Alexander2(), 0.01))
     energies = np.array([energy(model, u) for _, u in run])
@@ -54,22 +54,22 @@ def test_the_energy_decays_only_by_damping(d):
 def test_a_moving_end_needs_its_velocity():
     moving = {"left": lambda x, t: np.sin(t)}
     with pytest.raises(lp.errors.ModelError, match="give its time derivative"):
-        wave(STRING, lp.Scalar(1.0), dirichlet=moving)
+        wave(STRING, lp.Normal(1.0), dirichlet=moving)
     speed = {"left": lambda x, t: np.cos(t)}
-    model = wave(STRING, lp.Scalar(1.0), dirichlet=moving, velocity=speed)
+    model = wave(STRING, lp.Normal(1.0), dirichlet=moving, velocity=speed)
     u0 = {"p": lambda x: np.exp(-((x[0] / 0.1) ** 2))}
     *_, (_, u) = simulate(model, np.ones(1), u0, [0.0, 0.5], Advance(Alexander2(), 0.01))
     assert model.state_space.probe(np.array([[0.0]]), of="w") @ u == pytest.approx(np.sin(0.5))
 
 
 def test_shipped_checks():
-    model = wave(STRING, lp.Scalar(1.0, 0.5), lp.Scalar(0.2, 0.1), FIXED, f=lambda x, t: x[0])
+    model = wave(STRING, lp.Normal(1.0, 0.5), lp.Normal(0.2, 0.1), FIXED, f=lambda x, t: x[0])
     lp.diagnostics.check_model(model).raise_if_failed()
     assert list(model.parameter_space.labels) == ["c2", "d"]
 
 
 def test_speed_and_damping_from_two_points():
-    model = wave(STRING, lp.Scalar(1.3, 0.3), lp.Scalar(0.2, 0.3), FIXED)
+    model = wave(STRING, lp.Normal(1.3, 0.3), lp.Normal(0.2, 0.3), FIXED)
     sensors = lp.Points([0.45, 0.8], of="w", noise=0.01)
     twin = Twin(
         model=model,
@@ -90,7 +90,7 @@ def test_speed_and_damping_from_two_points():
 
 
 def test_the_speed_as_a_field():
-    field = lp.Field(STRING, ElementLineP1(), inner="H1", prior=1.0, std=0.3)
+    field = lp.Field(STRING, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=0.3))
     model = wave(STRING, field, 0.1, FIXED)
     sensors = lp.Points([0.2, 0.4, 0.6, 0.8], of="w", noise=0.005)
     exact = lambda x: 1.0 + 0.3 * np.sin(2 * np.pi * x[0])  # noqa: E731

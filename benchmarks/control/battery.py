@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.control.problem import Problem, Simulated
 from livepde.control import Goal, Trust, reduce
-from livepde.fem import On, RandomWalk, Scalar, line
+from livepde.fem import LogNormal, On, RandomWalk, Scalar, line
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.model import Model
@@ -53,7 +53,7 @@ def process(cells: int) -> Model:
     inward = np.linspace(1.0, 0.0, cells + 1)
     mesh = line((RADIUS * (1.0 - inward**2)).tolist())
     walk = RandomWalk(DRIFT)
-    unknown = Scalar(D, SPREAD * D, bounds=(0.0, np.inf), transform="log", evolution=walk)
+    unknown = Scalar(LogNormal(D, SPREAD * D), evolution=walk)
     return battery_particle(mesh, unknown, area=AREA, c_max=FULL)
 
 

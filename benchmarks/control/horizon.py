@@ -14,6 +14,7 @@ from benchmarks.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
 from livepde.control import Known, ReducedModel
 from livepde.control.mpc import packages, quiet
+from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed
 from livepde.result import unknown_of
@@ -162,7 +163,7 @@ class MovingHorizon:
         for k, (label, prior, std) in enumerate(
             zip(model.unknowns, model.prior, model.std, strict=True)
         ):
-            positive = unknown_of(space, label).transform == "log"
+            positive = isinstance(unknown_of(space, label).prior, LogNormal)
             found.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
         return found
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.control.problem import Problem, Simulated
 from livepde.control import Goal, reduce
-from livepde.fem import Field, On, Scalar, dot, grad, interval, linear
+from livepde.fem import Field, LogNormal, On, Scalar, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
@@ -28,7 +28,7 @@ LENGTH = 0.15  # m
 CAPACITY = 3.6e6  # J/(m^3 K): steel
 LOSS = 2000.0  # W/(m^3 K): 10 W/(m^2 K) around a rod of 20 mm
 POWER = 60e3  # W/m^2 of the heater
-CONDUCTIVITY = Scalar(20.0, std=10.0, transform="log", bounds=(0.0, np.inf), unit="W/(m K)")
+CONDUCTIVITY = Scalar(LogNormal(20.0, std=10.0), unit="W/(m K)")
 BEFORE, AFTER, JUMP = 26.0, 12.0, 9000.0  # W/(m K), W/(m K), s
 SENSORS = {"T_5": 0.05, "T_10": 0.10}
 NOISE = 0.2  # K

@@ -28,7 +28,7 @@ import numpy as np
 from benchmarks.control.problem import Problem, Simulated
 from livepde.control import Goal, Trust, reduce
 from livepde.errors import ConfigurationError
-from livepde.fem import Field, On, Piecewise, dot, grad, line, linear
+from livepde.fem import Field, LogNormal, On, Piecewise, dot, grad, line, linear
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
@@ -83,11 +83,7 @@ def process(fine: int = 1) -> Model:
 
     mesh = line(nodes).with_subdomains({"room": lambda x: x[0] < DEEP})
     share = Piecewise(
-        {name: partial(inside, name=name) for name in WALL},
-        prior=1.0,
-        std=SPREAD,
-        bounds=(0.0, np.inf),
-        transform="log",
+        {name: partial(inside, name=name) for name in WALL}, LogNormal(1.0, std=SPREAD)
     )
     return Model(
         Field(mesh, linear(mesh), unit="degC"),

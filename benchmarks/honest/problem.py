@@ -162,7 +162,7 @@ class Problem(ABC):
         """
         model, direct = self.model(), dict(self.direct)
         if freed is not None:
-            model = model.with_unknowns({"offset": lp.Scalar(0.0, std=2.0 * self.noise)})
+            model = model.with_unknowns({"offset": lp.Normal(0.0, std=2.0 * self.noise)})
             seen = direct.get(freed)
             direct[freed] = lambda q, x: q.offset + (seen(q, x) if seen is not None else 0.0)
         sensors = lp.Points(dict(self.points), noise=self.noise, direct=direct)

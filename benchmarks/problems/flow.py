@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.problems.data import Problem, Process
-from livepde.fem import Field, RandomWalk, Scalar, dot, grad, hermite, interval
+from livepde.fem import Field, LogNormal, Normal, RandomWalk, Scalar, dot, grad, hermite, interval
 from livepde.model import Model
 from livepde.models import burgers
 from livepde.observation import Points
@@ -31,7 +31,7 @@ def _u0(x: Any) -> Any:
 
 @cache
 def _process(seed: int) -> Process:
-    nu = Scalar(0.1, 0.05, transform="log", evolution=RandomWalk(RATE))
+    nu = Scalar(LogNormal(0.1, 0.05), evolution=RandomWalk(RATE))
     model = burgers(interval(0.0, 1.0, 32), nu, dirichlet=SIDES)
     rng = np.random.default_rng([seed, 0])
     gained = RATE * np.sqrt(np.diff(TIMES, prepend=TIMES[0]))
@@ -40,7 +40,7 @@ def _process(seed: int) -> Process:
     mesh = interval(0.0, 1.0, 96)
     fine = Model(
         Field(mesh, hermite(mesh), dirichlet=SIDES),
-        {"a": Scalar(1.0, 1.0)},
+        {"a": Normal(1.0, 1.0)},
         A=lambda q, u, v, x: q.a * u * grad(u)[0] * v + x.inputs["nu"] * dot(grad(u), grad(v)),
         inputs=["nu"],
     )

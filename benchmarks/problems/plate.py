@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.problems.data import Problem, Process
-from livepde.fem import Field, Sobolev, dot, grad, linear, rectangle
+from livepde.fem import Field, LogNormal, Sobolev, dot, grad, linear, rectangle
 from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
@@ -30,7 +30,7 @@ def _model(cells: int) -> Model:
         "bottom": lambda x, t: np.sin(1.1 * t) * (1 - x[0]),
         "top": lambda x, t: np.sin(1.1 * t) * (1 - x[0]) + np.sin(0.7 * t) * x[0],
     }
-    a = Field(mesh, linear(mesh), inner=Sobolev(2.0, 0.3), prior=0.1, std=STD, transform="log")
+    a = Field(mesh, linear(mesh), inner=Sobolev(2.0, 0.3), prior=LogNormal(0.1, std=STD))
     return Model(
         Field(mesh, linear(mesh), dirichlet=sides),
         {"a": a},

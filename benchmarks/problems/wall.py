@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.problems.data import Problem, Process
-from livepde.fem import Field, On, Scalar, Scalars, grad, interval, linear
+from livepde.fem import Field, LogNormal, Normal, On, Scalars, grad, interval, linear
 from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
@@ -65,8 +65,8 @@ def _model() -> Model:
     return Model(
         Field(mesh, linear(mesh), unit="degC"),
         {
-            "k": Scalars(list(LAYERS), 0.6, 0.3, unit="W/(m K)", transform="log"),
-            "C": Scalars(list(LAYERS), 350.0, 140.0, unit="W h/(m^3 K)", transform="log"),
+            "k": Scalars(list(LAYERS), LogNormal(0.6, 0.3), unit="W/(m K)"),
+            "C": Scalars(list(LAYERS), LogNormal(350.0, 140.0), unit="W h/(m^3 K)"),
         },
         A=[
             conduct,
@@ -89,7 +89,7 @@ def _truth(k: dict[str, float], C: dict[str, float]) -> Model:
     mesh = interval(0.0, 0.3, 240)
     return Model(
         Field(mesh, linear(mesh)),
-        {"a": Scalar(1.0, 1.0)},
+        {"a": Normal(1.0, 1.0)},
         A=[
             lambda q, u, v, x: q.a * _mixed(k, x)[0] * grad(u)[0] * grad(v)[0],
             On("left", lambda q, u, v, x: q.a * FILM["left"] * (u - x.inputs["inside"]) * v),

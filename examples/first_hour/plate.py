@@ -7,10 +7,9 @@ from livepde.models import heat
 
 FOLDER = "examples/first_hour/"
 mesh = lp.read_mesh(FOLDER + "plate.msh")  # boundaries "heated" and "closed"
-prior = lp.Sobolev(2, 0.3).pointwise(2)  # a smooth field, correlated over about 0.3 m
-alpha = lp.Field(
-    mesh, lp.linear(mesh), inner=prior, prior=1e-4, std=4e-5, transform="log", unit="m^2/s"
-)
+smooth = lp.Sobolev(2, 0.3).pointwise(2)  # correlated over about 0.3 m
+prior = lp.LogNormal(1e-4, std=4e-5)  # at each point
+alpha = lp.Field(mesh, lp.linear(mesh), inner=smooth, prior=prior, unit="m^2/s")
 model = heat(mesh, alpha, {"heated": lp.Channel("T_hot")})
 
 places = pd.read_csv(FOLDER + "places.csv", index_col="name")

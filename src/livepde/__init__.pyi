@@ -24,7 +24,10 @@ from .errors import LivepdeError
 from .fem import (
     Channel,
     Field,
+    LogitNormal,
+    LogNormal,
     MeanReverting,
+    Normal,
     On,
     Piecewise,
     RandomWalk,
@@ -39,7 +42,7 @@ from .fem import (
     read_mesh,
     rectangle,
 )
-from .fleet import Fleet, Shard
+from .fleet import Fleet
 from .identifier import Identifier
 from .laws import AutoLaw, GradientLaw, Jumps, Replay, SensitivityLaw
 from .model import Model
@@ -66,8 +69,11 @@ __all__ = [
     "ImplicitEuler",
     "Jumps",
     "LivepdeError",
+    "LogNormal",
+    "LogitNormal",
     "MeanReverting",
     "Model",
+    "Normal",
     "On",
     "Piecewise",
     "Points",
@@ -78,7 +84,6 @@ __all__ = [
     "Scalar",
     "Scalars",
     "SensitivityLaw",
-    "Shard",
     "Sobolev",
     "Subdomain",
     "cases",

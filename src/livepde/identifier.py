@@ -502,7 +502,7 @@ class Identifier:
         --------
         >>> import livepde as lp
         >>> from livepde.models import heat
-        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Scalar(0.1, std=0.05))
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
         >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}), lp.GradientLaw(), u0=20.0)
         >>> rod.forecast([1.0, 2.0])["middle"].round(6)
         array([20., 20.])

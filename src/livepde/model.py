@@ -94,7 +94,8 @@ class Model:
         The field u, or a mapping of names to fields on one mesh, which forms see as u.c, v.c and so
         on; Dirichlet values may be numbers, functions g(x, t) or channels.
     parameter
-        The unknown: a `Field`, `Scalar` or `Piecewise`, or a mapping of names to those.
+        The unknown: a prior (`Normal`, `LogNormal`, `LogitNormal`: one number), a `Scalar`,
+        `Piecewise`, `Scalars` or `Field`, or a mapping of names to those.
     A
         Integrand (q, u, v, x), linear in v; for a mapping of unknowns `q.name`. Whether it is
         linear in q is found out; all of the residual may stand here.
@@ -364,7 +365,7 @@ class Model:
         """Space of the latent parameter; its Gram matrix is the inverse of the prior covariance."""
         parts = []
         for part in self.latent.parts.values():
-            unknown, size, variance = part.unknown, part.size, part.unknown.latent_std**2
+            unknown, size, variance = part.unknown, part.size, part.unknown.prior.latent_std**2
             if isinstance(unknown, Field):
                 space = self._field_space(unknown, part.block, variance)
             else:

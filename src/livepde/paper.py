@@ -35,7 +35,7 @@ def space(mesh: Any, **options: Any) -> Field:
         Mesh of an interval, or of quadrilaterals for Bogner-Fox-Schmit functions with the same
         conditions.
     options
-        Options of `Field`: inner, std, prior, name.
+        Options of `Field`: inner, prior, name.
     """
     return Field(mesh, smooth(mesh), dirichlet={"boundary": 0.0}, clamped=True, **options)
 

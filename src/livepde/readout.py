@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from livepde.fem import FunctionSpace
+from livepde.fem import FunctionSpace, Normal
 from livepde.laws import Belief
 from livepde.linalg import Array
 
@@ -78,14 +78,14 @@ class ScalarReadout:
 
 def _ends(unknown: Any) -> Ends:
     """Return the function from value and standard deviation to interval ends; () if symmetric."""
-    if unknown.symmetric:
+    if unknown.prior.symmetric:
         return lambda value, std: ()
-    if unknown.transform is not None:
+    if not isinstance(unknown.prior, Normal):
         return lambda value, std: tuple(map(float, unknown.interval(value, std, LEVEL)))
     from statistics import NormalDist
 
     quantile = NormalDist().inv_cdf(0.5 + 0.5 * LEVEL)
-    lower, upper = map(float, unknown.bounds)
+    lower, upper = map(float, unknown.prior.bounds)
 
     def clipped(value: float, std: float) -> tuple[float, float]:
         if not math.isfinite(value + quantile * std):

@@ -223,7 +223,7 @@ class Marginal:
         A number each; of a field arrays of coefficients. The standard deviation is NaN for a law
         without covariance.
     unknown
-        The unknown with its prior, transform and bounds.
+        The unknown with its prior.
     """
 
     mean: Any
@@ -233,8 +233,8 @@ class Marginal:
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the ends of the central interval that holds it with probability `level`.
 
-        Within its bounds, and not symmetric for an unknown with a transform. NaN for a law without
-        covariance.
+        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
+        without covariance.
         """
         low, high = self.unknown.interval(self.mean, self.std, level)
         return (float(low), float(high)) if isinstance(self.mean, float) else (low, high)
@@ -248,7 +248,7 @@ def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
     """Return findings on scalar unknowns that are hardly identified, or end at a bound."""
     for label, row in space.labels.items():
         unknown, value = unknown_of(space, label), float(belief.q[row])
-        lower, upper = map(float, unknown.bounds)
+        lower, upper = map(float, unknown.prior.bounds)
         if value in (lower, upper):
             yield at_bound(label, value)
         left = float(belief.left([row])[0])
@@ -478,7 +478,7 @@ def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[s
 
 def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
     """Return variables with the ends of 95 % intervals, if those are not mean +- 1.96 std."""
-    if unknown.symmetric:
+    if unknown.prior.symmetric:
         return {}
     low, high = unknown.interval(values, std)
     return {f"{name}_low": low, f"{name}_high": high}
@@ -498,10 +498,10 @@ def _correlation(estimate: Estimate) -> Array | None:
 
 def _prior(unknown: Any) -> dict[str, float]:
     """Return prior and finite bounds of a scalar unknown as attributes of its variable."""
-    bounds = zip(("lower_bound", "upper_bound"), unknown.bounds, strict=True)
+    bounds = zip(("lower_bound", "upper_bound"), unknown.prior.bounds, strict=True)
     found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
     if not unknown.evolution.moves:  # one that moves is never known better for good
-        found["prior_std"] = float(unknown.std)
+        found["prior_std"] = float(unknown.prior.std)
     return found
 
 

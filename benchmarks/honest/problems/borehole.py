@@ -49,8 +49,8 @@ class Borehole(Problem):
     def model(self, refine: int = 1) -> lp.Model:
         return borehole(
             lp.interval(WALL, FAR, 40 * refine, geometric=True),
-            lp.Scalar(2.0, std=0.6, transform="log"),
-            lp.Scalar(0.1, std=0.03, transform="log"),
+            lp.LogNormal(2.0, std=0.6),
+            lp.LogNormal(0.1, std=0.03),
             H=DEPTH,
             rho_c=RHO_C,
             T0=self.u0,

@@ -43,6 +43,6 @@ class Column(Problem):
         return system.respond(self.inputs(fine_times(self.times)), self.length / self.intervals)
 
     def model(self, refine: int = 1) -> lp.Model:
-        D = lp.Scalar(0.5, std=0.2, transform="log")
-        v = lp.Scalar(1.0, std=0.3, transform="log")
+        D = lp.LogNormal(0.5, std=0.2)
+        v = lp.LogNormal(1.0, std=0.3)
         return advection_dispersion(lp.interval(0.0, DEPTH, 50 * refine), D, v)

@@ -82,6 +82,6 @@ class Fisher(Problem):
         return self._solved(theta, True)[1]
 
     def model(self, refine: int = 1) -> lp.Model:
-        D = lp.Scalar(0.02, std=0.008, transform="log")
-        r = lp.Scalar(1.0, std=0.3, transform="log")
+        D = lp.LogNormal(0.02, std=0.008)
+        r = lp.LogNormal(1.0, std=0.3)
         return fisher_kpp(lp.interval(0.0, WIDTH, 50 * refine), D, r)

@@ -80,8 +80,8 @@ class _Drifting(Problem):
         return lp.Model(
             lp.Field(mesh, lp.linear(mesh), dirichlet={"right": lp.Channel("T_right")}),
             {
-                "k": lp.Scalar(0.1, std=0.03, transform="log"),
-                "J": lp.Scalar(PRIOR, std=STD, evolution=lp.RandomWalk(RATE)),
+                "k": lp.LogNormal(0.1, std=0.03),
+                "J": lp.Scalar(lp.Normal(PRIOR, std=STD), evolution=lp.RandomWalk(RATE)),
             },
             A=[
                 lambda q, u, v, x: q.k * (1.0 + growth * u) * lp.dot(lp.grad(u), lp.grad(v)),

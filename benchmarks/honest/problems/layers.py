@@ -71,7 +71,7 @@ class Wall(_Conduction):
         regions = {name: layer(n) for n, name in enumerate(NAMES)}
         return lp.Model(
             Rod.state(refine),
-            {"k": lp.Piecewise(regions, prior=0.1, std=0.04, transform="log")},
+            {"k": lp.Piecewise(regions, lp.LogNormal(0.1, std=0.04))},
             A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         )
 
@@ -118,7 +118,7 @@ class Profile(_Conduction):
         mesh = self.mesh(refine)
         prior = lp.Sobolev(2, self.LENGTH).pointwise(1)
         k = lp.Field(
-            mesh, lp.linear(mesh), inner=prior, prior=self.PRIOR, std=self.STD, transform="log"
+            mesh, lp.linear(mesh), inner=prior, prior=lp.LogNormal(self.PRIOR, std=self.STD)
         )
         ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
         return lp.Model(

@@ -77,9 +77,9 @@ class Plate(Problem):
         return lp.Model(
             lp.Field(mesh, lp.linear(mesh)),
             {
-                "kx": lp.Scalar(0.05, std=0.02, transform="log"),
-                "ky": lp.Scalar(0.05, std=0.02, transform="log"),
-                "loss": lp.Scalar(0.3, std=0.15, transform="log"),
+                "kx": lp.LogNormal(0.05, std=0.02),
+                "ky": lp.LogNormal(0.05, std=0.02),
+                "loss": lp.LogNormal(0.3, std=0.15),
             },
             A=lambda q, u, v, x: (
                 q.kx * lp.grad(u)[0] * lp.grad(v)[0]
@@ -164,7 +164,7 @@ class Reaction(Problem):
         mesh, D, shape = self.mesh(refine), self.D, self._shape
         prior = lp.Sobolev(2, self.LENGTH).pointwise(2)
         q = lp.Field(
-            mesh, lp.linear(mesh), inner=prior, prior=self.PRIOR, std=self.STD, transform="log"
+            mesh, lp.linear(mesh), inner=prior, prior=lp.LogNormal(self.PRIOR, std=self.STD)
         )
         return lp.Model(
             lp.Field(mesh, lp.linear(mesh)),

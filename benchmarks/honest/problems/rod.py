@@ -52,7 +52,7 @@ class Rod(Problem):
     def model(self, refine: int = 1) -> lp.Model:
         return lp.Model(
             self.state(refine),
-            {"k": lp.Scalar(0.1, std=0.03, transform="log")},
+            {"k": lp.LogNormal(0.1, std=0.03)},
             A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         )
 
@@ -85,9 +85,9 @@ class LossyRod(Rod):
         return lp.Model(
             self.state(refine),
             {
-                "k": lp.Scalar(0.1, std=0.03, transform="log"),
-                "loss": lp.Scalar(0.3, std=0.1, transform="log"),
-                "source": lp.Scalar(0.2, std=0.3),
+                "k": lp.LogNormal(0.1, std=0.03),
+                "loss": lp.LogNormal(0.3, std=0.1),
+                "source": lp.Normal(0.2, std=0.3),
             },
             A=lambda q, u, v, x: (
                 q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.loss * u * v - q.source * v

@@ -123,6 +123,6 @@ class WarmRod(Problem):
     def model(self, refine: int = 1) -> lp.Model:
         return lp.Model(
             Rod.state(refine),
-            {"k": lp.Scalar(0.1, std=0.03, transform="log"), "m": lp.Scalar(0.3, std=0.15)},
+            {"k": lp.LogNormal(0.1, std=0.03), "m": lp.Normal(0.3, std=0.15)},
             A=lambda q, u, v, x: q.k * (1.0 + q.m * u) * lp.dot(lp.grad(u), lp.grad(v)),
         )

@@ -13,7 +13,7 @@ from livepde.cases.limits import MEMBERS
 from livepde.cases.read import is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.errors import CaseError
-from livepde.fem import MeanReverting, Scalars, Unknown
+from livepde.fem import MeanReverting, Normal, Scalars, Unknown
 from livepde.observation import Calibrated, Observation
 from livepde.observation.placed import POSITION, shift_names
 
@@ -102,12 +102,12 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
     }
     if offsets:
         std = _common(frame, offsets, "offset")
-        found["offset"] = Scalars(tuple(offsets), 0.0, std, unit=_difference(unit))
+        found["offset"] = Scalars(tuple(offsets), Normal(0.0, std), unit=_difference(unit))
     gains = {
         name: item.gain for name, item in frame.roles("sensor").items() if item.gain is not None
     }
     if gains:
-        found["gain"] = Scalars(tuple(gains), 1.0, _common(frame, gains, "gain"))
+        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(frame, gains, "gain")))
     shifts = positions_of(frame, frame.roles("sensor"))
     if shifts:
         std = _common(frame, shifts, "at_std")
@@ -116,7 +116,7 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
             for name in shifts
             for shift in shift_names(name, _dimension(frame.spec.channels[name]))
         ]
-        found[POSITION] = Scalars(names, 0.0, std, unit=frame.equation.length_unit)
+        found[POSITION] = Scalars(names, Normal(0.0, std), unit=frame.equation.length_unit)
     errors = {}
     for name, item in frame.roles("sensor").items():
         if item.correlated is not None:
@@ -128,7 +128,7 @@ def unknowns_of(frame: Frame) -> dict[str, Unknown]:
         std, time = _common(frame, errors, "correlated")
         fades = MeanReverting(time)
         found["correlated"] = Scalars(
-            tuple(errors), 0.0, std, unit=_difference(unit), evolution=fades
+            tuple(errors), Normal(0.0, std), unit=_difference(unit), evolution=fades
         )
     return found
 

@@ -77,7 +77,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         )
     space = case.model.parameter_space
     if law.drift or any(
-        unknown.evolution.growth(1.0, unknown.latent_std).any()
+        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
         for unknown in space.unknowns.values()
     ):
         return _advise_moving(prepared, law, list(samples))

@@ -21,9 +21,13 @@ from livepde.fem import (
     Channel,
     Evolution,
     Field,
+    LogitNormal,
+    LogNormal,
     MeanReverting,
+    Normal,
     Periodic,
     Piecewise,
+    Prior,
     RandomWalk,
     Scalar,
     Sobolev,
@@ -135,7 +139,7 @@ def _inside(nodes: Array, edge: float) -> bool:
 
 
 def _built(frame: Frame, key: str, build: Callable[[], Any]) -> Any:
-    """Return the built mesh; an error names the key of the case."""
+    """Return what is built, a mesh or an unknown; an error names the key of the case."""
     try:
         return build()
     except SpaceError as error:
@@ -254,24 +258,33 @@ def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
 def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
     key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
-    prior_of = _prior(frame, spec, unit, key)
+    options = _options_of(frame, spec, unit, key)
     if spec.field:
-        return _built(frame, key, lambda: _field(frame, mesh, spec, name, prior_of))
+        return _built(frame, key, lambda: _field(frame, mesh, spec, name, options))
     if spec.regions is None:
-        return _built(frame, key, lambda: Scalar(**prior_of))
+        return _built(frame, key, lambda: Scalar(**options))
     places = {region: item.over for region, item in spec.regions.items()}
     regions = _regions(frame, mesh, places, f"{key}.regions")
     own = {}
     for region, item in spec.regions.items():
         if (there := spec.at(item)) is not None:
             where = f"{key}.regions.{region}"
-            given = _prior(frame, there, unit, where)
+            given = _options_of(frame, there, unit, where)
             own[region] = _built(frame, where, partial(Scalar, **given))
-    return _built(frame, key, lambda: Piecewise(regions, **prior_of, own=own))
+    return _built(frame, key, lambda: Piecewise(regions, **options, own=own))
 
 
-def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
-    """Return prior, bounds, transform and evolution in the model's unit."""
+def _options_of(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
+    """Return prior, evolution and within in the model's unit, and that unit."""
+    prior = _prior(frame, spec, unit, key)
+    options: dict[str, Any] = {"prior": prior, "unit": unit, "within": spec.within}
+    if spec.evolution is not None:
+        options["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
+    return options
+
+
+def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
+    """Return the prior in the model's unit."""
     rule = conversion(spec.unit or unit, unit, frame.where(f"{key}.unit"))
 
     def value(given: float | str, item: str) -> float:
@@ -297,11 +310,29 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, An
         if not low <= prior <= high:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
-    prior_of: dict[str, Any] = {"prior": prior, "std": std, "bounds": (low, high), "unit": unit}
-    prior_of |= {"transform": spec.transform, "within": spec.within}
-    if spec.evolution is not None:
-        prior_of["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
-    return prior_of
+    if spec.transform is None:
+        normal: Prior = _built(frame, key, lambda: Normal(prior, std, (low, high)))
+        return normal
+    return _transformed(frame, spec.transform, prior, std, (low, high), key)
+
+
+def _transformed(
+    frame: Frame, transform: str, median: float, std: float, bounds: tuple[float, float], key: str
+) -> Prior:
+    """Return the prior of an unknown with a transform; errors name the keys of the case."""
+    low, high = bounds
+    if transform == "log":
+        if np.isfinite(high):
+            raise frame.error(key, "transform='log' knows no upper bound; take 'logit'.")
+        low = low if np.isfinite(low) else 0.0
+    elif not np.isfinite(bounds).all():
+        raise frame.error(key, f"transform='logit' needs two finite bounds; got {bounds}.")
+    if not low < median < high:
+        text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
+        raise frame.error(key, text + "inside of the bounds.")
+    distribution = LogNormal if transform == "log" else LogitNormal
+    found: Prior = _built(frame, key, lambda: distribution(median, std, (low, high)))
+    return found
 
 
 def _evolution(

@@ -10,7 +10,7 @@ import numpy as np
 from livepde.cases.from_table import PLACES, case_for, channels_in, places_for
 from livepde.cases.measured import Measured, measured
 from livepde.errors import RunError
-from livepde.fem import Channel, Scalar, interval
+from livepde.fem import Channel, Normal, interval
 from livepde.models import EQUATIONS, Equation, heat
 from livepde.stepping import Advance, Alexander2, simulate
 
@@ -137,7 +137,7 @@ def _measurements() -> str:
         return {"T_left": left, "T_right": 20.0 + 1.0 * np.sin(2 * np.pi * t / 3600.0)}
 
     values = {"left": Channel("T_left"), "right": Channel("T_right")}
-    model = heat(interval(0.0, 0.4, 80), Scalar(TRUE_ALPHA), values)
+    model = heat(interval(0.0, 0.4, 80), Normal(TRUE_ALPHA), values)
     at = {"T_10": 20, "T_20": 40, "T_30": 60}  # vertices
     rng = np.random.default_rng(1)
     lines = ["time_s,T_left,T_10,T_20,T_30,T_right"]

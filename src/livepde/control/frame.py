@@ -135,8 +135,8 @@ class GalerkinReduction:
         if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
             raise ModelError(
                 "reduce: the model is not linear in its unknown numbers, so that it has no reduced "
-                "model in which they are parameters. Write it linear in them: a transform of each "
-                "(transform='log') is no hindrance."
+                "model in which they are parameters. Write it linear in them: a LogNormal prior of "
+                "each is no hindrance."
             )
 
     def output(self, observed: Observed) -> Output:
@@ -155,5 +155,5 @@ class GalerkinReduction:
 def likely(space: Any, label: str) -> tuple[float, float]:
     """Return the ends of the prior's 95 % interval of an unknown number."""
     unknown = unknown_of(space, label)
-    low, high = unknown.interval(unknown.prior, unknown.std, LIKELY)
+    low, high = unknown.interval(unknown.prior.centre, unknown.prior.std, LIKELY)
     return float(low), float(high)

@@ -81,9 +81,9 @@ class ReducedModel:
             outputs=frame.output(frame.outputs),
             sensors=frame.output(frame.sensors),
             prior=space.prior[frame.rows],
-            std=np.array([unknown.std for unknown in unknowns]),
-            lower=np.array([_end(unknown, 0) for unknown in unknowns]),
-            upper=np.array([_end(unknown, 1) for unknown in unknowns]),
+            std=np.array([unknown.prior.std for unknown in unknowns]),
+            lower=np.array([float(unknown.prior.bounds[0]) for unknown in unknowns]),
+            upper=np.array([float(unknown.prior.bounds[1]) for unknown in unknowns]),
             frame=frame,
         )
 
@@ -185,7 +185,7 @@ class ReducedModel:
         """Return unknown numbers shifted in latent values, to first order by `shift`, (m,)."""
         space = self.frame.model.parameter_space
         moved = [
-            unknown_of(space, label).map.shifted(value, abs(by), np.sign(by))
+            unknown_of(space, label).prior.transform.shifted(value, abs(by), np.sign(by))
             for label, value, by in zip(self.unknowns, q, shift, strict=True)
         ]
         return np.array(moved, dtype=float)
@@ -302,12 +302,6 @@ def _known(what: str, inputs: Mapping[str, float] | None, channels: Sequence[str
             raise ConfigurationError(
                 f"{what}: inputs['{name}'] must be a finite number; got {value}."
             )
-
-
-def _end(unknown: Any, side: int) -> float:
-    """Return a bound of an unknown; the logarithm implies a lower bound of zero."""
-    bound = float(unknown.bounds[side])
-    return max(bound, 0.0) if unknown.transform == "log" and not side else bound
 
 
 def reduce(

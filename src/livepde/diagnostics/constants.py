@@ -56,7 +56,7 @@ class Spaces:
     >>> mesh = lp.interval(0.0, 1.0, 8)
     >>> model = lp.Model(
     ...     lp.Field(mesh, ElementLineP2(), dirichlet={"boundary": 0.0}),
-    ...     lp.Scalar(),
+    ...     lp.Normal(),
     ...     A=lambda q, u, v, x: q * u * v,
     ... )
     >>> full = lp.Full().bind(model.state_space, model.X, model.parameter_space)

@@ -124,7 +124,7 @@ class Excitation:
     >>> import livepde as lp, numpy as np
     >>> from skfem import ElementLineP1
     >>> rod = lp.Field(lp.interval(0, 1, 4), ElementLineP1())
-    >>> model = lp.Model(rod, lp.Scalar(std=2.0), A=lambda q, u, v, x: q * u * v)
+    >>> model = lp.Model(rod, lp.Normal(std=2.0), A=lambda q, u, v, x: q * u * v)
     >>> full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
     >>> excitation = Excitation(Spaces(model, full), window=0.5)
     >>> state = excitation.init()

@@ -136,7 +136,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     >>> from skfem import ElementLineP1
     >>> model = lp.Model(
     ...     lp.Field(lp.interval(0, 1, 4), ElementLineP1()),
-    ...     {"a": lp.Scalar(), "b": lp.Scalar()},
+    ...     {"a": lp.Normal(), "b": lp.Normal()},
     ...     A=lambda q, u, v, x: (q.a - q.b) * u * v,
     ... )
     >>> identifier = lp.Identifier(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), u0=1.0)

@@ -57,7 +57,7 @@ def check_law(
     >>> from skfem import ElementLineP1
     >>> mesh = lp.interval(0.0, 1.0, 8)
     >>> model = lp.Model(
-    ...     lp.Field(mesh, ElementLineP1()), lp.Scalar(prior=1.0), A=lambda q, u, v, x: q * u * v
+    ...     lp.Field(mesh, ElementLineP1()), lp.Normal(1.0), A=lambda q, u, v, x: q * u * v
     ... )
     >>> sensors = lp.Points([0.2, 0.7], noise=0.1)
     >>> report = check_law(

@@ -77,7 +77,7 @@ def check_model(
     >>> mesh = lp.interval(0.0, 1.0, 8)
     >>> model = lp.Model(
     ...     lp.Field(mesh, ElementLineP1()),
-    ...     lp.Scalar(prior=1.0),
+    ...     lp.Normal(1.0),
     ...     A=lambda q, u, v, x: q * u * v,
     ...     B=lambda u, v, x: abs(u) * v,  # has no complex derivative, and no dB= is given
     ... )

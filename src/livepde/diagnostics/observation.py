@@ -66,7 +66,7 @@ def check_observation(
     >>> from skfem import ElementLineP1
     >>> mesh = lp.interval(0.0, 1.0, 8)
     >>> model = lp.Model(
-    ...     lp.Field(mesh, ElementLineP1()), lp.Scalar(), A=lambda q, u, v, x: q * u * v
+    ...     lp.Field(mesh, ElementLineP1()), lp.Normal(), A=lambda q, u, v, x: q * u * v
     ... )
     >>> check_observation(lp.Points([0.25, 0.3, 0.3]), model).ok
     True

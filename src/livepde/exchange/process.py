@@ -186,11 +186,11 @@ class UnitProcess:
         q = model.latent.value(model.initial_parameter())
         found = [math.nan]
         for label, k in space.labels.items():
-            found += self._pair(float(q[k]), float(unknown_of(space, label).std))
+            found += self._pair(float(q[k]), float(unknown_of(space, label).prior.std))
         for name in self.fields:
             values = space.fields[name].at_vertices @ q[space.part(name)]
             for value in values[vertex_order(model)].tolist():
-                found += self._pair(value, float(space.unknowns[name].std))
+                found += self._pair(value, float(space.unknowns[name].prior.std))
         return [*found, *[math.nan] * len(self.sensors)]
 
     def shown(self, identifier: Identifier, estimate: Estimate) -> list[float]:

@@ -7,6 +7,7 @@ from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.fields import (
     Channel,
+    Declaration,
     Field,
     Integrand,
     On,
@@ -15,6 +16,7 @@ from livepde.fem.fields import (
     Scalar,
     Scalars,
     Unknown,
+    declared,
     interval,
     line,
 )
@@ -32,6 +34,7 @@ from livepde.fem.meshes import (
     smooth,
 )
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
+from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
 from livepde.fem.reading import reads
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
@@ -42,6 +45,7 @@ __all__ = [
     "START",
     "Channel",
     "Composed",
+    "Declaration",
     "Evolution",
     "Field",
     "FieldBlock",
@@ -51,14 +55,18 @@ __all__ = [
     "Integrand",
     "Latent",
     "LatentPart",
+    "LogNormal",
+    "LogitNormal",
     "MeanReverting",
     "Moment",
     "Named",
+    "Normal",
     "On",
     "Periodic",
     "Piecewise",
     "Place",
     "Predicate",
+    "Prior",
     "RandomWalk",
     "Scalar",
     "Scalars",
@@ -70,6 +78,7 @@ __all__ = [
     "cells",
     "compose",
     "ddot",
+    "declared",
     "div",
     "dot",
     "grad",

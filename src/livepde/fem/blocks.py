@@ -16,10 +16,19 @@ from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elements import own
-from livepde.fem.fields import Channel, Field, Piecewise, Scalar, Scalars, Unknown, is_nodal
+from livepde.fem.fields import (
+    Channel,
+    Declaration,
+    Field,
+    Piecewise,
+    Scalar,
+    Scalars,
+    is_nodal,
+)
 from livepde.fem.measure import Measure
 from livepde.fem.periodic import tied
 from livepde.fem.place import Moment, Place
+from livepde.fem.priors import Normal
 from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
@@ -140,7 +149,7 @@ class ScalarBlock(Block):
         return values[0]
 
     def prior(self) -> Array:
-        return np.full(self.size, float(self.unknown.prior))
+        return np.full(self.size, float(self.unknown.prior.centre))
 
     def labels(self, name: str) -> tuple[str, ...]:
         if isinstance(self.unknown, Scalar):
@@ -168,7 +177,7 @@ class NamesBlock(Block):
         return dict(zip(self.names, values, strict=True))
 
     def prior(self) -> Array:
-        return np.full(self.size, float(self.unknown.prior))
+        return np.full(self.size, float(self.unknown.prior.centre))
 
     def labels(self, name: str) -> tuple[str, ...]:
         return tuple(f"{name}[{item}]" for item in self.names)
@@ -305,7 +314,7 @@ class FieldBlock(Block):
         return DiscreteField(**arrays)
 
     def prior(self) -> Array:
-        return self.interpolate(self.field.prior)
+        return self.interpolate(self.field.prior.centre)
 
     def labels(self, name: str) -> tuple[str, ...]:
         return ()
@@ -328,7 +337,7 @@ class FieldBlock(Block):
             if level == 0.0 or self.nodal:
                 return np.full(self.size, level)
             value = lambda x: np.full(np.shape(x[0]), level)  # noqa: E731
-        if self.field.transform is not None:  # a projection need not stay within the bounds
+        if not isinstance(self.field.prior, Normal):  # a projection need not stay within the bounds
             nodes = self.doflocs
             return np.asarray(value(nodes) + 0.0 * nodes[0])
         return self._projected(lambda at, piece: value(piece.points) + 0.0 * piece.points[0])
@@ -619,13 +628,8 @@ def base_name(name: str) -> str:
     return name.partition("[")[0]
 
 
-def block_of(unknown: Unknown) -> Block:
+def block_of(unknown: Declaration) -> Block:
     """Return the block of an unknown."""
     if isinstance(unknown, Field):
         return FieldBlock(unknown)
-    if not isinstance(unknown, Scalars | Scalar | Piecewise):
-        raise SpaceError(
-            f"got {unknown!r} as an unknown; expected Scalar, Piecewise, Scalars or Field, as "
-            "Scalar(0.5, std=0.1)."
-        )
     return NamesBlock(unknown) if isinstance(unknown, Scalars) else ScalarBlock(unknown)

@@ -63,7 +63,7 @@ class RandomWalk(Evolution):
     Parameters
     ----------
     rate
-        In the unit of the unknown (of its logarithm for transform="log") per square root of the
+        In the unit of the unknown (of its logarithm for a `LogNormal`) per square root of the
         model's unit of time.
     """
 

@@ -14,12 +14,13 @@ from skfem.element import Element
 
 from livepde.errors import SpaceError
 from livepde.fem.evolution import CONSTANT, Evolution, RandomWalk
+from livepde.fem.priors import Normal, Prior
 from livepde.fem.sobolev import Sobolev
-from livepde.fem.transforms import Transform, transform_of
 from livepde.linalg import Array
 
 __all__ = [
     "Channel",
+    "Declaration",
     "Field",
     "Integrand",
     "On",
@@ -28,6 +29,7 @@ __all__ = [
     "Scalar",
     "Scalars",
     "Unknown",
+    "declared",
     "interval",
     "line",
 ]
@@ -35,7 +37,7 @@ __all__ = [
 # Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
 # with a probability of 2e-23.
 WITHIN = 10.0
-PRIOR = ("prior", "std", "bounds", "transform", "evolution", "within")
+STANDARD = Normal()
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
@@ -136,52 +138,12 @@ def is_nodal(element: Element) -> bool:
     return not inner and element.nodal_dofs + element.interior_dofs == 1
 
 
-def _check_prior(
-    what: str, std: float, bounds: tuple[float, float], prior: float, transform: str | None
-) -> None:
-    if not (np.isfinite(std) and std > 0):
-        raise SpaceError(f"{what}: std must be a positive number; got {std}.")
-    lower, upper = bounds
-    if not lower < upper:
-        raise SpaceError(f"{what}: bounds must be (lower, upper) with lower < upper; got {bounds}.")
-    if not lower <= prior <= upper:
-        raise SpaceError(f"{what}: prior {prior} lies outside of its bounds {bounds}.")
-    if not np.isfinite(transform_of(what, transform, bounds).inverse(np.array(prior))):
-        raise SpaceError(
-            f"{what}: prior {prior} is not inside of what transform='{transform}' allows; move it "
-            "inside of the bounds."
-        )
+class _Declared:
+    """Common base of all declarations: prior, evolution, trust region."""
 
-
-class _Prior:
-    """Common base of all unknowns: prior, bounds, transform, evolution."""
-
-    prior: float
-    std: float
-    bounds: tuple[float, float]
-    transform: str | None
+    prior: Prior
     evolution: Evolution
     within: float
-
-    @property
-    def map(self) -> Transform:
-        """The transform q = T(latent)."""
-        return transform_of(type(self).__name__, self.transform, self.bounds)
-
-    @property
-    def latent_prior(self) -> float:
-        """Prior mean of the latent coefficients."""
-        return float(self.map.inverse(np.array(float(self.prior))))
-
-    @property
-    def latent_std(self) -> float:
-        """Prior standard deviation of the latent coefficients: that of q, to first order."""
-        return float(self.std / self.map.slope(np.array(self.latent_prior)))
-
-    @property
-    def latent_bounds(self) -> tuple[float, float]:
-        """Bounds of the latent coefficients; infinite if a transform enforces them."""
-        return self.bounds if self.transform is None else (-np.inf, np.inf)
 
     @property
     def reach(self) -> float:
@@ -191,43 +153,33 @@ class _Prior:
     @property
     def point_std(self) -> float:
         """Largest prior standard deviation of a latent value at a point; inf if unknown."""
-        return self.latent_std
+        return self.prior.latent_std
 
     @cached_property
     def _ends(self) -> tuple[Array, Array]:
         """Values of q at latent values `reach` prior standard deviations from their mean."""
-        farthest = self.reach * self.point_std
+        farthest, mean = self.reach * self.point_std, self.prior.latent_mean
         with np.errstate(over="ignore"):
             low, high = (
-                self.map.value(np.array(self.latent_prior + s)) for s in (-farthest, farthest)
+                self.prior.transform.value(np.array(mean + s)) for s in (-farthest, farthest)
             )
         return low, high
-
-    @property
-    def symmetric(self) -> bool:
-        """True if intervals are value +- multiples of std: neither a transform nor bounds."""
-        return self.transform is None and not np.isfinite(self.bounds).any()
 
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
         """Return the ends of the central interval that holds the unknown with probability `level`.
 
-        Quantiles of the Gaussian belief about the latent values, mapped through the transform and
-        cut off at the bounds; with a transform also at the ends of the latent values (`within`).
+        Those of the prior's kind of distribution (`Prior.interval`), for a `LogNormal` and a
+        `LogitNormal` also cut off at the ends of the latent values (`within`).
 
         Parameters
         ----------
         value, std
             Estimates and their standard deviations, of equal shape.
         """
-        from statistics import NormalDist
-
-        if not 0.0 < level < 1.0:
-            raise SpaceError(f"interval: level must lie between 0 and 1; got {level}.")
-        z = NormalDist().inv_cdf(0.5 + 0.5 * level)
-        value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
-        low, high = (np.clip(self.map.shifted(value, std, s), *self.bounds) for s in (-z, z))
-        if self.transform is not None:
+        low, high = self.prior.interval(value, std, level)
+        if not isinstance(self.prior, Normal):
             # A value beyond these ends, as another law may report, stays inside of its interval.
+            value = np.asarray(value, dtype=float)
             least, largest = self._ends
             low = np.maximum(low, np.minimum(least, value))
             high = np.minimum(high, np.maximum(largest, value))
@@ -235,22 +187,29 @@ class _Prior:
 
     def _check(self) -> None:
         what = type(self).__name__
+        if not isinstance(self.prior, Prior):
+            raise SpaceError(f"{what}: prior={self.prior!r:.60}; {_expected(self.prior)}.")
         if not isinstance(self.evolution, Evolution):
             raise SpaceError(
                 f"{what}: evolution={self.evolution!r}; expected RandomWalk(rate), "
                 "MeanReverting(time) or Periodic(period), or nothing."
             )
-        _check_prior(what, self.std, self.bounds, self.prior, self.transform)
         if not self.within > 0:
             raise SpaceError(f"{what}: within must be a positive number; got {self.within}.")
-        if self.evolution.copies > 1 and (self.transform or np.isfinite(self.bounds).any()):
+        if self.evolution.copies > 1 and not self.prior.symmetric:
             raise SpaceError(
-                f"{what}: bounds or a transform together with Periodic are not possible; choose."
+                f"{what}: Periodic needs a prior without bounds and transform: a Normal."
             )
 
 
+def _expected(given: Any) -> str:
+    """Return what to write in the place of something that is no prior."""
+    number = f"{given}" if isinstance(given, int | float) else "mean"
+    return f"write Normal({number}, std), or LogNormal or LogitNormal with a median and a std"
+
+
 @dataclass(frozen=True, eq=False)
-class Field(_Prior):
+class Field(_Declared):
     """A function on a mesh: the state u, or a parameter q(x).
 
     Parameters
@@ -269,11 +228,12 @@ class Field(_Prior):
     clamped
         True: all coefficients on the boundaries of `dirichlet` are zero, including slopes. False:
         only the values are prescribed.
-    std
-        Prior standard deviation of a parameter: the inner product is divided by std**2, so that the
-        prior covariance is the inverse Gram matrix.
-    bounds, transform, evolution, within
-        As for `Scalar`; bounds need a transform, and a transform an element of first order.
+    prior
+        Prior of a parameter: the inner product is divided by std**2, so that the prior covariance
+        is the inverse Gram matrix. A `Normal` has no bounds here; a `LogNormal` or `LogitNormal`
+        needs an element of first order, as it holds at each node.
+    evolution, within
+        As for `Scalar`.
     unit, name
         For tables and plots.
     periodic
@@ -285,13 +245,10 @@ class Field(_Prior):
     element: Element
     inner: str | Sobolev | Integrand = "L2"
     dirichlet: Mapping[str, BoundaryValue] = field(default_factory=dict)
-    prior: float = 0.0
-    std: float = 1.0
+    prior: Prior = STANDARD
     unit: str = ""
     name: str = ""
     quadrature: int | None = None
-    bounds: tuple[float, float] = (-np.inf, np.inf)
-    transform: str | None = None
     evolution: Evolution = CONSTANT
     periodic: Sequence[tuple[str, str]] = ()
     clamped: bool = False
@@ -306,7 +263,7 @@ class Field(_Prior):
     def point_std(self) -> float:
         """Largest prior standard deviation of a latent value at a point; inf if unknown."""
         pointwise = isinstance(self.inner, Sobolev) and self.inner.factor != 1.0
-        return math.sqrt(2.0) * self.latent_std if pointwise else math.inf
+        return math.sqrt(2.0) * self.prior.latent_std if pointwise else math.inf
 
     def __post_init__(self) -> None:
         if isinstance(self.inner, str) and self.inner not in ("L2", "H1", "H2"):
@@ -320,7 +277,7 @@ class Field(_Prior):
                 raise SpaceError(
                     f"dirichlet: the mesh has no boundary '{name}'; it has {sorted(known)}."
                 )
-            if any(isinstance(item, _Prior) for item in _each_value(value)):
+            if any(isinstance(item, _Declared | Prior) for item in _each_value(value)):
                 raise SpaceError(
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
@@ -347,18 +304,19 @@ class Field(_Prior):
                     'name the other boundaries instead of "boundary".'
                 )
         self._check()
-        if self.transform is None and np.isfinite(self.bounds).any():
-            raise SpaceError("Field: bounds need transform='log' or 'logit', which keeps them.")
-        if self.transform is not None and (not is_nodal(self.element) or self.dirichlet):
+        if isinstance(self.prior, Normal):
+            if not self.prior.symmetric:
+                raise SpaceError("Field: bounds need a LogNormal or LogitNormal, which keeps them.")
+        elif not is_nodal(self.element) or self.dirichlet:
             raise SpaceError(
-                "Field: a transform acts on values at nodes: take an element of first order and "
-                "no boundary values."
+                f"Field: a {type(self.prior).__name__} holds for values at nodes: take an element "
+                "of first order and no boundary values."
             )
 
 
 def _is_plain(value: Any) -> bool:
     """Return True if a boundary value is not a sequence with one value per component."""
-    return callable(value) or isinstance(value, Channel | _Prior) or np.ndim(value) == 0
+    return callable(value) or isinstance(value, Channel | _Declared | Prior) or np.ndim(value) == 0
 
 
 def _each_value(value: Any) -> Sequence[Any]:
@@ -367,18 +325,13 @@ def _each_value(value: Any) -> Sequence[Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class Scalar(_Prior):
-    """One unknown number with a Gaussian prior; bounds are never left by an estimate.
+class Scalar(_Declared):
+    """One unknown number; a prior alone means the same, without options.
 
     Parameters
     ----------
-    prior, std
-        Mean and standard deviation, in `unit`.
-    bounds
-        (lower, upper). Without a transform estimates are clipped to them.
-    transform
-        "log": positive (above a finite lower bound); the prior is the median and the standard
-        deviation of the logarithm is std / prior. "logit": strictly between two finite bounds.
+    prior
+        `Normal`, `LogNormal` or `LogitNormal`, in `unit`.
     evolution
         Model of the change in time: `RandomWalk`, `MeanReverting`, `Periodic`; default constant.
     within
@@ -389,11 +342,8 @@ class Scalar(_Prior):
         about later values.
     """
 
-    prior: float = 0.0
-    std: float = 1.0
-    bounds: tuple[float, float] = (-np.inf, np.inf)
+    prior: Prior
     unit: str = ""
-    transform: str | None = None
     evolution: Evolution = CONSTANT
     within: float = WITHIN
 
@@ -402,7 +352,7 @@ class Scalar(_Prior):
 
 
 @dataclass(frozen=True, eq=False)
-class Piecewise(_Prior):
+class Piecewise(_Declared):
     """One unknown number for each named region, with a common prior or priors of their own.
 
     Parameters
@@ -410,31 +360,28 @@ class Piecewise(_Prior):
     regions
         Name -> predicate on x, or the name of a subdomain of the mesh. A point in no region sees
         the value zero; in two regions, the sum.
-    prior, std, bounds, unit, transform, evolution, within
+    prior, unit, evolution, within
         As for `Scalar`.
     own
-        Name of a region -> `Scalar` whose prior, bounds, transform and evolution hold there
-        instead. The unknown then needs a name: parameter={"k": Piecewise(...)}.
+        Name of a region -> prior of a constant that holds there instead, or a `Scalar` with prior,
+        evolution and within. The unknown then needs a name: parameter={"k": Piecewise(...)}.
     """
 
     regions: Mapping[str, Predicate | str]
-    prior: float = 0.0
-    std: float = 1.0
-    bounds: tuple[float, float] = (-np.inf, np.inf)
+    prior: Prior
     unit: str = ""
-    transform: str | None = None
     evolution: Evolution = CONSTANT
     within: float = WITHIN
-    own: Mapping[str, Scalar] = field(default_factory=dict)
+    own: Mapping[str, Prior | Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.regions:
             raise SpaceError("Piecewise: needs at least one region.")
-        for name, scalar in self.own.items():
-            if name not in self.regions or not isinstance(scalar, Scalar):
+        for name, given in self.own.items():
+            if name not in self.regions or not isinstance(given, Prior | Scalar):
                 raise SpaceError(
-                    f"Piecewise: own={{'{name}': {scalar!r:.60}}}; expected the name of a region, "
-                    f"one of {list(self.regions)}, and a Scalar."
+                    f"Piecewise: own={{'{name}': {given!r:.60}}}; expected the name of a region, "
+                    f"one of {list(self.regions)}, and a prior or a Scalar."
                 )
         self._check()
 
@@ -444,15 +391,16 @@ class Piecewise(_Prior):
             return {name: self}
         found = {}
         for region, where in self.regions.items():
-            given = self.own.get(region, self)
-            shared = {key: getattr(given, key) for key in PRIOR}
-            unit = given.unit or self.unit
-            found[f"{name}[{region}]"] = Piecewise({region: where}, **shared, unit=unit)
+            own = self.own.get(region, self)
+            one = Scalar(own) if isinstance(own, Prior) else own
+            found[f"{name}[{region}]"] = Piecewise(
+                {region: where}, one.prior, one.unit or self.unit, one.evolution, one.within
+            )
         return found
 
 
 @dataclass(frozen=True, eq=False)
-class Scalars(_Prior):
+class Scalars(_Declared):
     """One unknown number for each name, with a common prior: an offset of each sensor, say.
 
     Forms and sensors see a mapping, q.offset["T_10"].
@@ -461,16 +409,13 @@ class Scalars(_Prior):
     ----------
     names
         Their names.
-    prior, std, bounds, unit, transform, evolution, within
+    prior, unit, evolution, within
         As for `Scalar`.
     """
 
     names: Sequence[str]
-    prior: float = 0.0
-    std: float = 1.0
-    bounds: tuple[float, float] = (-np.inf, np.inf)
+    prior: Prior
     unit: str = ""
-    transform: str | None = None
     evolution: Evolution = CONSTANT
     within: float = WITHIN
 
@@ -480,4 +425,20 @@ class Scalars(_Prior):
         self._check()
 
 
-Unknown: TypeAlias = Field | Scalar | Piecewise | Scalars
+Declaration: TypeAlias = Field | Scalar | Piecewise | Scalars
+"""An unknown with its options."""
+
+Unknown: TypeAlias = Declaration | Prior
+"""What a model takes as an unknown; a prior alone is that of one number."""
+
+
+def declared(unknown: Unknown) -> Declaration:
+    """Return an unknown with its options: the defaults of `Scalar` for a prior alone."""
+    if isinstance(unknown, Prior):
+        return Scalar(unknown)
+    if not isinstance(unknown, Declaration):
+        raise SpaceError(
+            f"got {unknown!r:.60} as an unknown; {_expected(unknown)}, or Scalar, Piecewise, "
+            "Scalars or Field."
+        )
+    return unknown

@@ -483,7 +483,7 @@ class Form(FormMatrices):
         if key == self.parameter:
             unknowns = local.space.unknowns.values()
             counts = [item.components for item in local.locals]
-            std = np.repeat([float(item.std) for item in unknowns], counts)
+            std = np.repeat([float(item.prior.std) for item in unknowns], counts)
             whole = np.maximum(whole, std[:, None, None])
         whole = np.where(whole > 0.0, whole, 1.0)
         return np.where(size > SMALL * whole, size, whole)[:, None, None]

@@ -44,7 +44,7 @@ class LatentPart:
     @cached_property
     def transform(self) -> Transform:
         """Transform T of this unknown."""
-        transform: Transform = self.unknown.map
+        transform: Transform = self.unknown.prior.transform
         return transform
 
     @property
@@ -62,7 +62,7 @@ class LatentPart:
 class Latent:
     """Map q = V T(a) from latent to physical coefficients of a function space, and its prior.
 
-    T acts on each coefficient (`transform` of the unknown); V sums the components of an unknown
+    T acts on each coefficient (`Prior.transform`); V sums the components of an unknown
     with harmonics (`Periodic`).
     """
 
@@ -156,8 +156,8 @@ class Latent:
             inside = p.transform.inverse(q[self.space.part(p.name)])
             if not np.isfinite(inside).all():
                 raise SpaceError(
-                    f"'{p.name}': a value lies outside of what transform="
-                    f"'{p.unknown.transform}' with bounds {p.unknown.bounds} allows."
+                    f"'{p.name}': a value is not strictly inside of the bounds "
+                    f"{p.unknown.prior.bounds} of its {type(p.unknown.prior).__name__} prior."
                 )
             a[p.part.start : p.part.start + p.size] = inside
         return a
@@ -176,12 +176,14 @@ class Latent:
     @cached_property
     def deviations(self) -> Array:
         """Prior standard deviation of each latent coefficient, shape (dim,)."""
-        return self._filled([p.unknown.latent_std for p in self.parts.values()])
+        return self._filled([p.unknown.prior.latent_std for p in self.parts.values()])
 
     @cached_property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the latent coefficients, to be respected by laws."""
-        lower, upper = zip(*(p.unknown.latent_bounds for p in self.parts.values()), strict=True)
+        lower, upper = zip(
+            *(p.unknown.prior.latent_bounds for p in self.parts.values()), strict=True
+        )
         return self._filled(lower), self._filled(upper)
 
     @cached_property
@@ -199,7 +201,8 @@ class Latent:
         """Lower and upper bounds of the coefficients of q, each of shape (m,)."""
         parts = self.parts.values()
         lower, upper = (
-            np.repeat([p.unknown.bounds[k] for p in parts], [p.size for p in parts]) for k in (0, 1)
+            np.repeat([p.unknown.prior.bounds[k] for p in parts], [p.size for p in parts])
+            for k in (0, 1)
         )
         return lower, upper
 

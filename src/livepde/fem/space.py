@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from livepde.errors import SpaceError
 from livepde.fem.blocks import FieldBlock, Local, base_name, block_of
-from livepde.fem.fields import Piecewise, Unknown
+from livepde.fem.fields import Declaration, Piecewise, Unknown, declared
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray, compact
@@ -202,7 +202,7 @@ class FunctionSpace:
         Regions with priors of their own are unknowns, "k[soil]", of which forms see the sum, q.k.
     """
 
-    unknowns: Mapping[str, Unknown]
+    unknowns: Mapping[str, Declaration]
     single: bool
 
     @classmethod
@@ -214,15 +214,17 @@ class FunctionSpace:
             for key in unknown:
                 if not key.isidentifier():
                     raise SpaceError(f"unknown '{key}': the name must be a Python identifier.")
-            separated: dict[str, Unknown] = {}
-            for key, item in unknown.items():
+            separated: dict[str, Declaration] = {}
+            for key, given in unknown.items():
+                item = declared(given)
                 separated |= item.separated(key) if isinstance(item, Piecewise) else {key: item}
             return cls(separated, single=False)
-        if isinstance(unknown, Piecewise) and unknown.own:
+        one = declared(unknown)
+        if isinstance(one, Piecewise) and one.own:
             raise SpaceError(
                 "Piecewise: with own= it needs a name: parameter={'k': Piecewise(...)}."
             )
-        return cls({getattr(unknown, "name", "") or name: unknown}, single=True)
+        return cls({getattr(one, "name", "") or name: one}, single=True)
 
     @cached_property
     def blocks(self) -> dict[str, Any]:
@@ -259,7 +261,7 @@ class FunctionSpace:
         """Names that forms see."""
         return tuple(dict.fromkeys(map(base_name, self.blocks)))
 
-    def unknown_of(self, label: str) -> Unknown:
+    def unknown_of(self, label: str) -> Declaration:
         """Return the unknown of a scalar label."""
         return self.unknowns[label if label in self.unknowns else base_name(label)]
 

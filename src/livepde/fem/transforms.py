@@ -11,10 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from livepde.errors import SpaceError
 from livepde.linalg import Array
 
-__all__ = ["Identity", "Log", "Logit", "Transform", "transform_of"]
+__all__ = ["Identity", "Log", "Logit", "Transform"]
 
 
 class Transform(ABC):
@@ -118,19 +117,3 @@ class Logit(Transform):
         with np.errstate(divide="ignore", invalid="ignore"):
             # Two logarithms, since the quotient could overflow close to a bound.
             return np.asarray(np.log(q - self.lower) - np.log(self.upper - q))
-
-
-def transform_of(what: str, name: str | None, bounds: tuple[float, float]) -> Transform:
-    """Return the transform of an unknown by name: None, "log" or "logit"."""
-    lower, upper = bounds
-    if name is None:
-        return Identity()
-    if name == "log":
-        if np.isfinite(upper):
-            raise SpaceError(f"{what}: transform='log' knows no upper bound; take 'logit'.")
-        return Log(lower if np.isfinite(lower) else 0.0)
-    if name == "logit":
-        if not (np.isfinite(lower) and np.isfinite(upper)):
-            raise SpaceError(f"{what}: transform='logit' needs two finite bounds; got {bounds}.")
-        return Logit(lower, upper)
-    raise SpaceError(f"{what}: transform='{name}' is not known; expected 'log' or 'logit'.")

@@ -69,7 +69,7 @@ class Fleet:
     --------
     >>> import livepde as lp
     >>> from livepde.models import heat
-    >>> model = heat(lp.interval(0, 1, 20), lp.Scalar(0.5, 0.2), {"left": 0.0, "right": 0.0})
+    >>> model = heat(lp.interval(0, 1, 20), lp.Normal(0.5, 0.2), {"left": 0.0, "right": 0.0})
     >>> fleet = Fleet(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), members=3, u0=1.0)
     >>> fleet.step(0.1, [[0.9], [0.8], [float("nan")]]).q.shape
     (3, 1)

@@ -61,7 +61,7 @@ class Shard:
     --------
     >>> import livepde as lp
     >>> from livepde.models import heat
-    >>> model = heat(lp.interval(0, 1, 20), lp.Scalar(0.5, 0.2), {"left": 0.0, "right": 0.0})
+    >>> model = heat(lp.interval(0, 1, 20), lp.Normal(0.5, 0.2), {"left": 0.0, "right": 0.0})
     >>> rods = ["north", "south"]
     >>> shard = Shard(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), rods, u0=1.0)
     >>> shard.step(0, [("south", 0.1, [0.9]), ("north", 0.3, [0.7]), ("south", 0.2, [0.8])]).status

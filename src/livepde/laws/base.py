@@ -36,7 +36,7 @@ REMEDIES = {
     "ok": "",
     "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
     "not_finite": "Check the sample, the bounds of the unknowns, and the gain.",
-    "departed": "Check the model and the sensors, give the unknowns a std= that allows for such "
+    "departed": "Check the model and the sensors, give the unknowns a std that allows for such "
     "values, or give a number for gain.",
     "singular": "Check the model's forms at the current estimate, or take a smaller dt_max.",
 }

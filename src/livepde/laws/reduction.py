@@ -89,10 +89,10 @@ class Reduction:
                     weights = mass.diagonal()
                     phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
             else:
-                phi = np.eye(item.size) * item.unknown.latent_std
+                phi = np.eye(item.size) * item.unknown.prior.latent_std
             blocks.append(np.kron(np.eye(item.evolution.copies), phi))
             stop = start + blocks[-1].shape[1]
-            std = item.unknown.latent_std
+            std = item.unknown.prior.latent_std
             evolutions.append(ReducedEvolution(slice(start, stop), item.evolution, std))
             start = stop
         return cls(problem, np.asarray(block_diag(*blocks)), tuple(evolutions))

@@ -39,7 +39,7 @@ def advection_diffusion(
     mesh
         `livepde.interval(...)`, or a mesh of more dimensions with the flow along its first; in m.
     kappa
-        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`.
+        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`.
     dirichlet
         Mapping from boundary to number, function g(x, t), or `Channel`. Other boundaries have no
         diffusive flux.
@@ -75,7 +75,7 @@ def advection_diffusion(
     >>> import livepde as lp
     >>> bed = lp.interval(0.0, 0.4, 40)
     >>> sides = {"left": lp.Channel("T_river"), "right": lp.Channel("T_40")}
-    >>> kappa, K = lp.Scalar(8e-7, 4e-7, transform="log"), lp.Scalar(0.0, 1e-5)
+    >>> kappa, K = lp.LogNormal(8e-7, 4e-7), lp.Normal(0.0, 1e-5)
     >>> model = advection_diffusion(bed, kappa, sides, K=K, L=0.4, ratio=1.5)
     >>> model.channels
     ('dH', 'T_river', 'T_40')

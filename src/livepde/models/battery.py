@@ -42,7 +42,7 @@ def battery_particle(
         Radius in m, from 0 ("left") to the surface ("right"), with cells of size sqrt(D h) at the
         surface for time steps h.
     D
-        Diffusivity of lithium at half filling in m^2/s; positive: transform="log".
+        Diffusivity of lithium at half filling in m^2/s; positive: a `LogNormal`.
     slope
         Derivative of the logarithm of the diffusivity by the filling; default 0, a constant D.
     area
@@ -64,7 +64,7 @@ def battery_particle(
     Examples
     --------
     >>> import livepde as lp
-    >>> D = lp.Scalar(1e-14, 1e-14, transform="log")
+    >>> D = lp.LogNormal(1e-14, 1e-14)
     >>> model = battery_particle(lp.interval(0.0, 1e-5, 40), D, area=1.0, c_max=30000.0)
     >>> model.channels
     ('I',)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Field, On, Place, Scalar, Unknown, dot, grad, linear
+from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
 from livepde.models.base import Equation, Option, Variable, closed
 
@@ -46,7 +46,7 @@ def grouted_borehole(
     its middle. The power is distributed evenly, and the mean over "left" is the temperature of the
     fluid.
 
-    All unknowns are positive: use transform="log", and "logit" for the share.
+    All unknowns are positive: use `LogNormal`, and `LogitNormal` for the share.
 
     The capacity of the ground may be unknown because radii there are replaced by a coordinate that
     measures the heat content: x^2 - r_b^2 = (rho_c/rho_0) (r^2 - r_b^2), with the prior rho_0. In x
@@ -62,7 +62,7 @@ def grouted_borehole(
     k
         Conductivity of the ground in W/(m K).
     rho_c
-        Volumetric heat capacity of the ground in J/(m^3 K), a `Scalar`.
+        Volumetric heat capacity of the ground in J/(m^3 K), one number.
     R_b
         Resistance between fluid and wall of the borehole in m K/W.
     share
@@ -87,12 +87,12 @@ def grouted_borehole(
     Raises
     ------
     ModelError
-        The radii are not inside of the mesh in this order, or rho_c is not a `Scalar`.
+        The radii are not inside of the mesh in this order, or rho_c is not one number.
     """
-    if not isinstance(rho_c, Scalar):
-        raise ModelError("grouted_borehole: rho_c must be one number, a Scalar.")
+    if not isinstance(heat := declared(rho_c), Scalar):
+        raise ModelError("grouted_borehole: rho_c must be one number: a prior, or a Scalar.")
     layered = _layered(mesh, r_p, r_b)
-    thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), rho_c.prior
+    thickness, around, rho_0 = r_p - float(mesh.p[0].min()), log(r_b / r_p), heat.prior.centre
     # Quadrature of order four integrates the weight r with elements of first order exactly.
     cold = {name: T0 for name in ("right", "end") if name in layered.boundaries}
     state = Field(layered, linear(layered), dirichlet=cold, unit="degC", quadrature=4)

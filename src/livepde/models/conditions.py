@@ -101,8 +101,8 @@ def with_conditions(
     >>> import livepde as lp
     >>> from livepde.models import Flux, conduction, with_conditions
     >>> wall = lp.interval(0.0, 0.1, 40)
-    >>> k = lp.Scalar(20.0, 10.0, transform="log")
-    >>> J = lp.Scalar(0.0, 2e4, evolution=lp.RandomWalk(2e3))
+    >>> k = lp.LogNormal(20.0, 10.0)
+    >>> J = lp.Scalar(lp.Normal(0.0, 2e4), evolution=lp.RandomWalk(2e3))
     >>> slab = conduction(wall, k, {"right": lp.Channel("T_cold")}, C=3.6e6)
     >>> slab = with_conditions(slab, {"left": Flux("J")}, unknowns={"J": J})
     >>> tuple(slab.parameter_space.labels)

@@ -36,7 +36,7 @@ def heat(
     mesh
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     alpha
-        Diffusivity in m^2/s: a `Scalar`, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
+        Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`. The flux alpha u_n
         is continuous between layers, so all layers have the same heat capacity (else:
         `conduction`).
     dirichlet
@@ -66,7 +66,7 @@ def heat(
     Examples
     --------
     >>> import livepde as lp
-    >>> model = heat(lp.interval(0, 1, 10), lp.Scalar(5e-7, 2e-7), {"left": lp.Channel("T0")})
+    >>> model = heat(lp.interval(0, 1, 10), lp.Normal(5e-7, 2e-7), {"left": lp.Channel("T0")})
     >>> model.channels
     ('T0',)
     """
@@ -113,7 +113,7 @@ def conduction(
     >>> dry, wet = 1.3e6, 2.9e6
     >>> model = conduction(
     ...     layers,
-    ...     lp.Scalar(1.0, 0.5),
+    ...     lp.Normal(1.0, 0.5),
     ...     {"boundary": 10.0},
     ...     C=lambda x: dry + (wet - dry) * (x[0] > 0.2),
     ... )

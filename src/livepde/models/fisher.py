@@ -46,7 +46,7 @@ def fisher_kpp(
     Examples
     --------
     >>> import livepde as lp
-    >>> D, r = lp.Scalar(0.01, 0.01, transform="log"), lp.Scalar(1.0, 0.5, transform="log")
+    >>> D, r = lp.LogNormal(0.01, 0.01), lp.LogNormal(1.0, 0.5)
     >>> fisher_kpp(lp.interval(0.0, 1.9, 38), D, r, K=1700.0).affine
     False
     """

@@ -22,7 +22,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
 
     At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
     and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)); Q
-    may also change (step tests, recovery). Both unknowns are positive: use transform="log".
+    may also change (step tests, recovery). Both unknowns are positive: use `LogNormal`.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def groundwater(
 
     The equation is divided by S, so that the storativity may be unknown, too. Each well is a
     smooth, round source (see `well`): the head equals that of a point source only beyond its
-    radius, so place no sensor within it. T and S are positive: use transform="log".
+    radius, so place no sensor within it. T and S are positive: use `LogNormal`.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def groundwater(
     --------
     >>> import livepde as lp
     >>> mesh = lp.rectangle((-50.0, 50.0), (-50.0, 50.0), (40, 40))
-    >>> T, S = (lp.Scalar(x, x, transform="log") for x in (1e-2, 1e-2))
+    >>> T, S = (lp.LogNormal(x, x) for x in (1e-2, 1e-2))
     >>> model = groundwater(mesh, T, S, {"boundary": 0.0}, wells={"Q": (0, 0)}, radius=5.0)
     >>> model.inputs
     ('Q',)

@@ -108,7 +108,7 @@ def mobile_immobile(
     v
         Mean pore velocity in cm/h: flux over total water content. The mobile water moves at v/phi.
     phi
-        Mobile share of the water, in (0, 1): a `Scalar` with transform="logit".
+        Mobile share of the water, in (0, 1): a `LogitNormal`.
     omega
         Rate of exchange in 1/h.
 

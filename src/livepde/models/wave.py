@@ -36,7 +36,7 @@ def wave(
     mesh
         Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
     c2
-        Squared speed in m^2/s^2: a `Scalar`, a `Piecewise`, or a `Field`.
+        Squared speed in m^2/s^2: a number, a `Piecewise`, or a `Field`.
     d
         Damping in 1/s: a number or an unknown.
     dirichlet
@@ -57,7 +57,7 @@ def wave(
     Examples
     --------
     >>> import livepde as lp
-    >>> model = wave(lp.interval(0, 1, 20), lp.Scalar(1.0, 0.3), dirichlet={"left": 0.0})
+    >>> model = wave(lp.interval(0, 1, 20), lp.Normal(1.0, 0.3), dirichlet={"left": 0.0})
     >>> list(model.state_space.blocks)
     ['w', 'p']
     """

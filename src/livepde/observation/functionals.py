@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ModelError, ObservationError
-from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, Named, On, Scalar
+from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
 from livepde.linalg import Array
 from livepde.observation.base import Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -81,7 +81,7 @@ class FunctionalsObserved(Observed):
         # with respect to both.
         unknowns = {STATE + name: unknown for name, unknown in state.unknowns.items()}
         unknowns |= {PARAMETER + name: unknown for name, unknown in parameter.unknowns.items()}
-        spaces = {"w": FunctionSpace.of(Scalar(), "w"), "uq": FunctionSpace(unknowns, False)}
+        spaces = {"w": FunctionSpace.of(Normal(), "w"), "uq": FunctionSpace(unknowns, False)}
         self.forms = [self._form(name, spaces) for name in self.names]
 
     def _names(self) -> tuple[str, ...]:

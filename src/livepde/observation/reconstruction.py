@@ -296,7 +296,7 @@ class Tikhonov(Reconstruction):
     >>> from skfem import ElementLineP1
     >>> from livepde.observation import Discrepancy, Full, Tikhonov
     >>> rod = lp.Field(lp.interval(0, 1, 20), ElementLineP1())
-    >>> model = lp.Model(rod, lp.Scalar(1.0), lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)))
+    >>> model = lp.Model(rod, lp.Normal(1.0), lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)))
     >>> full = Full(noise=0.1, reconstruction=Tikhonov("V", Discrepancy(tau=1.1)))
     >>> observed = full.bind(model.state_space, model.X, model.parameter_space)
     >>> z = 1 + 0.1 * (-1.0) ** np.arange(21)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, FunctionSpace, Predicate, Scalars, Unknown
+from livepde.fem import FieldBlock, FunctionSpace, Normal, Predicate, Scalars, Unknown
 from livepde.fem.measure import Measure
 from livepde.linalg import Array
 from livepde.observation.base import Direct, Observation, Observed
@@ -93,7 +93,7 @@ class Points(Observation):
             return {}
         dimension = self.positions.shape[1]
         names = [shift for name in self.uncertain for shift in shift_names(name, dimension)]
-        return {POSITION: Scalars(names, 0.0, self.shift_std)}
+        return {POSITION: Scalars(names, Normal(0.0, self.shift_std))}
 
     def bind(self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace) -> Observed:
         if self.position_std is None:

@@ -20,7 +20,7 @@ import numpy as np
 
 from livepde import paper, plots
 from livepde.diagnostics.constants import Spaces, constants
-from livepde.fem import START, Field, Moment, Scalar, dot, grad, hermite, line, linear
+from livepde.fem import START, Field, Moment, Normal, dot, grad, hermite, line, linear
 from livepde.identifier import Identifier
 from livepde.laws import (
     ConstantDamping,
@@ -127,7 +127,7 @@ class ReferenceSamples:
             "clamped": {"dirichlet": {"boundary": 0.0}, "clamped": True},
         }
         exact = 2 * setting.points - 1
-        q: Field | Scalar = Scalar()
+        q: Field | Normal = Normal()
         if setting.parameter != "constant":
             of_q, inner = elements[setting.parameter], setting.inner
             q = Field(mesh, of_q, inner=inner, quadrature=exact, **ends[setting.parameter_ends])

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from livepde import paper, plots
-from livepde.fem import Field, dot, grad, hermite, interval
+from livepde.fem import Field, Normal, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.model import Model
@@ -71,7 +71,9 @@ def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[M
     zero = {"boundary": 0.0}
     model = Model(
         state=Field(mesh, element, dirichlet=zero, clamped=clamped),
-        parameter=Field(mesh, element, inner="H1", dirichlet=zero, std=std, clamped=clamped),
+        parameter=Field(
+            mesh, element, inner="H1", dirichlet=zero, prior=Normal(std=std), clamped=clamped
+        ),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,

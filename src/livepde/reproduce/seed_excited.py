@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from livepde import paper, plots
-from livepde.fem import Field, dot, grad, hermite, interval
+from livepde.fem import Field, Normal, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import ResidualDamping, SensitivityLaw
 from livepde.model import Model
@@ -62,7 +62,7 @@ def build(std: float = 1.0) -> tuple[Model, Full]:
     element = hermite(mesh)
     model = Model(
         state=Field(mesh, element, dirichlet={"boundary": 0.0}),
-        parameter=Field(mesh, element, inner="H1", std=std),
+        parameter=Field(mesh, element, inner="H1", prior=Normal(std=std)),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: D * dot(grad(u), grad(v)),
         f=f,

@@ -149,7 +149,7 @@ class Twin:
     >>> import numpy as np, livepde as lp
     >>> from skfem import ElementLineP1
     >>> rod = lp.Field(lp.interval(0, 1, 10), ElementLineP1(), dirichlet={"boundary": 0.0})
-    >>> model = lp.Model(rod, lp.Scalar(1.0), lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)))
+    >>> model = lp.Model(rod, lp.Normal(1.0), lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)))
     >>> twin = Twin(
     ...     model=model,
     ...     observation=lp.Points([0.3]),

@@ -1,0 +1,204 @@
+"""Priors of unknowns: normal, log-normal (positive), logit-normal (between two bounds).
+
+Each is Gaussian in a latent value a, and q = T(a): laws work with a, weak forms and sensors see q.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import SpaceError
+from livepde.fem.transforms import Identity, Log, Logit, Transform
+from livepde.linalg import Array
+
+__all__ = ["LogNormal", "LogitNormal", "Normal", "Prior"]
+
+
+class Prior(ABC):
+    """What is known of a number before the first sample: common base of the distributions.
+
+    Attributes
+    ----------
+    std
+        Standard deviation in the unit of the unknown.
+    bounds
+        (lower, upper), never left by an estimate.
+    """
+
+    std: float
+    bounds: tuple[float, float]
+
+    @property
+    @abstractmethod
+    def centre(self) -> float:
+        """Median of the unknown: q at the latent mean."""
+
+    @property
+    @abstractmethod
+    def transform(self) -> Transform:
+        """The transform q = T(latent)."""
+
+    @property
+    def latent_mean(self) -> float:
+        """Mean of the latent value."""
+        return float(self.transform.inverse(np.array(float(self.centre))))
+
+    @property
+    def latent_std(self) -> float:
+        """Standard deviation of the latent value: that of q, to first order."""
+        return float(self.std / self.transform.slope(np.array(self.latent_mean)))
+
+    @property
+    def latent_bounds(self) -> tuple[float, float]:
+        """Bounds of the latent value; infinite if the transform enforces them."""
+        return (-np.inf, np.inf)
+
+    @property
+    def symmetric(self) -> bool:
+        """True if intervals are value +- multiples of std: neither a transform nor bounds."""
+        return False
+
+    def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
+        """Return the ends of the central interval that holds q with probability `level`.
+
+        Quantiles of the Gaussian belief about the latent values, mapped through the transform and
+        cut off at the bounds.
+
+        Parameters
+        ----------
+        value, std
+            Estimates and their standard deviations, of equal shape.
+        """
+        from statistics import NormalDist
+
+        if not 0.0 < level < 1.0:
+            raise SpaceError(f"interval: level must lie between 0 and 1; got {level}.")
+        z = NormalDist().inv_cdf(0.5 + 0.5 * level)
+        value, std = np.asarray(value, dtype=float), np.asarray(std, dtype=float)
+        low, high = (np.clip(self.transform.shifted(value, std, s), *self.bounds) for s in (-z, z))
+        return low, high
+
+    def _check(self, centre: str) -> None:
+        """Raise an error for numbers that are no distribution; `centre` is its name, as "mean"."""
+        what, at = type(self).__name__, self.centre
+        if not (np.isfinite(self.std) and self.std > 0):
+            raise SpaceError(f"{what}: std must be a positive number; got {self.std}.")
+        lower, upper = self.bounds
+        if not lower < upper:
+            raise SpaceError(
+                f"{what}: bounds must be (lower, upper) with lower < upper; got {self.bounds}."
+            )
+        if not lower <= at <= upper:
+            raise SpaceError(f"{what}: {centre} {at} lies outside of its bounds {self.bounds}.")
+        if not np.isfinite(self.transform.inverse(np.array(at))):
+            raise SpaceError(
+                f"{what}: {centre} {at} needs to be finite, and strictly inside of {self.bounds}."
+            )
+
+
+@dataclass(frozen=True)
+class Normal(Prior):
+    """Normal distribution of q.
+
+    Parameters
+    ----------
+    mean, std
+        Mean and standard deviation, in the unit of the unknown.
+    bounds
+        (lower, upper), to which estimates are clipped.
+    """
+
+    mean: float = 0.0
+    std: float = 1.0
+    bounds: tuple[float, float] = (-np.inf, np.inf)
+
+    def __post_init__(self) -> None:
+        self._check("mean")
+
+    @property
+    def centre(self) -> float:
+        return self.mean
+
+    @property
+    def transform(self) -> Transform:
+        return Identity()
+
+    @property
+    def latent_bounds(self) -> tuple[float, float]:
+        return self.bounds
+
+    @property
+    def symmetric(self) -> bool:
+        return not np.isfinite(self.bounds).any()
+
+
+@dataclass(frozen=True)
+class LogNormal(Prior):
+    """Normal distribution of log(q - lower): q stays positive, or above a finite lower bound.
+
+    Parameters
+    ----------
+    median
+        Median, in the unit of the unknown.
+    std
+        Standard deviation to first order, in the same unit: the logarithm has std/(median - lower).
+    bounds
+        (lower, inf) with a finite lower bound.
+    """
+
+    median: float
+    std: float
+    bounds: tuple[float, float] = (0.0, np.inf)
+
+    def __post_init__(self) -> None:
+        lower, upper = self.bounds
+        if np.isfinite(upper) or not np.isfinite(lower):
+            raise SpaceError(
+                f"LogNormal: bounds must be (lower, inf) with a finite lower one; got "
+                f"{self.bounds}; with an upper one take LogitNormal."
+            )
+        self._check("median")
+
+    @property
+    def centre(self) -> float:
+        return self.median
+
+    @property
+    def transform(self) -> Transform:
+        return Log(self.bounds[0])
+
+
+@dataclass(frozen=True)
+class LogitNormal(Prior):
+    """Normal distribution of log((q - lower)/(upper - q)): q stays strictly between two bounds.
+
+    Parameters
+    ----------
+    median
+        Median, in the unit of the unknown.
+    std
+        Standard deviation to first order, in the same unit.
+    bounds
+        (lower, upper), both finite.
+    """
+
+    median: float
+    std: float
+    bounds: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.bounds).all():
+            raise SpaceError(f"LogitNormal: needs two finite bounds; got {self.bounds}.")
+        self._check("median")
+
+    @property
+    def centre(self) -> float:
+        return self.median
+
+    @property
+    def transform(self) -> Transform:
+        return Logit(*self.bounds)
