@@ -17,11 +17,11 @@ PYTHON ?= python3
 
 # The tiers of the tests, by the markers of pyproject.toml.
 PYTEST := pytest --numprocesses auto --maxprocesses 8 --dist worksteal
-USERS := -m "not (study or process or broker or browser or pages)"
-SYSTEM := -m "not study and (process or broker or browser or pages)"
-FAST := -m "not (slow or study or process or broker or browser or pages)"
+USERS := -m "not (long or study or process or broker or browser or pages)"
+SYSTEM := -m "not study and (long or process or broker or browser or pages)"
+FAST := -m "not (slow or long or study or process or broker or browser or pages)"
 # With other versions: the fast ones, and those of what brokers are spoken to with.
-OTHERS := -m "not (slow or study or process or browser or pages)"
+OTHERS := -m "not (slow or long or study or process or browser or pages)"
 # Beside the oldest one of pyproject.toml: Pythons that they run on, where found.
 VERSIONS := 3.12 3.13
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
@@ -45,10 +45,10 @@ demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) 
 test: $(READY)  ## Run the tests of what users rely on, and the doctests
 	@$(BIN)/$(PYTEST) $(USERS)
 
-test-fast: $(READY)  ## Run those that take less than a second each
+test-fast: $(READY)  ## Run those that take a fraction of a second each
 	@$(BIN)/$(PYTEST) $(FAST)
 
-test-system: $(READY)  ## Run those with programs of their own, brokers, browsers and pages
+test-system: $(READY)  ## Run the long ones, and those with programs of their own, brokers, browsers, pages
 	@$(BIN)/$(PYTEST) $(SYSTEM)
 
 test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too

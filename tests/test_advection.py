@@ -50,6 +50,7 @@ def test_stabilised_it_is_exact_at_the_vertices_however_fast():
     assert found == pytest.approx(steady(mesh.p[0], 1.0, 0.01), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_a_warm_spot_drifts_with_the_water_and_spreads():
     """A Gaussian; the water follows the head, w = ratio K dH(t)/L, here back and forth."""
     kappa, K, L, ratio, start = 0.02, 3.0, 2.0, 1.5, 0.05

@@ -56,7 +56,7 @@ def rod(folder: Path, change: float = CHANGE, jumps: str = "true") -> Path:
     return case
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     case = rod(tmp_path / "rod")
     done = CliRunner().invoke(app, ["run", str(case), "--out", str(tmp_path / "run"), "--json"])
@@ -84,7 +84,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     assert len(lines) == 3  # the unknown, innovations, and withheld channels
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_jump_no_word(tmp_path: Path):
     case = cases.load(rod(tmp_path / "rod", change=1.0)).prepare()
     data = runs.drive(case.identifier, case.stream).result.to_xarray()
@@ -126,6 +126,7 @@ def said(data: Any) -> list[str]:
     return [sentence for sentence in doubts(data) if "ump" in sentence]
 
 
+@pytest.mark.slow
 def test_what_has_moved_between_two_alarms():
     first, second = runs.jumps(dataset([4, 7]))
     assert (first.t, second.t) == (5.0, 8.0)
@@ -155,6 +156,7 @@ def test_what_settles_is_not_looked_at():
     assert alarm
 
 
+@pytest.mark.slow
 def test_slow_errors_below_the_noise_hide_no_jump():
     rng, jumps = np.random.default_rng(0), lp.Jumps(settle=0)
     watch, alarm = jumps.start(2), False

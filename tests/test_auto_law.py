@@ -109,6 +109,7 @@ def test_an_unknown_that_moves_is_followed_as_with_the_best_drift_in_hindsight()
     assert auto[-1].notes["drift"] > 1e-3
 
 
+@pytest.mark.long
 def test_an_unknown_that_stays_is_found_as_by_a_law_that_knows_it():
     auto = bank_still()
     known = run(build(lp.SensitivityLaw(replay=lp.Replay(), shadows=None)), still())
@@ -125,6 +126,7 @@ def test_members_that_are_not_needed_sleep():
     assert min(awake) <= 2
 
 
+@pytest.mark.long
 def test_a_prior_that_is_too_narrow_is_widened():
     narrow = rod(std=0.01)  # the truth is ten deviations away
     auto, plain = run(build(model=narrow), still()[:120]), lp.SensitivityLaw(replay=lp.Replay())
@@ -133,6 +135,7 @@ def test_a_prior_that_is_too_narrow_is_widened():
     assert abs(auto[-1].parameters["a"][0] - 0.3) < 0.7 * abs(known[-1].parameters["a"][0] - 0.3)
 
 
+@pytest.mark.long
 def test_the_stated_noise_is_raised_but_not_lowered():
     low, told, high = (bank_still(n)[-1] for n in (0.1 * NOISE, NOISE, 5 * NOISE))
     assert low.notes["noise_level"] == pytest.approx(10.0, rel=0.1)
@@ -143,6 +146,7 @@ def test_the_stated_noise_is_raised_but_not_lowered():
     assert high.parameters["a"][1] > 1.5 * deviation
 
 
+@pytest.mark.long
 def test_the_noise_need_not_be_stated():
     told, silent = (bank_still(noise) for noise in (NOISE, None))
     (value, std), (expected, deviation) = (e[-1].parameters["a"] for e in (silent, told))
@@ -157,6 +161,7 @@ def test_the_noise_need_not_be_stated():
     assert silent[GUESSED].parameters["a"][1] < 0.1
 
 
+@pytest.mark.long
 def test_a_jump_is_learned():
     def a(t: float) -> float:
         return 0.3 if t < 15.0 else 0.24
@@ -187,6 +192,7 @@ def test_guesses_of_the_noise():
 # --- what does not matter ------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("unit", "noise"),
     [({"u": 300.0}, NOISE), ({"u": 300.0}, None), ({"x": 0.07}, NOISE), ({"t": 3600.0}, None)],
@@ -232,6 +238,7 @@ def test_the_mesh_hardly_matters():
 # --- the contract --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_it_keeps_the_contract_of_a_law(noise: float | None):
     lp.diagnostics.check_law(
@@ -239,6 +246,7 @@ def test_it_keeps_the_contract_of_a_law(noise: float | None):
     ).raise_if_failed()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any):
     """Saved before, at and after a replay, as often as the run goes on from there."""
@@ -257,6 +265,7 @@ def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any
         np.testing.assert_array_equal(found.belief.q_factor, expected.belief.q_factor)
 
 
+@pytest.mark.long
 def test_missing_samples_are_no_error():
     rng = np.random.default_rng(3)
     holes = [(t, np.where(rng.random(3) < 0.3, np.nan, z)) for t, z in still()]
@@ -300,6 +309,7 @@ def test_a_step_that_fails_for_all_changes_nothing(monkeypatch: pytest.MonkeyPat
     assert identifier.step(*still()[20]).status.ok
 
 
+@pytest.mark.long
 def test_an_unknown_with_an_evolution_of_its_own_keeps_it():
     found = run(build(model=rod(evolution=lp.RandomWalk(0.05))), moving())
     assert found[0].notes["awake"] == 2
@@ -325,6 +335,7 @@ def test_a_window_that_is_full_begins_anew():
     assert abs(value - stays(0.0)) <= 3.0 * std <= 0.03
 
 
+@pytest.mark.long
 def test_the_first_interval_may_be_of_any_length():
     late, nothing = moving()[100:250], np.full(len(POINTS), np.nan)
     (value, std), *others = (
@@ -336,6 +347,7 @@ def test_the_first_interval_may_be_of_any_length():
         assert deviation == pytest.approx(std, rel=0.2)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("resolution", [0.02, 0.1])
 def test_readings_of_a_coarse_resolution_tell_their_noise(resolution: float):
     coarse = [(t, np.round(z / resolution) * resolution) for t, z in still()[:200]]
@@ -345,11 +357,13 @@ def test_readings_of_a_coarse_resolution_tell_their_noise(resolution: float):
     assert 0.1 <= last.notes["noise_level"] <= 10.0
 
 
+@pytest.mark.long
 def test_a_slow_signal_of_coarse_resolution_starts_the_bank():
     steps = [(t, np.round(0.1 * t * np.ones(len(POINTS)), 1)) for t, _ in still()[: PATIENCE + 40]]
     assert "noise_level" in run(build(noise=None), steps)[-1].notes
 
 
+@pytest.mark.long
 def test_silence_is_not_stored():
     quiet = build(noise=None)
     run(quiet, [(0.05 * k, np.zeros(len(POINTS))) for k in range(1, 601)])
@@ -369,6 +383,7 @@ def _case(tmp_path: Any, law: str, noise: bool = True) -> Any:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [True, False])
 def test_a_case_says_auto(tmp_path: Any, noise: bool):
     case = load(_case(tmp_path, 'kind = "auto"', noise))

@@ -71,6 +71,7 @@ def test_constant_flux_is_that_of_the_textbook():
     assert errors[1] < 0.4 * errors[0]
 
 
+@pytest.mark.slow
 def test_what_leaves_is_the_charge():
     model = particle(slope=lp.Normal(-1.0, 1.0))
     _, c = discharged(model, TIMES)
@@ -113,7 +114,7 @@ def pulses(t: float) -> dict[str, float]:
     return {"I": 1.36 * (t // 300 % 2 < 1) * (1 if t // 3600 % 2 < 1 else -1)}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
     model = particle(slope=lp.Normal(0.0, 1.0))
     sensor = lp.Points({"surface": R}, noise=50.0)

@@ -87,7 +87,7 @@ CASES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_blocks_do_not_change_the_result(name, monkeypatch):
     form, sensors, options = CASES[name]
@@ -129,7 +129,7 @@ def test_a_law_that_tunes_itself_learns_little_from_what_blocks_leave(monkeypatc
     assert errors[1] < 1.03 * errors[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
     model = plane()
     sensors = lp.Averages({f"z{k}": lambda x, k=k: abs(x[0] - 0.2 * k) < 0.1 for k in range(1, 5)})

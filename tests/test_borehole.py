@@ -97,6 +97,7 @@ def test_no_heat_is_lost():
     assert held == pytest.approx(POWER * times[-1], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_late_the_fluid_follows_the_line_source():
     """T_fluid = T0 + Q/(4 pi k H) E1(rho_c r_b^2/(4 k t)) + R_b Q/H, after some days."""
     from scipy.special import exp1
@@ -121,7 +122,7 @@ def test_an_unknown_capacity_is_that_capacity(factor):
     assert abs(final(scaled, times)[1][0] - one[0]) > 0.3  # and it matters
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_twin_finds_conductivity_and_resistance():
     process = model(50)
     sensor = lp.Points({"T": 0.02}, noise=0.02)
@@ -202,6 +203,7 @@ def fluid(process: lp.Model, times: Any) -> float:
     return float(sensor.predict(u, process.latent.value(start), moment)[0])
 
 
+@pytest.mark.slow
 def test_forms_in_the_plane_pass_the_shipped_checks():
     check_model(
         plane(cells=30, C_c=1900.0), u=30.0, spread=5.0, inputs={"Q": POWER}
@@ -241,6 +243,7 @@ def test_the_sandbox_from_five_hours_on(data_dir, monkeypatch):
     assert std[-1] < 0.05 * 2.88
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rho_c", [2.3e6, lp.LogNormal(2e6, 5e5)])
 def test_the_ground_alone_with_known_and_unknown_heat_capacity(rho_c: Any) -> None:
     """Late the wall follows the line source, T = T0 + Q/(4 pi k H) E1(r^2 rho_c/(4 k t))."""
@@ -302,7 +305,7 @@ T_fluid = { role = "sensor", column = "T", unit = "degC", over = "left", noise =
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("finite", [True, False])
 def test_a_short_borehole_from_a_case(tmp_path: Path, finite: bool) -> None:
     """Its ends cool it: a case of radius and height finds k, one of the radius alone does not."""

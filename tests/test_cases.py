@@ -144,7 +144,7 @@ def test_template_is_not_written_over(tmp_path):
         write_template(tmp_path / "file" / "below")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_units_of_columns(rod, tmp_path):
     """The same data in Fahrenheit, minutes and with other numbers give the same estimate."""
     import pandas as pd
@@ -178,6 +178,7 @@ def test_layers(rod):
     assert len(preview(prepared, prepared.stream).unknowns) == 2
 
 
+@pytest.mark.slow
 def test_layers_with_priors_of_their_own(rod):
     own = """{ over = ["20 cm", "40 cm"], prior = 0.8, std = "3e-5 m^2/s",
         evolution = { kind = "mean-reverting", time = "1 h" } }"""
@@ -256,6 +257,7 @@ def test_gradient_law_on_averages(rod):
     assert (data.status == 0).all()
 
 
+@pytest.mark.slow
 def test_gradient_law_tunes_itself_on_means_over_subdomains(tmp_path):
     """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
     mesh, times = lp.interval(0, 1, 40), 0.05 * np.arange(201)
@@ -992,7 +994,7 @@ def with_reader(rod, body: str, *changes: tuple[str, str]) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     _, first = result_of(rod())
     path = with_reader(rod, READER)
@@ -1261,7 +1263,7 @@ def measured(data_dir, monkeypatch):
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("measured")
 def test_soil_uniform(tmp_path):
     _, data = result_of(shipped("soil_uniform", tmp_path))
@@ -1272,7 +1274,7 @@ def test_soil_uniform(tmp_path):
     assert found["failed_steps"] == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("measured")
 def test_soil_by_layer(tmp_path):
     _, data = result_of(shipped("soil_layers", tmp_path))

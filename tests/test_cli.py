@@ -116,7 +116,7 @@ def test_equations(here):
     assert "did you mean 'heat'" in bad("equations", "haet")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_values_set_from_outside(rod, here, monkeypatch):
     setting = ("--set", "data.every=9", "--set", "title=Thin")
     assert call("check", rod, *setting)[1].startswith("Thin")
@@ -134,7 +134,7 @@ def test_values_set_from_outside(rod, here, monkeypatch):
     assert code == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_init_check_run_report(here):
     code, output = call("init", "mine")
     assert code == 0
@@ -179,7 +179,7 @@ def test_run_as_json_with_checks(rod):
     assert json.loads(again)["checks"] == content["checks"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_failed_check_is_exit_code_1_with_json(rod):
     path = Path(rod)
     path.write_text(
@@ -221,6 +221,7 @@ def test_data_that_are_refused_leave_nothing(rod, here):
     assert not (here / "out").exists()
 
 
+@pytest.mark.slow
 def test_check_tells_what_can_hardly_be_identified(rod):
     path = Path(rod)
     text = path.read_text().replace("bounds =", "# bounds =")
@@ -278,7 +279,7 @@ def test_a_bad_line_ends_a_run_that_is_kept(rod, here):
     assert "Stopped after 5 samples" in output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_json_lines_file_can_be_checked(rod, here):
     (here / "data.jsonl").write_text(lines(30))
     for arguments in (("--data", "data.jsonl"), ("--set", f"data.file={here}/data.jsonl")):
@@ -308,7 +309,7 @@ def test_ctrl_c_keeps_what_there_is(rod, here):
     assert json.loads(record.read_text())["samples"] == 8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_resume_goes_on_where_a_run_was_killed(rod, here):
     path = Path(rod)
     path.write_text(path.read_text().replace("replay = false", "replay = true"))
@@ -332,7 +333,7 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     xr.testing.assert_identical(runs.open("begun").dataset, whole)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
     class Serves:
         reason = "another program"
@@ -351,7 +352,7 @@ def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
             assert ("not to the last digit" in notes) == resumed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_full_disk_is_one_sentence_where_a_run_goes_on_or_is_shown(rod, here, monkeypatch):
     assert call("run", rod, "--out", "full")[0] == 0
 
@@ -474,7 +475,7 @@ def test_reproduce_and_bench_for_people(fake, here):
 
 
 # The preview of the others takes long: they have hundreds of sensors or many unknowns.
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", ["thermal_response", "sioux", "streambed_047", "soil_column", "soil_layers"]
 )

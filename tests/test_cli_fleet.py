@@ -64,6 +64,7 @@ def alone(out: str, *options: str) -> pd.Series:
     return runs.open(Path(out)).dataset["alpha"].to_series()
 
 
+@pytest.mark.long
 def test_each_row_is_a_run_of_its_own(here):
     code, output = call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
     assert code == 1  # two of them cannot run
@@ -83,6 +84,7 @@ def test_each_row_is_a_run_of_its_own(here):
         assert table.loc[name, "alpha"] == float(mine.dataset["alpha"][-1])
 
 
+@pytest.mark.long
 def test_steps_that_failed_are_told(here):
     """Also of members that are stepped together: nothing else would show it."""
     table = pd.read_csv("rod/rod.csv")
@@ -238,6 +240,7 @@ def _attrs(data: xr.Dataset) -> dict:
     return found
 
 
+@pytest.mark.long
 def test_members_that_are_alike_step_together(alike):
     """What each leaves is what a run of its own leaves."""
     code, output = call(*FIRST, "rods", "--json")
@@ -412,6 +415,7 @@ def test_a_worker_of_another_engine_is_killed(backend):
         xr.testing.assert_identical(*(run.dataset.drop_attrs() for run in (mine, wanted)))
 
 
+@pytest.mark.long
 def test_what_it_leaves_serves_other_commands(alike):
     call(*FIRST, "rods")
     call("report", "rods/b")
@@ -426,6 +430,7 @@ def test_what_it_leaves_serves_other_commands(alike):
     assert case.identifier.step(estimate.t + 20.0, list(case.stream)[-1].z).status.ok
 
 
+@pytest.mark.long
 def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
     """A journal that is written piece by piece is the same as one that is written at once."""
     call(*FIRST, "rods")
@@ -445,6 +450,7 @@ def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
         equal(Path("pieces") / name, Path("rods") / name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("waiting", "how"),
     [(500, "3 separately: they had begun before (3)."), (10**9, "3 were stepped together.")],
@@ -477,6 +483,7 @@ class Killed(BaseException):
     """What a kill looks like from inside."""
 
 
+@pytest.mark.long
 def test_a_signal_ends_all_members_where_they_are(alike, monkeypatch):
     """Others do not begin."""
     others = "d,,,0.1 K\ne,rod/other.csv,,0.1 K\nf,,,0.2 K\n"
@@ -545,6 +552,7 @@ def test_says_why_members_are_run_separately(alike):
     assert [row[1] for row in found["tables"][0]["rows"]] == ["finished"] * 6 + ["failed"]
 
 
+@pytest.mark.long
 def test_a_step_that_fails_is_told_of_that_member_alone(alike):
     """An event in its journal, a status in its dataset."""
     rows = Path("rod/other.csv").read_text().splitlines()
@@ -562,6 +570,7 @@ def test_a_step_that_fails_is_told_of_that_member_alone(alike):
             assert bool(journal.events) == (name == "b")
 
 
+@pytest.mark.long
 def test_a_sample_that_none_can_take_ends_all(alike):
     """A gap in the times that is longer than a step may be divided."""
     for name in ("rod", "other", "third"):

@@ -51,6 +51,7 @@ def times(run: Live) -> list[float]:
     return [record.t for record in run.journal]
 
 
+@pytest.mark.slow
 def test_a_row_days_ahead_of_fast_ones_is_refused(tmp_path):
     given = right(60)
     given.insert(30, {**given[30], "t": 29 * DAY})
@@ -81,6 +82,7 @@ def test_rows_far_ahead_that_agree_are_taken_back(tmp_path, wrong, step):
     assert run.health["ok"]
 
 
+@pytest.mark.slow
 def test_a_gap_that_the_next_row_confirms_loses_nothing(tmp_path):
     given = [*right(40), *moved(right(80, 40), 5000.0)]
     run = run_of(tmp_path, given)
@@ -89,6 +91,7 @@ def test_a_gap_that_the_next_row_confirms_loses_nothing(tmp_path):
     assert run.journal.counts == {}
 
 
+@pytest.mark.slow
 def test_a_clock_that_was_set_back_is_told_and_time_goes_on(tmp_path):
     given = right(200)
     given[100:] = moved(given[100:], -5.0)
@@ -101,6 +104,7 @@ def test_a_clock_that_was_set_back_is_told_and_time_goes_on(tmp_path):
     assert run.health["ok"]
 
 
+@pytest.mark.slow
 def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
     """Nobody can tell which time is right: times go on, and a shift is told."""
     given = right(60 + INSIST)
@@ -110,6 +114,7 @@ def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
     assert told(run) == ["clock"]
 
 
+@pytest.mark.slow
 def test_rows_that_come_again_are_known(tmp_path):
     """A broker or a logger that repeats itself is no clock that was set back."""
     given = right(100)
@@ -119,6 +124,7 @@ def test_rows_that_come_again_are_known(tmp_path):
     assert run.journal.counts == {("repeated", ""): 60}
 
 
+@pytest.mark.slow
 def test_the_backlog_of_a_logger_is_late(tmp_path):
     """Rows of a time in which none has been taken, between rows of now."""
     given = right(200)
@@ -130,6 +136,7 @@ def test_the_backlog_of_a_logger_is_late(tmp_path):
     assert run.journal.counts == {("late", name): 40 for name in COLUMNS}
 
 
+@pytest.mark.slow
 def test_a_shift_survives_a_restart(tmp_path):
     """Times go on with it, and rows are read again with that of their place."""
     path = tmp_path / "data.csv"
@@ -187,6 +194,7 @@ def test_the_hour_twice_without_a_zone_is_a_clock_set_back(tmp_path):
     assert told(run) == ["clock"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("leap", [math.inf, 30 * DAY])
 def test_rows_of_several_channels_are_no_leaps(tmp_path, leap):
     """Three channels a moment apart, and a long time between: each is taken."""

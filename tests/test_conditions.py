@@ -231,6 +231,7 @@ def test_heat_takes_fluxes_over_the_heat_capacity() -> None:
     assert steady(one, {"k": K}) == pytest.approx(steady(two, {"alpha": K / C}))
 
 
+@pytest.mark.slow
 def test_a_constant_input_equals_its_channel() -> None:
     mesh = lp.interval(0.0, LENGTH, 40)
     unknowns = {"k": K, "loss": 0.3, "transfer": 0.2}
@@ -246,6 +247,7 @@ def test_a_constant_input_equals_its_channel() -> None:
         model.with_constant_inputs({"Q": 1.0})
 
 
+@pytest.mark.slow
 def test_one_input_is_constant_and_another_a_channel() -> None:
     model = with_conditions(slab({"right": 0.0}), {"left": Flux(lp.Channel("J"))})
     model = with_conditions(model, sources={"s": Source(lp.Channel("P"))})
@@ -293,6 +295,7 @@ def response(folder: Path, given: str, column: str) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_constant_input_of_a_case_is_that_of_a_column(tmp_path: Path) -> None:
     found = []
     for given, column in (("", COLUMN), ('inputs.Q = "5 kW"', "")):

@@ -82,7 +82,7 @@ def temperatures(cells: int = 400, parts: int = 40) -> np.ndarray:
     return 25.0 + np.array([np.interp(DEPTHS, x, row) for row in rows])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_thin_layer_is_a_contact_resistance(tmp_path: Path) -> None:
     shown = temperatures()
     shown = shown + NOISE * np.random.default_rng(0).standard_normal(shown.shape)

@@ -523,6 +523,7 @@ def test_settings_of_the_controller_that_make_no_sense_are_told(options, says):
         ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_a_search_that_fails_holds_the_inputs_and_says_so():
     model = reduced(modes=2)
@@ -825,6 +826,7 @@ def test_a_limit_that_the_goal_does_not_have_is_not_dropped():
         )
 
 
+@pytest.mark.slow
 def test_references_and_forecasts_are_checked():
     loop = ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD))
     z = [ROOM, ROOM]

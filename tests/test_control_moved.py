@@ -76,6 +76,7 @@ def driven(kind: str, using: str, count: int = 60) -> tuple[float, ct.Action]:
     return float(u[0]), action
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("using", ["LQ", MPC])
 @pytest.mark.parametrize("kind", ["radiating", "field"])
 def test_the_model_of_a_loop_follows_the_estimate(kind, using):

@@ -41,6 +41,7 @@ def inflated(x, factor):
     return changed(x, innovations=changed(one, sums=sums))
 
 
+@pytest.mark.slow
 def test_nothing_changes_where_innovations_are_as_expected():
     work, x = learned()
     assert x.innovations.inflation == 1.0
@@ -49,6 +50,7 @@ def test_nothing_changes_where_innovations_are_as_expected():
     assert C is x.C
 
 
+@pytest.mark.slow
 def test_the_sandwich_of_a_known_direction():
     work, x = learned()
     wide = inflated(x, 3.0)
@@ -60,6 +62,7 @@ def test_the_sandwich_of_a_known_direction():
     np.testing.assert_allclose(V, P @ (np.eye(2) + scale**2 * F) @ P, rtol=1e-8, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_what_no_sensor_sees_keeps_its_prior():
     work, x = learned()
     for scale in (2.0, 30.0, 1e6):
@@ -80,6 +83,7 @@ def test_a_walk_is_no_wider_than_its_prior_of_now():
     assert prior[1, 1] > 2.0
 
 
+@pytest.mark.slow
 def test_the_state_widens_with_the_unknowns():
     work, x = learned()
     wide = inflated(x, 3.0)
@@ -88,6 +92,7 @@ def test_the_state_widens_with_the_unknowns():
     np.testing.assert_allclose(U[0], C[0] @ sensitivity, rtol=1e-7, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_factor_that_is_not_finite_stays_as_it_is():
     work, x = learned()
     broken = changed(inflated(x, 3.0), C=np.full_like(x.C, np.nan))

@@ -99,7 +99,7 @@ def dataset(kind: str = "line", count: int = 6, **options):
 # --- figures -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", MESHES)
 @pytest.mark.parametrize("field", [False, True])
 def test_every_kind_of_run_has_its_panels(kind, field):
@@ -117,6 +117,7 @@ def test_every_kind_of_run_has_its_panels(kind, field):
     assert found["field:u"].figure.data[0].type == drawn
 
 
+@pytest.mark.slow
 def test_a_run_of_one_sample_and_one_without_covariance():
     assert len(panels.panels(dataset(count=1))) > 3
     law = lp.GradientLaw(gain=1e-3, damping=lp.laws.ResidualDamping(c1=1.0))
@@ -125,6 +126,7 @@ def test_a_run_of_one_sample_and_one_without_covariance():
     assert "no covariance" in str(cards.cards(plain, None))
 
 
+@pytest.mark.slow
 def test_looking_back_shows_the_fields_of_then():
     data = dataset(count=9)
 
@@ -141,6 +143,7 @@ def test_looking_back_shows_the_fields_of_then():
     assert np.array_equal(profile(-1.0), data["u"].values[0])
 
 
+@pytest.mark.slow
 def test_unknowns_are_drawn_with_their_intervals():
     data = dataset(count=9)
     figure = figures.unknowns(data, ["loss"])
@@ -151,6 +154,7 @@ def test_unknowns_are_drawn_with_their_intervals():
     assert np.allclose(band, [data["loss"].values - half, data["loss"].values + half])
 
 
+@pytest.mark.slow
 def test_dates_where_the_run_has_an_origin():
     data = dataset()
     assert times.when_axis(data).text(0.6) == "0.6 s"
@@ -160,6 +164,7 @@ def test_dates_where_the_run_has_an_origin():
     assert not times.when_axis(data).dates
 
 
+@pytest.mark.slow
 def test_long_series_are_thinned_but_failures_stay():
     data = dataset(count=4)
     long = data.isel(time=np.zeros(20_000, dtype=int), snapshot=[0])
@@ -169,6 +174,7 @@ def test_long_series_are_thinned_but_failures_stay():
     assert "failed step" in {trace.name for trace in figures.unknowns(long, ["loss"]).data}
 
 
+@pytest.mark.slow
 def test_names_from_files_are_text_in_figures():
     data = dataset().rename({"loss": HOSTILE, "loss_std": f"{HOSTILE}_std"})
     data["sensor"] = [HOSTILE]
@@ -185,6 +191,7 @@ def test_names_from_files_are_text_in_figures():
 # --- cuts ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["triangle", "quad"])
 def test_a_map_is_exact_for_what_is_linear(kind):
     data = dataset(kind, count=1)
@@ -217,6 +224,7 @@ def test_a_hole_stays_open():
     assert np.isfinite(values[(x < 0.9) | (y > 2.1)]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["tetra", "hexahedron"])
 @pytest.mark.parametrize("share", [0.5, 0.37])
 def test_cuts_of_a_cube_are_whole_and_exact(kind, share):
@@ -254,6 +262,7 @@ def test_what_is_kept_is_spread_evenly():
     assert all(number == item for number, item in spread)
 
 
+@pytest.mark.slow
 def test_a_view_follows_a_run(tmp_path, monkeypatch):
     monkeypatch.setattr(views, "OFTEN", 0.0)
     who = identifier()
@@ -282,7 +291,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     assert view.look().status == "stopped"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_long_run_is_read_bit_by_bit_and_thinned(tmp_path, monkeypatch):
     monkeypatch.setattr(views, "OFTEN", 0.0)
     monkeypatch.setattr(views, "AT_ONCE", 100)
@@ -304,6 +313,7 @@ def test_a_long_run_is_read_bit_by_bit_and_thinned(tmp_path, monkeypatch):
         assert np.array_equal(seen.dataset["u"][end], whole["u"][end])
 
 
+@pytest.mark.slow
 def test_a_finished_run_without_a_journal(tmp_path):
     writer = RunWriter.create(tmp_path, version="1", command=["livepde"], title="A rod")
     check = runs.Check("rmse", 0.5, 0.1, "<=")
@@ -337,6 +347,7 @@ def test_watch_needs_a_run(tmp_path):
     assert "holds no run" in str(result.exception)
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_it_says_where_ends_it(tmp_path, monkeypatch):
     begun(tmp_path, identifier()).close()
     before = {*threading.enumerate()}
@@ -525,6 +536,7 @@ def test_a_solid_is_drawn_and_a_token_is_asked_for(tmp_path):
         wait(page, lambda p: "three cuts at 45%" in text(p, ".panel figcaption"))
 
 
+@pytest.mark.slow
 def test_every_visitor_has_a_page_that_needs_nothing_from_elsewhere(tmp_path):
     """What the page names in its text, beside what it has asked for above."""
     begun(tmp_path, identifier()).close()
@@ -545,6 +557,7 @@ def several(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_many_runs_are_a_table(several):
     from livepde.dashboard.overview import PerRun, overview_table
 
@@ -565,6 +578,7 @@ def test_many_runs_are_a_table(several):
         views["notes"]
 
 
+@pytest.mark.slow
 def test_each_run_has_its_page_behind_the_table(several):
     with served(several) as url:
         for path, known in (("", "_dash-"), ("run/east/", "/run/east/_dash-")):

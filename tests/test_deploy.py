@@ -90,6 +90,7 @@ def test_the_health_check_asks_the_run():
     assert ask("a-token-of-the-example").returncode == 1
 
 
+@pytest.mark.slow
 def test_the_dashboard_draws_metrics_that_are_served():
     metrics = Metrics(["T_1"])
     health = {"ok": True, "silent": False, "waiting": 0, "seconds": 1.0, "counts": ()}

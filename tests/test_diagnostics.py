@@ -190,6 +190,7 @@ def build(law):
 SAMPLES = [(0.1 * k, [0.2, 0.1]) for k in range(1, 6)]
 
 
+@pytest.mark.slow
 def test_a_good_law_passes():
     check_law(OpenLoop(), build, SAMPLES).raise_if_failed()
 

@@ -87,7 +87,7 @@ def test_conduction_is_heat_in_other_units():
     assert np.allclose(one, two, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=10, deadline=None)
 @given(st.floats(1e-8, 1e-5), st.floats(1e-7, 1e-3), st.floats(1e-7, 1e-4), st.integers(0, 99))
 def test_random_heat_passes_the_checks(alpha, loss, transfer, seed):
@@ -109,7 +109,7 @@ def test_random_heat_passes_the_checks(alpha, loss, transfer, seed):
     check_model(model, u=10.0, inputs=inputs, seed=seed).raise_if_failed()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=5, deadline=None)
 @given(st.floats(0.1, 5.0), st.floats(5e5, 5e6), st.integers(0, 99))
 def test_random_conduction_passes_the_checks(k, C, seed):

@@ -55,6 +55,7 @@ def test_boundary_values_move_with_time():
     assert np.ptp(estimate.u[edge]) > 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["boundary", "left", "top"])
 def test_bogner_fox_schmit_on_the_boundary(side):
     """Values and slopes along the side are fixed: g of degree 3 is taken on exactly."""
@@ -76,6 +77,7 @@ def test_bogner_fox_schmit_on_the_boundary(side):
     assert len(model.X.fixed) == 2 * vertices + corners
 
 
+@pytest.mark.slow
 def test_bogner_fox_schmit_with_zero_values_and_channels():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
     field = lp.Field(mesh, ElementQuadBFS(), dirichlet={"left": lp.Channel("T"), "right": 1.0})

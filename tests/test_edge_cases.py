@@ -24,6 +24,7 @@ def conduction(prior=1.0, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.3, 1.0, 1.3])
 def test_an_unknown_in_the_principal_part_is_found_from_partial_data(start):
     """Lagged sweeps held A(w) q whole: the iteration went to q = 0 and called it ok."""
@@ -49,6 +50,7 @@ def test_a_sample_without_any_value_is_a_step_of_the_model(sensors):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [0.0, 0.5])
 def test_a_parameter_of_zero_is_no_failure(start):
     """q is nothing but rounding errors then, and has no relative accuracy."""
@@ -110,6 +112,7 @@ def test_a_prediction_that_is_not_a_number_is_not_accepted():
     assert ident.step(0.3, [0.3]).status.ok
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_options_is_refused_and_changes_nothing(tmp_path):
     mesh = line(8)
     model = lp.Model(

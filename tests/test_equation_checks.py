@@ -110,6 +110,7 @@ def models(draw: Any, name: str) -> lp.Model:
     return equation.build(mesh, unknowns, {}, **options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", EQUATIONS)
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data(), seed=st.integers(0, 2**31))
@@ -153,6 +154,7 @@ FORMS: dict[str, Callable[[Any, Any, Any, Any], Any]] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("distribution", [lp.Normal, lp.LogNormal, lp.LogitNormal])
 @pytest.mark.parametrize("kind", KINDS)

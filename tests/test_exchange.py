@@ -108,7 +108,7 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
     assert k == 180
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_unit_compares_with_its_case(rod, unit):
     found = compare_fmu(unit, load(rod))
     assert found.samples == 181
@@ -116,7 +116,7 @@ def test_the_unit_compares_with_its_case(rod, unit):
     assert found.largest <= 1e-10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
     bars = {}
 
@@ -130,7 +130,7 @@ def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
     assert bars == {"in Python": 181, "in the unit": 181}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_unit_of_another_case_is_found_out(rod, tmp_path):
     other = load(rod, settings={"unknowns.alpha.prior": "6e-5 m^2/s"})
     found = compare_fmu(export_fmu(other, tmp_path / "other.fmu"), load(rod))
@@ -161,7 +161,7 @@ def test_the_description_says_names_units_and_times(unit):
     assert description.generationTool.startswith(f"livepde {lp.__version__} by PythonFMU")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
     """FMPy sets the inputs of each communication point, and reads a step later."""
     prepared = load(rod).prepare()
@@ -183,6 +183,7 @@ def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
     assert not found["status"][1:].any()
 
 
+@pytest.mark.slow
 def test_the_state_is_kept_serialised_and_restored(unit):
     with running(unit, 0.0) as one:
         for t, z in history(5):
@@ -202,6 +203,7 @@ def test_the_state_is_kept_serialised_and_restored(unit):
         assert [taken(two, t, z) for t, z in history(5, 5)] == after
 
 
+@pytest.mark.slow
 def test_a_unit_begins_anew_after_a_reset(unit):
     with running(unit, 0.0) as instance:
         before = [taken(instance, t, z) for t, z in history(4)]
@@ -214,6 +216,7 @@ def test_a_unit_begins_anew_after_a_reset(unit):
         assert [taken(instance, t, z) for t, z in history(4)] == before
 
 
+@pytest.mark.long
 def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
     """A master with steps of 6 s, say, while there is a sample every 20 s."""
     with running(unit, 0.0) as instance:
@@ -241,6 +244,7 @@ def test_with_a_period_short_steps_are_not_taken_for_measurements(unit):
             assert found == shown[t][:-1]
 
 
+@pytest.mark.slow
 def test_a_step_that_takes_no_sample_does_not_use_up_its_period(unit):
     with running(unit, 0.0) as instance:
         instance.set(["sample_period"], [20.0])
@@ -252,6 +256,7 @@ def test_a_step_that_takes_no_sample_does_not_use_up_its_period(unit):
     assert found[1:] == [10.0, 20.0, 20.0, 40.0, 40.0, 60.0, 60.0]  # at 0 it could not begin
 
 
+@pytest.mark.slow
 def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
     (tmp_path / "own.py").write_text(
         "import livepde as lp\n"
@@ -272,6 +277,7 @@ def test_a_function_of_ones_own_waits_for_a_first_sample_too(tmp_path):
         assert instance.get(["status", "estimate_time"]) == [0.0, 2.0]
 
 
+@pytest.mark.slow
 def test_what_cannot_be_used_is_a_status_and_a_message(unit):
     (_, z), *others = history(6)
     with running(unit, 0.0) as instance:
@@ -291,6 +297,7 @@ def test_what_cannot_be_used_is_a_status_and_a_message(unit):
         assert taken(instance, t, z)[4] == 0.0
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
     (tmp_path / "own.py").write_text(
         "import numpy as np\n"
@@ -315,6 +322,7 @@ def test_a_step_that_fails_is_a_status_and_a_message(tmp_path):
         assert instance.get(["k", "a_model"]) == before
 
 
+@pytest.mark.slow
 def test_missing_values_are_those_of_the_case(rod, tmp_path):
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
     text = rod.read_text().replace('time_unit = "s"', 'time_unit = "s"\nmissing = [-9999]')
@@ -346,6 +354,7 @@ def test_missing_values_are_those_of_the_case(rod, tmp_path):
     assert shown == pytest.approx(identifier.forecast(t)["T_30"][0] + 273.15)
 
 
+@pytest.mark.slow
 def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 10), ElementLineP1()),
@@ -370,6 +379,7 @@ def test_time_goes_in_seconds_whatever_the_model_counts(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_a_field_goes_out_at_the_vertices(tmp_path):
     def build(cells):
         mesh = lp.interval(0.0, 1.0, cells)
@@ -399,6 +409,7 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
     assert large.notes == ["The field q is no output: it has 1201 vertices, more than 1000."]
 
 
+@pytest.mark.long
 def test_a_function_of_ones_own_becomes_a_unit(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(OWN)
@@ -417,7 +428,7 @@ def test_a_function_of_ones_own_becomes_a_unit(tmp_path, monkeypatch):
             assert found == pytest.approx([estimate.q[0], estimate.q_std[0]], rel=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path):
     (tmp_path / "inside").mkdir()
     shutil.copy(rod.with_name("rod.csv"), tmp_path)
@@ -441,6 +452,7 @@ def test_a_case_with_code_asks_for_leave_and_takes_its_files_along(rod, tmp_path
             assert taken(instance, t, z)[4] == 0.0
 
 
+@pytest.mark.slow
 def test_a_case_takes_its_mesh_along(rod, tmp_path):
     pytest.importorskip("meshio")
     (tmp_path / "meshes").mkdir()
@@ -480,6 +492,7 @@ def test_files_of_one_name_do_not_fit_into_a_unit(rod, tmp_path):
         recipe_of(load(case, allow_code=True))
 
 
+@pytest.mark.slow
 def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
     case = tmp_path / "case.toml"
     case.write_text(re.sub(r"^file = .*\n", "", rod.read_text(), flags=re.MULTILINE))
@@ -492,7 +505,7 @@ def test_a_case_without_data_becomes_a_unit(rod, tmp_path):
         compare_fmu(unit, load(case))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
     header, *rows = rod.with_name("rod.csv").read_text().splitlines()
     begin = datetime(2025, 4, 1)
@@ -515,6 +528,7 @@ def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
         assert (component.outputs[1] == 5e-5) == (t < 600.0)
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(OWN)
@@ -558,6 +572,7 @@ def test_variables_need_names_of_their_own(rod, tmp_path):
         export_fmu(case, tmp_path / "a.fmu")
 
 
+@pytest.mark.slow
 def test_a_unit_that_does_not_run_says_why(rod, tmp_path, monkeypatch):
     unit, broken = export_fmu(rod, tmp_path / "rod.fmu"), tmp_path / "broken.fmu"
     with zipfile.ZipFile(unit) as old, zipfile.ZipFile(broken, "w") as new:
@@ -633,7 +648,7 @@ def test_the_unit_runs_in_a_program_that_is_no_python(rod, tmp_path):
         assert component.outputs[1:3] == pytest.approx(shown, rel=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = CliRunner()
@@ -715,6 +730,7 @@ def test_a_regressor_predicts_before_it_learns():
     assert model.identifier.dump() == before
 
 
+@pytest.mark.slow
 def test_a_regressor_of_one_sensor_takes_numbers():
     model = OnlineRegressor(slab({"a": 0.3}))
     for x, y in measured(5):
@@ -729,6 +745,7 @@ def test_a_regressor_of_one_sensor_takes_numbers():
         several.learn_one({"t": 0.0, "T_left": 0.0}, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", [{"a": 0.3}, {"a": 0.3, "b": 0.6}])
 def test_a_target_that_is_missing_is_not_learned_from(sensors):
     model = OnlineRegressor(slab(sensors))
@@ -739,7 +756,7 @@ def test_a_target_that_is_missing_is_not_learned_from(sensors):
     assert model.estimate.q[0] == pytest.approx(slab(sensors).model.initial_parameter()[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rivers_own_evaluation_runs_it():
     evaluate = pytest.importorskip("river.evaluate")
     metrics = pytest.importorskip("river.metrics")
@@ -759,7 +776,7 @@ def test_rivers_own_evaluation_runs_it():
     assert 0.0 < last <= first
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rivers_checks_that_fit():
     """Not those that leave out features (there is no time then), or pickle models of lambdas."""
     common = pytest.importorskip("river.checks.common")
@@ -780,7 +797,7 @@ def test_rivers_checks_that_fit():
     assert model.clone().estimate is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_page_shows_a_controller_in_three_lines():
     """All blocks run in test_pages.py; here it must act, too."""
     page = (Path(__file__).parents[1] / "docs" / "exchange.md").read_text()

@@ -28,6 +28,7 @@ def biased(tmp_path, monkeypatch):
     return "run"
 
 
+@pytest.mark.long
 def test_the_causes_of_a_verdict_are_listed_and_tested(biased):
     code, output = call("explain", biased)
     assert code == 0
@@ -45,10 +46,12 @@ def test_the_causes_of_a_verdict_are_listed_and_tested(biased):
     assert float(errors["T_10"][2]) < 0.5 * float(errors["T_10"][1])
 
 
+@pytest.mark.long
 def test_a_cause_that_is_none_is_refused(biased):
     assert "lists them" in bad("explain", biased, "9")
 
 
+@pytest.mark.long
 def test_without_a_suspect_there_is_nothing_to_test(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_template(tmp_path / "rod")
@@ -58,6 +61,7 @@ def test_without_a_suspect_there_is_nothing_to_test(tmp_path, monkeypatch):
     assert "no cause" in " ".join(output.split())
 
 
+@pytest.mark.long
 def test_what_a_cause_frees_is_a_setting_of_a_case(biased):
     from livepde import cases, runs
     from livepde.cases.settings import parse

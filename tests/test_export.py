@@ -123,6 +123,7 @@ def test_units_are_those_of_udunits(unit, expected):
     assert udunits(unit) == expected
 
 
+@pytest.mark.slow
 def test_every_name_is_one_of_cf_and_tells_its_own(rod):
     found = cf(rod.dataset)
     assert all(str(name).isidentifier() and str(name).isascii() for name in found.variables)
@@ -147,6 +148,7 @@ def test_a_unit_that_udunits_has_not_is_said_in_words(tmp_path):
     assert "units" not in found
 
 
+@pytest.mark.slow
 def test_what_belongs_to_a_number(rod):
     found = cf(rod.dataset)
     beside = found["loss"].attrs["ancillary_variables"].split()
@@ -161,6 +163,7 @@ def test_what_belongs_to_a_number(rod):
     assert all(name in found for name in beside)
 
 
+@pytest.mark.slow
 def test_temperatures_and_their_differences(rod):
     found = cf(rod.dataset)
     assert found["u"].attrs["units_metadata"] == "temperature: on_scale"
@@ -169,6 +172,7 @@ def test_temperatures_and_their_differences(rod):
     assert "units_metadata" not in found["loss"].attrs
 
 
+@pytest.mark.slow
 def test_the_dataset_itself_is_not_changed(rod):
     before = rod.dataset.copy(deep=True)
     cf(rod.dataset)
@@ -178,6 +182,7 @@ def test_the_dataset_itself_is_not_changed(rod):
 # --- files that xarray opens -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ending", [".nc", ".zarr"])
 def test_xarray_opens_times_as_dates(rod, tmp_path, ending):
     target = tmp_path / f"rod{ending}"
@@ -202,6 +207,7 @@ def test_xarray_opens_times_as_dates(rod, tmp_path, ending):
     assert flags.tolist() == list(range(len(found["status"].attrs["flag_meanings"].split())))
 
 
+@pytest.mark.slow
 def test_without_dates_times_are_numbers_with_a_unit(tmp_path):
     rod = made(tmp_path / "rod")
     export(rod, tmp_path / "rod.nc")
@@ -219,6 +225,7 @@ def test_times_of_a_model_without_units_are_plain_numbers(tmp_path):
     assert xr.decode_cf(found)["time"].values.tolist() == [0.0, 0.5]
 
 
+@pytest.mark.slow
 def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
     export(rod, tmp_path / "rod.nc")
     with xr.open_dataset(tmp_path / "rod.nc", engine="scipy", decode_cf=False) as found:
@@ -262,6 +269,7 @@ def volume(points, kind, corners) -> float:
 # --- tables ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_pandas_opens_what_is_over_time(rod, tmp_path):
     export(rod, tmp_path / "rod.csv")
     found = pd.read_csv(tmp_path / "rod.csv", dtype=str)
@@ -281,6 +289,7 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
     assert len(found) == SAMPLES
 
 
+@pytest.mark.slow
 def test_a_table_without_dates(tmp_path):
     export(made(tmp_path / "rod"), tmp_path / "rod.csv")
     assert pd.read_csv(tmp_path / "rod.csv").columns[0] == "time [s]"
@@ -318,7 +327,7 @@ def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
         assert (lengths > 0.0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("ending", [".vtu", ".vtk"])
 @pytest.mark.parametrize("kind", MESHES)
 def test_vtk_holds_one_time(tmp_path, kind, ending):
@@ -332,6 +341,7 @@ def test_vtk_holds_one_time(tmp_path, kind, ending):
         assert np.array_equal(found.points[:, 0], run.dataset["x"])
 
 
+@pytest.mark.slow
 def test_unknown_fields_are_on_the_mesh_too(tmp_path):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
     data = drive(identifier(field=True), samples()).result.to_xarray()
@@ -344,6 +354,7 @@ def test_unknown_fields_are_on_the_mesh_too(tmp_path):
 # --- a run that goes on ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_that_goes_on_is_exported_as_far_as_it_is(tmp_path):
     folder, who = tmp_path / "rod", identifier()
     RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
@@ -431,6 +442,7 @@ def test_a_report_says_what_there_is_to_say(tmp_path):
         call("export", run.path, tmp_path / "run.html")
 
 
+@pytest.mark.slow
 def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
     run = watched_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "meshio", None)  # as if it were not there
@@ -439,6 +451,7 @@ def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
     assert not (tmp_path / "rod.csv").exists()
 
 
+@pytest.mark.slow
 def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
     run = watched_run(tmp_path / "run")
     (run.path / "case.toml").write_bytes('title = "Fühler"'.encode("cp1252"))
@@ -468,6 +481,7 @@ def test_a_report_says_first_whether_anything_is_wrong(tmp_path, monkeypatch, va
     assert ("Nothing speaks against" in page.text) == (value <= 0.1 and not doubts)
 
 
+@pytest.mark.slow
 def test_a_report_fetches_nothing(tmp_path):
     run = watched_run(tmp_path / "run")
     write_report(run, tmp_path / "run.html")
@@ -479,6 +493,7 @@ def test_a_report_fetches_nothing(tmp_path):
     assert "url(" not in text.split("<style>")[1].split("</style>")[0]
 
 
+@pytest.mark.slow
 def test_titles_and_texts_are_shown_as_they_stand(tmp_path):
     run = watched_run(tmp_path / "run", HOSTILE)
     write_report(run, tmp_path / "run.html")
@@ -491,6 +506,7 @@ def test_titles_and_texts_are_shown_as_they_stand(tmp_path):
     assert page.text.count(HOSTILE) >= 4  # heading, equation, note, event, case
 
 
+@pytest.mark.slow
 def test_names_in_figures_are_data(tmp_path):
     """Names of channels come into a script."""
     run = watched_run(tmp_path / "run")
@@ -501,6 +517,7 @@ def test_names_in_figures_are_data(tmp_path):
     assert "img" not in page.tags
 
 
+@pytest.mark.slow
 def test_a_report_of_a_run_that_goes_on(tmp_path):
     folder, who = tmp_path / "rod", identifier()
     RunWriter.create(folder, version="1", command=["livepde"], title="A rod")
@@ -512,6 +529,7 @@ def test_a_report_of_a_run_that_goes_on(tmp_path):
     assert "running · 6 samples · 0 s to 300 s" in page.text
 
 
+@pytest.mark.slow
 def test_a_report_needs_plotly(tmp_path, monkeypatch):
     run = watched_run(tmp_path / "run")
     monkeypatch.setitem(sys.modules, "plotly.offline", None)
@@ -568,6 +586,7 @@ def test_help_teaches():
     assert "Example:" in output
 
 
+@pytest.mark.slow
 def test_the_command_writes_several(rod, tmp_path):
     targets = [tmp_path / name for name in ("a.nc", "a.CSV", "a.xdmf", "a.zarr")]
     code, output = call("export", rod.path, *targets)
@@ -578,7 +597,7 @@ def test_the_command_writes_several(rod, tmp_path):
     assert not [path for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["a.nc", "a.csv", "a.xdmf", "a.vtu", "a.zarr"])
 def test_nothing_is_written_over_unasked(rod, tmp_path, name):
     target = tmp_path / name
@@ -593,6 +612,7 @@ def test_nothing_is_written_over_unasked(rod, tmp_path, name):
         assert xr.open_dataset(target, engine="zarr").sizes["time"] == 3
 
 
+@pytest.mark.slow
 def test_the_file_beside_xdmf_is_not_written_over_either(rod, tmp_path):
     (tmp_path / "a.h5").write_text("mine")
     with pytest.raises(RunError, match=r"a\.h5 exists"):
@@ -601,6 +621,7 @@ def test_the_file_beside_xdmf_is_not_written_over_either(rod, tmp_path):
     assert not (tmp_path / "a.xdmf").exists()
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_no_store_stays(rod, tmp_path):
     mine = tmp_path / "mine.zarr"
     mine.mkdir()
@@ -636,6 +657,7 @@ def test_a_moment_is_a_number_a_quantity_or_a_date(rod, tmp_path, moment):
     assert np.array_equal(found.point_data["u"], rod.dataset["u"].values[1])
 
 
+@pytest.mark.slow
 def test_a_date_needs_dates(tmp_path):
     run = made(tmp_path / "rod")
     with pytest.raises(ConfigurationError, match="the run's times have no date"):

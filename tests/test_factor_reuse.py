@@ -23,6 +23,7 @@ def plate():
     return given, [(t, G @ u) for t, u in given.forward(given.q_true)]
 
 
+@pytest.mark.long
 def test_a_kept_factor_changes_no_number(plate, monkeypatch):
     given, samples = plate
     law = lp.GradientLaw(
@@ -51,6 +52,7 @@ def test_a_kept_factor_changes_no_number(plate, monkeypatch):
         assert one.q == pytest.approx(other.q, rel=0, abs=1e-6 * np.abs(other.q).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [lp.GradientLaw(1.0, lp.laws.ResidualDamping(0.1)), lp.GradientLaw("auto")],

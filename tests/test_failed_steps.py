@@ -32,6 +32,7 @@ def sample(k: int) -> tuple[float, list[float], dict[str, float]]:
     return 0.1 * k, [20.0 + 0.02 * k, 20.0 + 0.01 * k], {"left": 20.0 + 5.0 * math.sin(k / 3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
 @pytest.mark.parametrize("place", ["input", "sensor"])
 @pytest.mark.parametrize("value", [1e150, -1e308])
@@ -85,6 +86,7 @@ class Failing(lp.SensitivityLaw):
         return new, report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("error", "code"),
     [

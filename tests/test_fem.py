@@ -174,6 +174,7 @@ def test_hermite_functions_are_exact_far_from_the_origin(span):
     np.testing.assert_allclose(mass[2, :6] / h, row, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_one_element_object_on_two_meshes():
     """scikit-fem's global elements remember their first mesh."""
     element, argyris = ElementLineHermite(), ElementTriArgyris()

@@ -24,6 +24,7 @@ def test_the_page_shows_the_files(name: str) -> None:
     assert len(shown.splitlines()) <= limit
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walk", WALKS)
 def test_the_tables_are_those_of_another_code(walk: str, tmp_path) -> None:
     write(tmp_path, walk, WRITTEN)
@@ -44,7 +45,7 @@ def test_each_case_is_one_file_without_a_law() -> None:
         assert not {"law", "steps", "intake"} & set(case)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_of_the_walks_hold_the_truth() -> None:
     for walk, seeds in (("furnace", 2), ("borehole", 10)):
         outcome = first_hour((walk,), seeds=seeds)

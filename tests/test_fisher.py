@@ -38,6 +38,7 @@ def error(function, wave, cells, span, **options):
     return model.state_block.at_vertices @ u - wave(mesh.p[0], t)
 
 
+@pytest.mark.slow
 def test_the_exact_wave_of_fisher_kpp():
     coarse, fine = (np.abs(error(fisher_kpp, kpp_wave, n, (-20, 40))).max() for n in (150, 300))
     assert fine < 4e-4

@@ -127,6 +127,7 @@ def test_a_forecast_begins_where_nothing_was_measured_yet():
     assert np.array_equal(identifier.forecast(0.5).z, found.z)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
     fixed = rod(LAWS["sensitivity"])
     moving = lp.Identifier(
@@ -147,6 +148,7 @@ def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
     assert np.isnan(moving.forecast(times[1])["c"]).all()
 
 
+@pytest.mark.slow
 def test_the_deviation_is_that_of_the_unknown_times_the_derivative():
     """What is known of u0 is exact: all that the sensors may deviate by comes from k."""
     inputs, h = {"T_end": 1.0, "heat": 1.0}, 1e-4
@@ -162,6 +164,7 @@ def test_the_deviation_is_that_of_the_unknown_times_the_derivative():
     assert np.isnan(rod(LAWS["gradient"]).forecast(0.1, inputs).z_std).all()
 
 
+@pytest.mark.slow
 def test_deviations_grow_as_an_unknown_moves():
     """In steps that are not long: in one long step a second-order scheme is not monotone."""
     still, moving = rod(lp.SensitivityLaw()), rod(lp.SensitivityLaw(), evolution=lp.RandomWalk(0.1))
@@ -205,6 +208,7 @@ def test_a_sensor_that_does_not_exist_is_told():
         found["T_99"]
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_is_the_status_of_the_forecast():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1()),
@@ -220,6 +224,7 @@ def test_a_step_that_fails_is_the_status_of_the_forecast():
     assert np.isnan(found.z_std[1:]).all()
 
 
+@pytest.mark.slow
 def test_a_controller_acts_on_each_estimate_before_the_next_sample():
     """The plant answers to what the controller did with the estimate of the sample before."""
     model = excited()

@@ -93,6 +93,7 @@ def test_a_kept_factor_gives_what_one_for_each_parameter_gives(wind):
     assert not np.array_equal(kept[-1], fresh[-1])
 
 
+@pytest.mark.slow
 def test_tangents_may_be_less_accurate_than_the_state(model):
     parameters = [bump(model, 1.0 + 0.2 * (k > 0)) for k in range(4)]
     fresh, _, _ = go(model, parameters, kept_from_start=False)
@@ -133,6 +134,7 @@ def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
     assert spent[renewed:] == [0.0] * (21 - renewed)
 
 
+@pytest.mark.slow
 def test_a_factor_is_kept_while_the_process_rests():
     """What corrections leave there is rounding, whose rate tells nothing."""
     steady = square_at_rest()
@@ -147,6 +149,7 @@ def test_a_factor_is_kept_while_the_process_rests():
     np.testing.assert_allclose(c[:, 0], 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_errors_are_small_beside_slow_changes():
     """A state that changes by 1e-8 of itself in a step is not left where it was."""
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
@@ -203,7 +206,7 @@ ENGINES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "engine", [*list(ENGINES)[:-1], pytest.param("multigrid", marks=pytest.mark.study)]
 )

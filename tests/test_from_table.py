@@ -371,6 +371,7 @@ def test_a_preview_of_what_was_read(here):
     assert tomllib.loads(Path("mine/case.toml").read_text())["steps"] == {"dt_max": "1800 s"}
 
 
+@pytest.mark.slow
 def test_options_for_what_the_table_does_not_tell(here):
     Path("my.csv").write_text("a;b\ntime;T\n03/02/2026 08:00;20\n03/02/2026 08:10;20\n")
     runner = CliRunner()
@@ -514,7 +515,7 @@ def test_a_process_that_nothing_drives_is_noted(here, more, driven):
     assert any(told in note for note in case.notes) is not driven
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_case_of_a_rod_is_fifteen_lines_and_runs(here):
     write_template(Path("rod"))
     runner = CliRunner()
@@ -532,6 +533,7 @@ def test_the_case_of_a_rod_is_fifteen_lines_and_runs(here):
     assert json.loads(done.stdout)["measures"]["alpha"] == pytest.approx(9.7e-5, rel=0.02)
 
 
+@pytest.mark.slow
 def test_from_a_table_to_estimates(here):
     rod, _ = write_template(Path("rod"))
     runner = CliRunner()
@@ -586,6 +588,7 @@ def two_tables() -> list[str]:
     return ["--data", "warm.csv", "--data", "heater.csv", "--equation", "borehole"]
 
 
+@pytest.mark.long
 def test_two_tables_are_joined_by_time(here):
     begin = ["init", "mine", *two_tables()]
     sets = [part for key, value in FILES.items() for part in ("--set", f"{key}={value}")]

@@ -90,7 +90,7 @@ def test_a_table_becomes_dots(maker):
     assert maker.shown("jumps", "row\n" * 100).endswith("... (55 lines more)")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_picture_becomes_small(maker, tmp_path):
     from PIL import Image
 

@@ -90,6 +90,7 @@ def test_a_cubic_has_no_spike_at_irregular_times():
     assert not find_spikes(t, t**3 - 20.0 * t**2 + 1e-6 * np.sin(50.0 * t)).any()
 
 
+@pytest.mark.slow
 def test_changes_that_stay_are_no_spikes():
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -301,7 +302,7 @@ def plant(folder: Path, left: str = "", sensor: str = "", wait: float = 0.0, bro
 BROKEN = {30: "", 31: "", 60: "9999", 119: ""}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
     whole = cases.load(plant(tmp_path)).prepare()
     whole_k = float(whole.identifier.run(whole.stream).to_xarray()["alpha"][-1])

@@ -34,7 +34,7 @@ def spoiled(samples, at, value):
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("at", [3, 20, 150])
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_bad_value_changes_next_to_nothing(law, at):
     clean = rod(LAWS[law]()).run(readings()).last
     spiked = rod(LAWS[law]()).run(spoiled(readings(), {at}, 9999.0)).last
@@ -43,20 +43,21 @@ def test_one_bad_value_changes_next_to_nothing(law, at):
     assert std < 1.5 * wanted
 
 
+@pytest.mark.slow
 def test_without_the_gate_one_bad_value_spoils_all():
     law = lp.SensitivityLaw(gate=np.inf, guards=None, start_window=0)
     value, _ = rod(law).run(spoiled(readings(), {150}, 9999.0)).last.parameters["alpha"]
     assert value == pytest.approx(0.05 - 10 * 0.03)  # as far as latent values go
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_refused_where_nothing_is_wrong():
     for seed in range(4):
         data = rod(lp.SensitivityLaw()).run(readings(seed=seed)).to_xarray()
         assert float(data["refused"].sum()) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_noise_that_is_stated_too_small_does_not_close_the_gate():
     result = rod(lp.SensitivityLaw()).run(readings(400, noise=20 * NOISE))
     refused = result.to_xarray()["refused"].values
@@ -65,7 +66,7 @@ def test_a_noise_that_is_stated_too_small_does_not_close_the_gate():
     assert abs(value - 0.06) < 3 * std < 0.06
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_lasts_is_believed():
     identifier = rod(lp.SensitivityLaw(gate_patience=5))
     found = [identifier.step(t, z) for t, z in spoiled(readings(), set(range(100, 120)), 40.0)]
@@ -74,7 +75,7 @@ def test_what_lasts_is_believed():
     assert refused[105] == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_many_refusals_are_said():
     bad = set(range(10, 200, 15))
     data = rod(lp.SensitivityLaw()).run(spoiled(readings(), bad, 500.0)).to_xarray()

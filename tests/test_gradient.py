@@ -93,6 +93,7 @@ def test_energy_of_the_papers_example(gain):
     assert np.diff(energy).max() <= 1e-13 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["triangles P1", "quads Q1"])
 def test_energy_in_the_plane_with_irregular_steps(name):
     model = CASES[name].model(f=lambda x, t: 10 * (1 + np.sin(t) * x[0]))
@@ -104,6 +105,7 @@ def test_energy_in_the_plane_with_irregular_steps(name):
     assert np.diff(energy).max() <= 1e-13 * energy[0]
 
 
+@pytest.mark.slow
 def test_energy_of_a_diffusivity_with_a_time_dependent_model():
     model = reaction(
         line(12),
@@ -120,6 +122,7 @@ def test_energy_of_a_diffusivity_with_a_time_dependent_model():
     assert np.diff(energy).max() <= 1e-13 * energy[0]
 
 
+@pytest.mark.slow
 def test_excited_twin_is_identified():
     """DESIGN.md, fact 5, a short run: q* between 2 and 5 from q0 = 0."""
     model = excited(16)
@@ -168,7 +171,7 @@ def resolved():
     return partly_observed(lp.Alexander2(), 1280)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("scheme", "order"), [(lp.ImplicitEuler(), 1), (lp.Alexander2(), 2)], ids=["euler", "alexander"]
 )
@@ -178,6 +181,7 @@ def test_order_in_time_of_the_coupled_step(scheme, order, resolved):
     np.testing.assert_allclose(rates(errors), order, atol=0.15)
 
 
+@pytest.mark.slow
 def test_precomputed_products_do_not_change_the_numbers():
     """A bilinear model, and the same one made to look time-dependent: two code paths."""
     fast = partly_observed(lp.ImplicitEuler(), 10)
@@ -299,6 +303,7 @@ def test_a_share_is_one_of_the_residual_that_the_prediction_had():
     assert dense.relative(found, *given) <= 2 * min(0.03 * missed, newton.ceiling)
 
 
+@pytest.mark.slow
 def test_a_strict_tolerance_below_rounding_is_reached_as_far_as_numbers_go():
     for seed in range(5):
         stage, problem, dense, given = a_stage(
@@ -312,6 +317,7 @@ def test_a_strict_tolerance_below_rounding_is_reached_as_far_as_numbers_go():
         assert dense.relative(y, *given) <= 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", [lp.ImplicitEuler(), lp.Alexander2()])
 def test_without_samples_the_law_is_the_model(scheme):
     model = excited(10)
@@ -327,6 +333,7 @@ def test_without_samples_the_law_is_the_model(scheme):
     assert np.isnan(estimate.innovation).all()
 
 
+@pytest.mark.slow
 def test_a_missing_sensor_takes_no_part():
     """With one sensor missing, the step is that of an observation without it."""
     model = excited(10)
@@ -339,6 +346,7 @@ def test_a_missing_sensor_takes_no_part():
     np.testing.assert_array_equal(both.u, one.u)
 
 
+@pytest.mark.slow
 def test_stabilising_term_decays_q():
     model = excited(6)
     ident = identifier(model, lp.GradientLaw(sigma=0.7, newton=EXACT), q0=3.0)
@@ -349,6 +357,7 @@ def test_stabilising_term_decays_q():
         np.testing.assert_allclose(estimate.q, q0 / (1 + 0.7 * 0.5) ** k, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_nu_damps_the_unobserved_part():
     model = reaction(line(12), ElementLineP1(), B=lambda u, v, x: -0.5 * laplace(u, v, x))
     sensors = lp.Subdomain(lambda x: x[0] > 0.5)
@@ -363,6 +372,7 @@ def test_nu_damps_the_unobserved_part():
     assert sizes[1] < sizes[0]
 
 
+@pytest.mark.slow
 def test_operators_are_users_choice():
     model = excited(8)
     first = lp.GradientLaw(gain=100.0, M_op=lambda u, v, x: u * v)
@@ -375,6 +385,7 @@ def test_operators_are_users_choice():
     assert abs(identifier(model, first).step(0.1, z).q - other).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_bounds_of_numbers_are_kept():
     """Data of q = 3 drive q up to its bound, and no further."""
     model = lp.Model(
@@ -480,6 +491,7 @@ def test_sensors_that_see_the_parameter_are_refused():
         identifier(model, lp.GradientLaw(), sensors)
 
 
+@pytest.mark.slow
 def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     model = excited(10)
     law = lp.GradientLaw(gain=1e4, newton=lp.stepping.Newton(iterations=0))
@@ -498,7 +510,7 @@ def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     assert np.isfinite(after.u).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("damping", [lp.laws.ResidualDamping(0.0), lp.laws.ConstantDamping(1.0)])
 def test_a_reaction_that_blows_up(damping):
     """u_t = exp(u) - ... reaches infinity in finite time wherever nothing is observed."""
@@ -517,7 +529,7 @@ def test_a_reaction_that_blows_up(damping):
     assert ident.t == 0.001
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_checked_contract():
     model = excited(8)
     times = [0.1, 0.2, 0.35, 0.5, 0.55, 0.7]

@@ -47,6 +47,7 @@ def history(model: lp.Model, times: Any, at: Any, inputs: Any, q: Any = None) ->
     return np.array([probe @ u for _, u in steps])[-(len(times) - 1) :]
 
 
+@pytest.mark.slow
 def test_drawdown_is_that_of_theis():
     r = np.array([10.0, 30.0, 90.0, 300.0])
     exact = theis(r, TIMES[1:, None], k * b, Ss * b, Q)
@@ -58,6 +59,7 @@ def test_drawdown_is_that_of_theis():
     assert errors[1] < 0.3 * errors[0]  # second order
 
 
+@pytest.mark.slow
 def test_drawdown_recovers_when_the_pump_stops():
     """Theis with a second well of negative rate from then on."""
     stop = 2000.0
@@ -76,7 +78,7 @@ def plane(cell: float = 4.0) -> MeshQuad:
     return MeshQuad.init_tensor(axis, axis)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wells_in_the_plane_superpose():
     T, S = 5e-3, 2e-3
     wells = {"Q1": (-20.0, 0.0), "Q2": (21.0, 9.0)}
@@ -140,7 +142,7 @@ def test_radial_flow_passes_the_checks(log_k: float, log_Ss: float, seed: int):
     check_model(model, u=rng.normal(), inputs={"Q": rng.normal()}, seed=seed).raise_if_failed()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(deadline=None, max_examples=10)
 @given(st.floats(-5, 0), st.floats(-5, 0), st.booleans(), st.integers(0, 1000))
 def test_flow_in_the_plane_passes_the_checks(log_T: float, log_S: float, field: bool, seed: int):
@@ -195,6 +197,7 @@ def test_published_tests_are_found_again(name: str, data_dir: Any, monkeypatch: 
     assert outcome.ok
 
 
+@pytest.mark.slow
 def test_the_tomography_of_horkheim_passes_the_checks():
     place = spec_from_file_location("pumping", ROOT / "cases" / "pumping.py")
     pumping = module_from_spec(place)

@@ -65,7 +65,7 @@ def off(estimate: lp.Estimate, name: str, true: float) -> float:
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-5])
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_overconfident_linearisation_is_iterated(noise: float):
     """DESIGN.md, fact 5: partial exact data with a small stated noise."""
     model, _ = seed_excited.build()
@@ -98,7 +98,7 @@ def test_an_overconfident_linearisation_is_iterated(noise: float):
 
 
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
-@pytest.mark.slow
+@pytest.mark.long
 def test_guards_do_nothing_where_all_is_well(replay: Any):
     model = rod()
     stream = samples(model, 0.25, 100)
@@ -111,7 +111,7 @@ def test_guards_do_nothing_where_all_is_well(replay: Any):
         assert one.notes == other.notes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("size", "length"), [(3.0, 1), pytest.param(1.0, 10, marks=pytest.mark.study), (30.0, 10)]
 )
@@ -132,7 +132,7 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     assert found[-1].parameters["q"][1] < 0.5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_guards_did_is_said():
     model = explosive()
     stream = [(t, z + 3.0 * (60 <= k < 70)) for k, (t, z) in enumerate(samples(model, 2.0, 80))]
@@ -143,6 +143,7 @@ def test_what_guards_did_is_said():
     assert "used with more than their noise" in said
 
 
+@pytest.mark.slow
 def test_a_failure_that_nothing_helps_against_is_a_status():
     """An input that no state can follow: the same status and estimate as without guards."""
     state = lp.Field(MESH, ElementLineP1(), dirichlet={"left": lp.Channel("T"), "right": 0.0})
@@ -161,7 +162,7 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
     assert identifier.step(0.2, [0.0, 0.0, 0.0], {"T": 0.0}).status.ok
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_burst_follows_a_rest():
     """Excitation returns at once after 10 s, in which the unknown may have gone anywhere.
 
@@ -184,7 +185,7 @@ def test_no_burst_follows_a_rest():
     assert [values[-1] for values in ends[lp.laws.Guards()]] == pytest.approx([0.3] * 3, abs=0.05)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_winds_up_while_nothing_is_excited():
     model = rod(lambda t: float(t < 2))
     found = run(model, samples(model, 0.3, 2000), drift=0.3)
@@ -194,7 +195,7 @@ def test_nothing_winds_up_while_nothing_is_excited():
     assert stds[-1] == pytest.approx(0.2, rel=0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_log_reaches_back_far_enough_and_stays_short():
     law = lp.SensitivityLaw(guards=lp.laws.Guards(past=8))
     identifier = lp.Identifier(rod(), POINTS, law, u0=0.0)
@@ -284,7 +285,7 @@ def holds(data: Any) -> np.ndarray:
     return held == 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: float):
     model = reaction(lambda t: 1.0 * (t < 20.0))
@@ -316,7 +317,7 @@ def test_the_law_goes_on_when_excitation_returns():
     assert any("samples, last at t = 20" in s for s in doubts(data))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_faster_than_the_samples_is_not_at_rest():
     values = np.random.default_rng(1).standard_normal(700)
     fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
@@ -372,7 +373,7 @@ FAST = np.random.default_rng(1).standard_normal(2000)
 PART = lp.Subdomain(lambda x: (x[0] > 0.3) & (x[0] < 0.9))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("sensors", [lp.Full(), PART], ids=["full", "part"])
 @pytest.mark.parametrize(
@@ -396,7 +397,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     assert last.correlation < 0.5  # this, it would be held
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("gain", [1.0, 1e4])
 @pytest.mark.parametrize("c1", [0.1, 1.0])
 def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
@@ -423,6 +424,7 @@ def test_probes_see_the_same_by_assembly_in_every_unit():
     np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.pairs[1].T], 1.0)
 
 
+@pytest.mark.slow
 def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
     model = reaction(lambda t: 1.0 * (t < 5.0))
     stream = list(full(model, 300))

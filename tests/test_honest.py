@@ -102,7 +102,7 @@ def simulated(problem, theta, refine, substeps):
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-@pytest.mark.slow
+@pytest.mark.long
 def test_truths_agree_with_livepde_refined(name):
     problem = PROBLEMS[name]
     theta = 0.7 * np.random.default_rng(5).standard_normal(problem.coordinates)
@@ -155,6 +155,7 @@ class ShortNonlinearFlux(NonlinearFlux):
     length, intervals = 2.0, 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [ShortWarmRod, ShortFlux, ShortNonlinearFlux])
 def test_derivatives_of_the_truth(kind):
     problem = kind()
@@ -165,6 +166,7 @@ def test_derivatives_of_the_truth(kind):
     np.testing.assert_allclose(exact, expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_the_flux_of_the_truth_walks_as_the_estimator_believes():
     problem = ShortFlux()
     rng = np.random.default_rng(3)
@@ -216,7 +218,7 @@ def test_kinds_of_data():
 # --- batch and scores ----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_batch_posterior_holds_its_truths():
     """Errors of the batch fit in its own standard deviations are standard normal."""
     problem, errors = PROBLEMS["column"], []
@@ -288,7 +290,7 @@ def test_twins_are_scored_in_every_kind():
     assert [row[:10] for row in again.tables[0].rows] == [row[:10] for row in white]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_command():
     given = ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1"]
     code, output = bench("honest", *given, "--json")

@@ -18,6 +18,7 @@ from livepde.streams.csvfile import read_csv
 from livepde.streams.table import Column
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_case_is_one_sentence(tmp_path, name):
     path = hostile_case(tmp_path, name)

@@ -37,6 +37,7 @@ def report(*args: Any, **options: Any) -> Identifiability:
     return identifiability(*learned(*args, **options))
 
 
+@pytest.mark.slow
 def test_pinned_and_flat():
     found = report({"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     assert [item.verdict for item in found.unknowns] == ["pinned", "flat"]
@@ -44,6 +45,7 @@ def test_pinned_and_flat():
     assert (found.pairs, found.directions, found.sentences) == ((), (), [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1000.0])
 def test_two_that_only_their_difference_shows_are_named_whatever_their_units(scale: float):
     unknowns = {"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, scale)}
@@ -56,6 +58,7 @@ def test_two_that_only_their_difference_shows_are_named_whatever_their_units(sca
     assert found.sentences[0].startswith("a and b are traded off against each other")
 
 
+@pytest.mark.slow
 def test_three_of_which_only_a_sum_shows():
     unknowns = {name: lp.Normal(0.0, 1.0) for name in "abc"}
     found = report(unknowns, lambda q: q.a + q.b + q.c)
@@ -82,6 +85,7 @@ def test_modes_of_a_field_and_a_number_that_stands_for_its_mean():
     assert [pair[:2] for pair in both.pairs] == [("a", "q")]
 
 
+@pytest.mark.slow
 def test_a_number_at_its_bound():
     found = report({"a": lp.Normal(0.5, 1.0, bounds=(0.2, 2.0))}, lambda q: q.a, z=1.5)
     assert found.unknowns[0].verdict == "at its bound"
@@ -102,6 +106,7 @@ def test_the_width_counts():
     assert wider.left == pytest.approx(3 * known.left)
 
 
+@pytest.mark.slow
 def test_a_law_without_covariance():
     model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     with pytest.raises(lp.errors.ConfigurationError, match="run SensitivityLaw or AutoLaw"):

@@ -46,6 +46,7 @@ def frozen(ident):
     return ident.t, ident._samples, ident._state
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("item", "error", "words"),
     [
@@ -78,6 +79,7 @@ def test_a_bad_sample_is_one_sentence_and_changes_nothing(item, error, words):
     assert ident.step(*sample()).status.ok
 
 
+@pytest.mark.slow
 def test_time_must_go_on():
     ident = identifier()
     ident.step(*sample(0.0))  # the start itself
@@ -89,6 +91,7 @@ def test_time_must_go_on():
     assert frozen(ident) == before
 
 
+@pytest.mark.long
 def test_a_missing_input_holds_its_last_value():
     held, sent = identifier(), identifier()
     for ident in (held, sent):
@@ -98,6 +101,7 @@ def test_a_missing_input_holds_its_last_value():
     np.testing.assert_array_equal(estimate.u, sent.step(*sample(0.2, T_end=0.7)).u)
 
 
+@pytest.mark.slow
 def test_nan_and_absent_are_missing_samples():
     one, two = identifier(), identifier()
     t, values = sample()
@@ -108,7 +112,7 @@ def test_nan_and_absent_are_missing_samples():
     assert np.isfinite(first.innovation[1])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_withheld_channels_are_scored_and_never_used():
     one, two = identifier(), identifier()
     for k in range(1, 5):
@@ -118,6 +122,7 @@ def test_withheld_channels_are_scored_and_never_used():
     assert second.withheld_error[0] - first.withheld_error[0] == pytest.approx(98.7)
 
 
+@pytest.mark.slow
 def test_before_assimilation_begins_data_are_only_scored():
     ident = identifier(assimilate_from=0.25)
     first = ident.step(*sample(0.1))
@@ -157,6 +162,7 @@ def limited(iterations):
     return lp.GradientLaw(damping=lp.laws.ResidualDamping(0.0), newton=newton, gate=None)
 
 
+@pytest.mark.slow
 def test_a_failed_step_reports_and_the_stream_goes_on():
     """Newton is given one iteration for a nonlinear reaction, then enough."""
     ident = cubic_decay(limited(1), u0=3.0)
@@ -173,6 +179,7 @@ def test_a_failed_step_reports_and_the_stream_goes_on():
     assert good.step(1.5, z).status.ok
 
 
+@pytest.mark.slow
 def test_a_stage_that_is_not_solved_is_halved_as_often_as_asked():
     """With two iterations short substeps can be solved, and long ones cannot."""
     z = np.full(3, 0.5)
@@ -190,6 +197,7 @@ def test_a_stage_that_is_not_solved_is_halved_as_often_as_asked():
     assert cubic_decay(lp.GradientLaw()).problem.control.halvings == lp.Advance.halvings == 8
 
 
+@pytest.mark.slow
 def test_without_halvings_solved_steps_are_the_same():
     one, other = cubic_decay(lp.GradientLaw()), cubic_decay(lp.GradientLaw(), halvings=0)
     for k in range(1, 6):
@@ -242,6 +250,7 @@ def test_a_continued_run_is_bit_identical(law, tmp_path):
             np.testing.assert_array_equal(found.u, expected.u)
 
 
+@pytest.mark.slow
 def test_saved_before_the_first_sample(tmp_path):
     one, two = identifier(), identifier()
     one.save(tmp_path / "state.bin")
@@ -249,6 +258,7 @@ def test_saved_before_the_first_sample(tmp_path):
     np.testing.assert_array_equal(one.step(*sample()).q, two.step(*sample()).q)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_an_earlier_format_is_refused(monkeypatch):
     ident = identifier()
     ident.step(*sample())
@@ -258,6 +268,7 @@ def test_a_checkpoint_of_an_earlier_format_is_refused(monkeypatch):
         identifier().restore(content)
 
 
+@pytest.mark.slow
 def test_checkpoints_that_cannot_be_used(tmp_path):
     ident = identifier()
     ident.step(*sample())
@@ -282,7 +293,7 @@ def stream(n=20):
     return [lp.Sample(*sample(0.1 * k, a=0.1 + 0.01 * k)) for k in range(n)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_result_has_named_axes_and_units(tmp_path):
     result = identifier().run(stream(), fields_every=7)
     assert len(result) == 20
@@ -306,7 +317,7 @@ def test_a_result_has_named_axes_and_units(tmp_path):
         np.testing.assert_array_equal(again["u"].values, data["u"].values)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_table_of_a_result():
     result = identifier().run(stream())
     table = result.table()
@@ -316,7 +327,7 @@ def test_a_table_of_a_result():
     assert table["withheld_error:c"]["count"] == 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_result_can_be_drawn():
     figure = identifier().run(stream()).plot()
     assert figure.axes
@@ -339,7 +350,7 @@ def test_a_field_in_the_plane():
     assert "withheld_error" not in data
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_progress_is_silent_where_nobody_watches(capsys):
     identifier().run(stream(), progress=True)
     assert capsys.readouterr() == ("", "")
@@ -359,6 +370,7 @@ def test_substeps_are_those_made_by_hand():
     np.testing.assert_allclose(estimate.q, found.q, atol=1e-8)
 
 
+@pytest.mark.long
 def test_rows_of_a_pandas_table_count_by_name():
     import pandas as pd
 
@@ -374,6 +386,7 @@ def test_rows_of_a_pandas_table_count_by_name():
     assert np.array_equal(last.u, expected.u)
 
 
+@pytest.mark.long
 def test_samples_of_other_tables():
     import pandas as pd
 

@@ -88,6 +88,7 @@ def run(
     return twin.error(estimate.q), np.asarray(estimate.q), estimate.notes
 
 
+@pytest.mark.slow
 def test_seed_reaches_its_floor_without_a_gain() -> None:
     model, omega = seed.build()
     twin = Twin(
@@ -106,6 +107,7 @@ def test_seed_reaches_its_floor_without_a_gain() -> None:
     assert errors[20] <= 0.06  # and it was there at t = 12: kept while the excitation dies
 
 
+@pytest.mark.slow
 def test_excited_twin_with_exact_data() -> None:
     model, full = seed_excited.build()
     twin = Twin(
@@ -128,7 +130,7 @@ def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[s
     return run(*rod(), **dict(options))[1:]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options", [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
 )
@@ -145,7 +147,7 @@ def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> 
     assert notes["departure"] == pytest.approx(before["departure"], rel=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_sampling_rate_and_mesh_do_not_matter_without_noise() -> None:
     errors = [run(*rod(**case))[0] for case in ({}, {"dt": 0.05}, {"dt": 0.025}, {"cells": 40})]
     assert max(errors) <= 0.01
@@ -178,6 +180,7 @@ def test_what_a_right_model_may_do_is_no_departure() -> None:
         assert learning.departure(twice, q0 + 20.0 * once) == pytest.approx(far)
 
 
+@pytest.mark.slow
 def test_what_has_faded_was_told_all_the_same() -> None:
     model, twin = rod()
     law, seen = AUTO, twin.observation
@@ -189,7 +192,7 @@ def test_what_has_faded_was_told_all_the_same() -> None:
     assert notes["information"] == learned.total.sum() / learned.spread
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
     # Noise of one spectral density: a deviation that grows with the root of the rate.
     notes = [
@@ -229,6 +232,7 @@ def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(nois
         assert run(*rod(), noise=noise, told=told)[0] <= 1.2 * untold
 
 
+@pytest.mark.slow
 def test_exact_data_are_not_smoothed() -> None:
     for told in (0.0, 1e-3):
         model, twin = rod()
@@ -238,7 +242,7 @@ def test_exact_data_are_not_smoothed() -> None:
         assert max(alphas) == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_more_noise_less_weight_on_the_data() -> None:
     found = [run(*rod(), noise=noise)[2]["information"] for noise in (0.0, 0.01, 0.03, 0.1)]
     assert found == sorted(found, reverse=True)
@@ -273,6 +277,7 @@ def test_what_was_learned_stays_without_excitation() -> None:
     assert errors[-1] <= 1.5 * errors[40]  # at t = 20 there is nothing but noise
 
 
+@pytest.mark.slow
 def test_a_gap_and_partial_sensors() -> None:
     model, twin = rod(observation=lp.Subdomain(lambda x: x[0] > 0.4))
     identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
@@ -284,6 +289,7 @@ def test_a_gap_and_partial_sensors() -> None:
     assert twin.error(estimate.q) <= 0.6
 
 
+@pytest.mark.slow
 def test_averages_and_a_number() -> None:
     mesh = lp.interval(0, 1, 20)
     model = lp.Model(
@@ -307,6 +313,7 @@ def test_averages_and_a_number() -> None:
     assert abs(estimate.q - 1.5) <= 0.3
 
 
+@pytest.mark.slow
 def test_a_run_can_be_saved_and_continued(tmp_path) -> None:
     model, twin = rod()
     samples = list(twin)
@@ -356,7 +363,7 @@ def test_what_cannot_be_is_one_sentence() -> None:
         lp.Identifier(model, lp.Full(), AUTO, u0=0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_missing_sensors_are_no_noise_that_turns_back():
     """What a change of the sensors leaves in r made the noise level negative, and the gain huge."""
     points, rng = np.linspace(0.1, 0.9, 9), np.random.default_rng(1)
@@ -418,6 +425,7 @@ def test_a_square_seen_in_a_part(size: int, best: float, noise: float) -> None:
     assert errors[-1] <= (1.3 * best if noise < 0.01 else 0.3)
 
 
+@pytest.mark.slow
 def test_an_unknown_far_from_its_prior_is_a_failed_step() -> None:
     model, twin = rod()
     twin = replace(twin, q_true=lambda x: 60.0 + 40.0 * x[0])

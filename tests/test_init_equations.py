@@ -242,7 +242,7 @@ def test_every_equation_is_tried():
     assert set(FILLED) == set(EQUATIONS)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EQUATIONS)
 def test_the_case_runs_as_written(here, name):
     filled, equation = FILLED[name], EQUATIONS[name]

@@ -171,7 +171,7 @@ NOTED = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("mistake", "prepare"), NOTED.items())
 def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, capsys):
     prepare()
@@ -180,6 +180,7 @@ def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, cap
     assert f"Note: {messages()[mistake]}\n" in out
 
 
+@pytest.mark.slow
 def test_check_tells_of_data_that_tell_nothing(home, monkeypatch, capsys):
     rest()
     _, out, _ = livepde(("check", "mine/case.toml"), monkeypatch, capsys)

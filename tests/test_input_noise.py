@@ -50,7 +50,7 @@ def states(model, inputs, scheme) -> np.ndarray:
 
 @pytest.mark.parametrize("flux", [False, True])
 @pytest.mark.parametrize(("scheme", "tolerance"), [(ImplicitEuler(), 0.01), (Alexander2(), 0.05)])
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tolerance):
     """Each reading one standard deviation off moves the state; squares add up."""
     model, noise = rod(std=1e-9, flux=flux), 0.2
@@ -81,6 +81,7 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     assert 1.0 - tolerance <= ratio[0] <= near + tolerance
 
 
+@pytest.mark.slow
 def test_a_model_that_is_not_linear_has_it_too():
     model, noise = rod(std=1e-9, cube=5.0), 1e-3
     inputs = np.array([channel(k) for k in range(6)])
@@ -185,7 +186,7 @@ def test_an_offset_is_not_learned_from_the_state_that_was_made_with_it():
 
 
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())])
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_start_does_not_end_in_the_unknowns(law):
     """Means of squared errors over expected variances: of order one with the noise of the start."""
     scores = []
@@ -283,6 +284,7 @@ def test_an_exact_start_has_no_noise(tmp_path):
     assert np.linalg.norm(there) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_members_of_a_fleet_start_from_readings_of_their_own():
     model, points = rod(), lp.Points(SENSORS, noise=0.05)
     hats = [{"T_1": lambda x: 1.0 - x[0]}, {"T_1": lambda x: 1.0 - x[0], "T_5": lambda x: x[0]}, {}]
@@ -297,6 +299,7 @@ def test_members_of_a_fleet_start_from_readings_of_their_own():
         assert found.q_std[j] == pytest.approx(one.belief.q_std, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_a_fleet_steps_as_its_members_do():
     model, points = rod(), lp.Points(SENSORS, noise=0.01)
     options = {"u0": 0.0, "input_noise": {"left": 0.1}}

@@ -57,6 +57,7 @@ def test_a_logarithm_has_quantiles_of_a_log_normal_number():
     assert ends.split(" to ")[0].startswith(f"{low:.2g}")
 
 
+@pytest.mark.slow
 def test_bounds_cut_an_interval_off():
     estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1, bounds=(0.28, 0.33))))
     low, high = estimate["a"].interval(0.9999)
@@ -99,6 +100,7 @@ def test_without_covariance_there_is_no_interval():
     assert tables(data)[0].rows[0][3] == "–"
 
 
+@pytest.mark.slow
 def test_an_unknown_is_read_by_its_label():
     estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1)))
     value, std = estimate.parameters["a"]

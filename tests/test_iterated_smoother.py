@@ -50,6 +50,7 @@ def ends(model, law, samples, u0=0.0):
     return [identifier.step(*sample) for sample in samples]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.5), lp.MeanReverting(2.0)])
 def test_nothing_changes_where_all_is_linear(evolution):
     model = sourced(evolution)
@@ -63,6 +64,7 @@ def test_nothing_changes_where_all_is_linear(evolution):
         np.testing.assert_allclose(other.u, one.u, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_poor_prior_leaves_no_error_behind():
     """From priors far off on both sides the estimate is the same, within what is left uncertain."""
     found = []
@@ -77,7 +79,7 @@ def test_a_poor_prior_leaves_no_error_behind():
     assert abs(high - low) < 0.25 * std
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     begun, descended = [], iterated_smoother._descended
 
@@ -96,6 +98,7 @@ def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     assert any(end < first - 1.0 for first, end in begun)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("explained", [True, False])
 def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, explained):
     begun = []
@@ -122,6 +125,7 @@ def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, exp
     assert max(begun) == 1 if explained else max(begun) == 3
 
 
+@pytest.mark.slow
 def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
     """The smoothed trajectory of a linear problem is the least squares solution."""
     model = sourced(lp.RandomWalk(0.5))
@@ -164,6 +168,7 @@ def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
     np.testing.assert_allclose(found[1:], exact[0], atol=0.1 * growth / prior_std + 0.02)
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch):
     monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda work, state: None)
     model = sourced()
@@ -174,6 +179,7 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
     np.testing.assert_array_equal(found[-1].q, plain.q)
 
 
+@pytest.mark.slow
 def test_a_settled_run_iterates_no_more():
     model = sourced()
     found = ends(model, lp.SensitivityLaw(start_window=8), readings(model, [1.5]))
@@ -187,6 +193,7 @@ def test_a_window_that_is_negative_is_refused():
         lp.SensitivityLaw(start_window=-1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
     """A rod with two conductivities is through after few samples, and costs few steps till then."""
@@ -208,6 +215,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
     assert len(taken) <= 2 * len(found)
 
 
+@pytest.mark.slow
 def test_a_direction_that_is_not_told_keeps_the_start_open():
     model = sourced()
     law = lp.SensitivityLaw(start_window=16)

@@ -89,7 +89,7 @@ class Breaks:
         pass
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["accept", "append", "checkpoint", "step"])
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monkeypatch, method):
     count = CHECKPOINT + 40
@@ -121,6 +121,7 @@ def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monk
         assert other.accepted == count
 
 
+@pytest.mark.long
 def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
     path = tmp_path / NAME
     run = started(tmp_path, 60, sinks=[Breaks(37)])
@@ -143,6 +144,7 @@ def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
     assert len(after["estimates"]) == 60
 
 
+@pytest.mark.long
 def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
     whole, stopped = tmp_path / "whole", tmp_path / "stopped"
     whole.mkdir(), stopped.mkdir()
@@ -161,6 +163,7 @@ def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
         assert list(other)[-1].snapshot is not None
 
 
+@pytest.mark.slow
 def test_an_event_of_a_refused_sample_comes_with_its_withdrawal(tmp_path):
     feed = Rows([{"t": 0.0, "a": 1.0, "b": 1.0, "left": 1.0}, {"t": 0.1, "a": 1.0}])
     run = live(tmp_path, feed)
@@ -179,7 +182,7 @@ def limit_pages(kept: Journal, more: int) -> None:
     kept._db.execute(f"PRAGMA max_page_count = {pages + more}")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
     whole, full = tmp_path / "whole", tmp_path / "full"
     whole.mkdir(), full.mkdir()
@@ -206,6 +209,7 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
         assert other.accepted == 300
 
 
+@pytest.mark.long
 def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
     run = started(tmp_path, 100)
     limit_pages(run.journal, 10)
@@ -245,6 +249,7 @@ class Failing:
         return getattr(self._raw, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [2, 40, 43, 60, 73, 100])
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first):
     whole, failing = tmp_path / "whole", tmp_path / "failing"
@@ -284,6 +289,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
         assert {kind for kind, *_ in found - told} == {"disk", "well"}
 
 
+@pytest.mark.slow
 def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
     tmp_path, monkeypatch
 ):
@@ -422,6 +428,7 @@ def test_a_folder_that_may_only_be_read(shared, killed):
     shared.chmod(0o755)
 
 
+@pytest.mark.slow
 def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     path = tmp_path / NAME
     partial = tmp_path / f"{NAME}.0.partial"
@@ -434,6 +441,7 @@ def test_a_journal_appears_whole_or_not_at_all(tmp_path):
     Journal.open(path, write=True).close()  # the lock is free
 
 
+@pytest.mark.slow
 def test_whether_a_journal_is_written_and_when(tmp_path):
     path = tmp_path / NAME
     assert written(path) == 0.0
@@ -447,6 +455,7 @@ def test_whether_a_journal_is_written_and_when(tmp_path):
     assert not in_use(path)
 
 
+@pytest.mark.slow
 def test_two_writers(tmp_path):
     first = journal(tmp_path / NAME)
     with pytest.raises(lp.errors.RunError, match="written by another process"):
@@ -456,6 +465,7 @@ def test_two_writers(tmp_path):
     first.close()
 
 
+@pytest.mark.slow
 def test_who_asks_whether_it_is_written_keeps_no_writer_out(tmp_path, monkeypatch):
     """To ask takes the lock for a moment."""
     monkeypatch.setattr("livepde.runs.database.MOMENT", PATIENCE)
@@ -466,6 +476,7 @@ def test_who_asks_whether_it_is_written_keeps_no_writer_out(tmp_path, monkeypatc
     Journal.open(tmp_path / NAME, write=True).close()
 
 
+@pytest.mark.slow
 def test_a_journal_that_is_held_is_not_read_as_if_nobody_wrote(tmp_path, monkeypatch):
     path = finished(tmp_path)
     connect = database._connect
@@ -509,7 +520,7 @@ def refused(path: Path, match: str = "damaged|not a journal|malformed|not a data
         other.unlink()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("keep", [0, 1, 50, 99, 4096, 5000, 20000])
 def test_a_file_that_was_cut_off(tmp_path, keep):
     path = finished(tmp_path)
@@ -523,7 +534,7 @@ def twelve(tmp_path_factory) -> bytes:
     return finished(tmp_path_factory.mktemp("twelve"), 12).read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(
     max_examples=60,
     deadline=None,
@@ -584,7 +595,7 @@ HOSTILE = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("command", HOSTILE)
 def test_a_file_made_to_do_harm_is_one_sentence(tmp_path, command):
     path = finished(tmp_path)
@@ -613,6 +624,7 @@ def signed(path: Path) -> None:
     raw.close()
 
 
+@pytest.mark.long
 def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
     for command in (
         "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
@@ -634,7 +646,7 @@ class Evil:
         return os.system, ("touch evil",)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["pickle", "text", "complex", "shape"])
 def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kind):
     monkeypatch.chdir(tmp_path)
@@ -691,7 +703,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
     assert seen >= 150
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_open_reader_does_not_let_the_log_grow(tmp_path):
     run = started(tmp_path, 1500)
     with Journal.open(tmp_path / NAME) as reader:
@@ -719,7 +731,7 @@ class First:
 # --- retention -----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
     count, retention = 10 * CHECKPOINT, Retention(10.0, 7)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -753,7 +765,7 @@ def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path
                 assert (mine[t].snapshot is None) == (yours[t].snapshot is None)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_thinning_while_somebody_iterates(tmp_path):
     run = started(tmp_path, 3 * CHECKPOINT)
     run.run()
@@ -767,7 +779,7 @@ def test_thinning_while_somebody_iterates(tmp_path):
     run.journal.close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_journal_that_is_thinned_stops_growing(tmp_path):
     run = started(tmp_path, 1)
     run.run()
@@ -807,7 +819,7 @@ ROWS = st.fixed_dictionaries(
 ) | st.dictionaries(st.text(max_size=5), VALUES, max_size=4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(max_examples=300, deadline=None)
 @given(st.lists(ROWS, max_size=20))
 def test_any_row_becomes_part_of_a_sample_or_has_a_reason(found):
@@ -856,6 +868,7 @@ def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
             intake.take(row.values, row.token)
 
 
+@pytest.mark.slow
 def test_right_lines_arrive_between_any_others(tmp_path):
     write(tmp_path, 40)
     path = tmp_path / "data.csv"
@@ -928,6 +941,7 @@ def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):
 # --- checksums -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "command",
     [
@@ -950,7 +964,7 @@ def test_a_record_that_is_not_as_it_was_is_told(tmp_path, command):
     refused(path, match="damaged.*--salvage")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("rest", [1, 0])
 def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
@@ -980,7 +994,7 @@ def test_the_older_checkpoint_serves_where_the_newest_is_broken(tmp_path, rest):
         same(one, other)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
     run = started(tmp_path, 3 * CHECKPOINT, retention=Retention(span=1.0))
     run.run()
@@ -995,6 +1009,7 @@ def test_a_checkpoint_that_is_gone_for_good_is_told(tmp_path):
         kept.rewind()
 
 
+@pytest.mark.slow
 def test_what_is_whole_is_salvaged(tmp_path):
     path = finished(tmp_path)
     with Journal.open(path) as kept:
@@ -1023,7 +1038,7 @@ def test_what_is_whole_is_salvaged(tmp_path):
         Salvage(tmp_path / "none")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_journal_that_was_cut_off_is_salvaged(tmp_path):
     path = finished(tmp_path, 600)
     whole = path.read_bytes()

@@ -37,6 +37,7 @@ def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE, **options: An
 
 
 # Every two of replay, change and seed once.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "replay", "change"),
     [
@@ -62,6 +63,7 @@ def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, se
     assert abs(value - 0.3 * change) < 5 * std < 0.02
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
 @pytest.mark.parametrize("seed", [1, 5, 7])
 def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(replay: Any, seed: int):
@@ -75,6 +77,7 @@ def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(replay: Any, 
     assert values[-1] == pytest.approx(0.24, abs=0.01)
 
 
+@pytest.mark.long
 def test_a_sample_without_a_measurement_is_no_evidence():
     """What the last measured sample showed does not count again in those after it."""
     nothing = np.full(len(POINTS), np.nan)
@@ -128,6 +131,7 @@ def test_settings_that_cannot_be_meant_are_refused(options: Any):
         Jumps(**options)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("guess", [1e-3, 1e-2, 1e-1, 1.0])
 def test_the_noise_is_found_from_any_first_guess(guess: float):
     law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16))

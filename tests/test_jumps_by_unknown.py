@@ -57,7 +57,7 @@ THREE = (1.0, 3.0, 0.5, 0.6)  # two large jumps and a small one
 
 
 @pytest.mark.parametrize("noise", [1e-3, 2e-3])
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_large_jumps_do_not_hide_a_third_one(noise: float):
     """The innovations that a jump has left behind are not by what the next one is measured.
 
@@ -70,7 +70,7 @@ def test_two_large_jumps_do_not_hide_a_third_one(noise: float):
 
 
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_does_not_jump_keeps_what_is_known_of_it(replay: Any):
     found, alarms = run(THREE, 1e-3, FLUX, replay)
     # One value beyond the gate may be a fault of its sensor: the next one makes it a jump.
@@ -85,7 +85,7 @@ def test_what_does_not_jump_keeps_what_is_known_of_it(replay: Any):
         assert found[k].parameters["v"][0] == pytest.approx(level, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_usual_size_hardly_grows_with_jumps():
     law, jumps = lp.SensitivityLaw(jumps=FLUX), []
     identifier = lp.Identifier(rod(16), lp.Points(POINTS, noise=1e-3), law, u0=0.0)

@@ -61,7 +61,7 @@ def quads():
     return MeshQuad(mesh.p + 0.05 * np.sin(7.0 * mesh.p[::-1]), mesh.t)  # no parallelograms
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_models_on_large_meshes(name, pieces):
     def make():
@@ -255,7 +255,7 @@ def square(cells=12):
     return reaction(factories.square(cells), ElementTriP1(), f=lambda x, t: np.exp(-t) * x[0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "sensors"),
     [

@@ -41,6 +41,7 @@ SPIKE = [np.exp(-0.05 * (k + 1)) for k in range(30)]
 SPIKE[12] = 9999.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(guards=None), lp.SensitivityLaw()])
 @pytest.mark.parametrize("prior", [lp.LogNormal(0.4, 0.1), lp.LogitNormal(0.4, 0.1, (0.0, 1.0))])
 def test_a_spike_does_not_take_a_latent_value_beyond_its_ends(prior: Any, law: Any):
@@ -72,7 +73,7 @@ def test_what_is_reached_is_told():
     assert not any("held" in text for text in doubts(fair))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stated_number_counts_and_infinity_is_no_end():
     far = [np.exp(-2.0 * (k + 1) * 0.1) for k in range(40)]
     narrow = lp.LogNormal(0.5, 0.01)
@@ -84,7 +85,7 @@ def test_a_stated_number_counts_and_infinity_is_no_end():
     assert "bounded" not in free
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_filter_stays_linear_so_that_nothing_is_lost():
     """While the estimate is held, the filter learns as ever: afterwards it is where it would be."""
     values = [5.0] * 3 + [0.0] * 60
@@ -103,7 +104,7 @@ def test_the_filter_stays_linear_so_that_nothing_is_lost():
     np.testing.assert_allclose(a["innovation"].values, b["innovation"].values, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_walk_has_no_end():
     walk = lp.Scalar(lp.Normal(0.0, 0.1), evolution=lp.RandomWalk(1.0))
     data = run(source(walk), stream([5.0] * 30), u0=0.0).to_xarray()
@@ -111,6 +112,7 @@ def test_a_walk_has_no_end():
     assert "bounded" not in data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pointwise", [True, False])
 def test_a_field_stays_within_its_ends(pointwise: bool):
     inner = lp.Sobolev(1, 0.3).pointwise(1) if pointwise else lp.Sobolev(1, 0.3)

@@ -43,7 +43,7 @@ UNKNOWNS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("unknown", UNKNOWNS)
 @pytest.mark.parametrize(
     "law",
@@ -61,6 +61,7 @@ def test_an_estimate_that_is_read_later_is_the_same(unknown, law):
             np.testing.assert_array_equal(getattr(read, name), getattr(at_once, name))
 
 
+@pytest.mark.slow
 def test_what_is_not_read_is_not_computed(monkeypatch):
     made = []
     made_by = Belief.__init__
@@ -80,6 +81,7 @@ def test_what_is_not_read_is_not_computed(monkeypatch):
     assert len(made) == 1
 
 
+@pytest.mark.slow
 def test_an_unread_estimate_holds_no_factor_of_the_stage():
     """What it keeps until it is read is of the size of the belief that it gives then."""
     identifier = rod()
@@ -97,6 +99,7 @@ def test_an_unread_estimate_holds_no_factor_of_the_stage():
     assert not hasattr(estimate, "_read")
 
 
+@pytest.mark.slow
 def test_an_estimate_is_copied_with_its_belief():
     identifier = rod()
     for sample in samples(3):
@@ -110,7 +113,7 @@ def test_an_estimate_is_copied_with_its_belief():
         estimate.velocity  # noqa: B018
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("unknown", UNKNOWNS)
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(), lp.AutoLaw(), lp.GradientLaw()])
 def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
@@ -128,7 +131,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
         np.testing.assert_array_equal(readout(estimate.belief), wanted)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_result_keeps_little_more_than_its_numbers():
     identifier = rod(withheld=lp.Points({"T_0": 0.4}))
     count = 1000

@@ -216,7 +216,7 @@ def test_what_cannot_be_stepped_as_arrays_says_why():
     assert score.note == "not run: constant unknowns and linear sensors only"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_lean_reference_is_a_row_where_it_applies():
     score = table.run_row(ROD, 0.01, 0, "lean reference")
     ours = table.run_row(ROD, 0.01, 0, "sensitivity")
@@ -264,7 +264,7 @@ def test_every_bound_is_of_a_process_that_is_timed():
     assert {(given.nodes, given.ends) for given in costs.RODS} == set(costs.EARLIER)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
     monkeypatch.setattr(earlier, "SIZES", ((12, 2), (31, 2)))
     earlier.compare(earlier.ROOT / "src", "HEAD", 2)

@@ -165,7 +165,7 @@ def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.slow
+@pytest.mark.long
 def test_engines_agree_with_dense_algebra(engine, seed):
     rng = np.random.default_rng(seed)
     matrix = regular(25, rng, spd=engine in DEFINITE)
@@ -184,6 +184,7 @@ def test_engines_agree_with_dense_algebra(engine, seed):
         np.testing.assert_array_equal(b, kept)  # right-hand sides are not written over
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
 def test_engines_refuse_singular_and_infinite_matrices(engine):
     pattern = Pattern.of(sp.diags_array([np.ones(4), np.ones(5), np.ones(4)], offsets=[-1, 0, 1]))
@@ -198,6 +199,7 @@ def test_engines_refuse_singular_and_infinite_matrices(engine):
             solver.factorise(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", [e for e in ENGINES if e.values[0] in DEFINITE[1:]])
 def test_engines_that_prove_it_refuse_an_indefinite_matrix(engine):
     matrix = sp.diags_array([np.ones(19), np.full(20, 1.5), np.ones(19)], offsets=[-1, 0, 1])
@@ -297,6 +299,7 @@ def test_banded_engine_finds_a_narrow_order():
     assert max(BandedSolver(Pattern.of(shuffled)).band) <= 2
 
 
+@pytest.mark.slow
 @given(st.integers(1, 12), st.integers(0, 2**32 - 1), st.floats(-0.5, 2.0))
 @settings(max_examples=80, deadline=None)
 def test_positive_definite_is_the_sign_of_the_smallest_eigenvalue(n, seed, shift):

@@ -40,7 +40,7 @@ def closed():
         OPENED.pop().close()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     write(tmp_path, 50)
     run = live(tmp_path)
@@ -58,7 +58,7 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     xr.testing.assert_identical(kept.assign_attrs(verdict=found.attrs["verdict"]), found)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_samples_in_order_go_on_after_the_last_one(tmp_path):
     def samples():
         return (lp.Sample(row.pop("t"), row) for row in rows(20))
@@ -128,6 +128,7 @@ def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     assert rest.journal.accepted == 700
 
 
+@pytest.mark.slow
 def test_one_writer_many_readers(tmp_path):
     write(tmp_path, 20)
     run = live(tmp_path)
@@ -219,6 +220,7 @@ def test_each_channel_has_habits_of_its_own():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overflow", ["merge", "drop"])
 def test_what_comes_too_fast_is_merged_or_dropped_and_counted(tmp_path, overflow):
     write(tmp_path, 100)
@@ -251,6 +253,7 @@ def test_lines_that_are_no_rows(text):
     assert json_row(text).broken
 
 
+@pytest.mark.slow
 def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path):
     mixed = list(rows(20))
     wrong = {"a": 0.7, "b": 0.4, "left": 1.0}
@@ -263,6 +266,7 @@ def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path):
     assert len(run.journal) == 20
 
 
+@pytest.mark.slow
 def test_a_refused_sample_does_not_let_known_ones_come_again(tmp_path):
     mixed = list(rows(20))
     mixed[1:1] = [{"t": 0.05, "a": 0.7, "b": 0.4, "left": None}]  # of the moment it is refused
@@ -290,7 +294,7 @@ class Batch(Rows):
         return [row for _ in range(5) for row in super(Batch, self).poll(wait)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_irregular_is_counted_once_whenever_it_is_killed(tmp_path):
     write(tmp_path, 30)
     path = tmp_path / "data.csv"
@@ -421,6 +425,7 @@ def health_of(run: Live) -> list[tuple[str, str]]:
     return [(e.kind, e.message) for e in run.journal.events if e.kind in ("unwell", "well")]
 
 
+@pytest.mark.slow
 def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     now, right = [0.0], [*rows(45)]  # so few that no verdict is looked at
     old = [{**right[0], "t": -1.0 - k} for k in range(10)]
@@ -437,6 +442,7 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     assert run.journal.health == ""
 
 
+@pytest.mark.slow
 def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
     run = live(tmp_path, Rows(rows(101)))
     run.run()
@@ -474,6 +480,7 @@ def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
     assert not run.health["ok"]
 
 
+@pytest.mark.slow
 def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
     class Fails(type(identifier())):
         def step(self, t, z, inputs=None):
@@ -498,6 +505,7 @@ def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
         assert run.health["ok"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("deaths", [1, 2, 3])
 def test_a_sample_in_which_the_process_ends_again_and_again_is_set_aside(tmp_path, deaths):
     """The mark in the journal counts; a process that was killed once or twice loses nothing."""
@@ -529,6 +537,7 @@ def test_a_sample_in_which_the_process_ends_again_and_again_is_set_aside(tmp_pat
         assert len(list(kept)) == 20 - aside
 
 
+@pytest.mark.slow
 def test_health_and_metrics(tmp_path):
     def ask(path):
         with urllib.request.urlopen(

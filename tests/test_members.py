@@ -157,7 +157,7 @@ def test_members_are_taken_put_and_joined_and_square_roots_widened():
     assert changed(whole, value=np.zeros(3)).inner is whole.inner
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bank_goes_on_where_the_step_of_a_member_fails():
     """All step alone then: logs of members stay in line, and the others have their sample."""
     model = lp.Model(
@@ -185,6 +185,7 @@ def test_a_bank_goes_on_where_the_step_of_a_member_fails():
     assert (np.diff(times, axis=1) > 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_fleet_whose_withheld_sensors_read_channels_of_their_own():
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
     sensors, hidden = lp.Points([0.3, 0.6], noise=0.01), lp.observation.Moving({"probe": "x_p"})
@@ -211,7 +212,7 @@ def test_members_without_a_reading_step_with_the_others(monkeypatch: pytest.Monk
     assert not alone
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
     """The log of a member that failed for some samples is that of a run of its own."""
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
@@ -235,6 +236,7 @@ def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
     assert alarms
 
 
+@pytest.mark.slow
 def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("livepde.laws.auto.SILENCE", 30)
     model = rod({"left": 1.0, "right": 0.0})

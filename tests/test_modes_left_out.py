@@ -38,6 +38,7 @@ def ran(modes: int | str, journal=None) -> lp.Result:
         return drive(one, samples, journal=kept).result
 
 
+@pytest.mark.slow
 def test_the_share_is_that_of_the_prior_beyond_the_modes():
     result = ran(4)
     belief, share = result.last.belief, result.to_xarray()["s_left_out"]
@@ -59,12 +60,14 @@ def test_a_sentence_says_so_with_the_remedy():
     assert row[-2] == f"{100 * float(data['s_left_out'][-1]):.2g} %"
 
 
+@pytest.mark.slow
 def test_where_nothing_is_left_out_nothing_is_said():
     data = ran(41).to_xarray()
     assert float(data["s_left_out"][-1]) < 1e-6
     assert not [text for text in doubts(data) if "modes" in text]
 
 
+@pytest.mark.slow
 def test_a_journal_keeps_the_share(tmp_path):
     ran(4, tmp_path / "journal.sqlite")
     with Journal.open(tmp_path / "journal.sqlite") as kept:

@@ -122,7 +122,7 @@ PAIRS = list(itertools.product(EVOLUTIONS, REPLAYS))
 
 
 # Each evolution with each replay, and each of both with one substep and with several.
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "replay", "substeps"),
     [(*pair, (1, 4)[k % 2]) for k, pair in enumerate(PAIRS)],
@@ -151,7 +151,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
         np.testing.assert_allclose(np.sqrt((factor**2).sum(axis=1)), std, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "replay"),
     [(name, (None, lp.Replay(first=3, window=9))[k % 2]) for k, name in enumerate(EVOLUTIONS)],
@@ -163,6 +163,7 @@ def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Path):
     model = linear_model(lp.RandomWalk(0.4))
     first, other = (
@@ -189,6 +190,7 @@ def test_an_initial_state_may_read_channels():
     np.testing.assert_allclose(estimate.u, 3.0, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("replay", "first"), [(None, True), (lp.Replay(first=2), True), (lp.Replay(first=2), False)]
 )
@@ -213,7 +215,7 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     assert abs(value - 5.0) < std < 0.01
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -317,6 +319,7 @@ def test_an_unknown_initial_state_is_not_for_the_gradient_law(law: Any):
         lp.Identifier(starting(lp.Normal(1.0, 1.0)), lp.Full(), law)
 
 
+@pytest.mark.slow
 def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     path, _ = write_template(tmp_path)
     text = path.read_text()
@@ -334,6 +337,7 @@ def test_the_preview_does_not_depend_on_what_is_measured(tmp_path: Path):
     assert other.posterior == pytest.approx(row.posterior, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_the_preview_tells_of_the_end_and_of_errors_that_are_not_seen(
     tmp_path: Path, monkeypatch: Any
 ):
@@ -357,7 +361,7 @@ def test_the_preview_tells_of_the_end_and_of_errors_that_are_not_seen(
     assert not preview(prepared, stream[:60]).last
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
     placed, count = replay_slices.placed, []
@@ -436,7 +440,7 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         assert strength == pytest.approx([0.5 * 3.0 * slope * 0.5])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
     """A logarithm that sensors see directly: the first samples overshot, and widened all."""
     model = lp.Model(

@@ -136,6 +136,7 @@ def test_every_name_that_a_dataset_has_is_known_to_the_check():
     assert {f"c{end}" for end in FIELD_ENDS} <= set(data.variables)
 
 
+@pytest.mark.slow
 def test_a_note_of_the_same_name_stands_beside_the_unknown():
     """`innovation_ratio` and `jump` are not read from unknowns that are called so."""
     model = decay(["innovation_ratio", "jump"])

@@ -62,6 +62,7 @@ LAWS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_a_reading_counts_with_its_own_noise_as_with_that_of_its_sensor(law):
     """Also in iterated starts, replays and members of a bank, which take readings again."""
@@ -72,6 +73,7 @@ def test_a_reading_counts_with_its_own_noise_as_with_that_of_its_sensor(law):
     assert same(one, two)
 
 
+@pytest.mark.slow
 def test_readings_of_any_noise_give_the_weighted_least_squares():
     """The amplitude of a source, in which the readings are linear."""
     model = lp.Model(
@@ -105,6 +107,7 @@ def test_readings_of_any_noise_give_the_weighted_least_squares():
     assert 10.0 * np.linalg.norm(C) == pytest.approx(information**-0.5, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_noise_that_is_not_there_is_that_of_the_sensor():
     stated, own = identifier(), identifier()
     for t, z, _ in stream(10):
@@ -112,6 +115,7 @@ def test_noise_that_is_not_there_is_that_of_the_sensor():
         assert same(one, two)
 
 
+@pytest.mark.slow
 def test_all_forms_say_the_same():
     each = [identifier() for _ in range(4)]
     for t, z, std in stream(8):
@@ -125,6 +129,7 @@ def test_all_forms_say_the_same():
         assert all(same(found[0], other) for other in found[1:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("z", "text"),
     [
@@ -173,6 +178,7 @@ def test_a_withheld_reading_may_have_noise_and_is_scored_all_the_same():
     assert estimate.withheld_error == pytest.approx([0.5], abs=0.2)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
     """Of those that an iterated start or a replay takes again."""
     for law in (lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())):
@@ -186,6 +192,7 @@ def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
         assert same(last, again)
 
 
+@pytest.mark.slow
 def test_a_journal_keeps_noise_and_a_run_goes_on_with_it(tmp_path):
     samples = [
         lp.Sample(t, np.column_stack([z, std]) if k % 3 else z)
@@ -206,6 +213,7 @@ def test_a_journal_keeps_noise_and_a_run_goes_on_with_it(tmp_path):
         assert same(driven.result.last, whole)
 
 
+@pytest.mark.slow
 def test_members_of_a_fleet_have_noise_of_their_own():
     fleet = lp.Fleet(
         rod(),
@@ -261,6 +269,7 @@ def case(folder, text=CASE):
     return cases.load(folder / "case.toml")
 
 
+@pytest.mark.slow
 def test_a_column_of_a_case_holds_the_noise(tmp_path):
     prepared = case(tmp_path).prepare()
     found = [sample.z.get("noise of T") for sample in prepared.stream]
@@ -274,6 +283,7 @@ def test_a_column_of_a_case_holds_the_noise(tmp_path):
     assert np.isfinite(result.to_xarray()["innovation"]).sum() == 5
 
 
+@pytest.mark.slow
 def test_rows_as_they_come_are_the_table(tmp_path):
     loaded = case(tmp_path)
     table = loaded.prepare()
@@ -308,6 +318,7 @@ def test_commands_show_the_column_of_noise(tmp_path):
     assert re.search(r"noise of T\W+noise\W+s\W", shown)
 
 
+@pytest.mark.slow
 def test_members_that_step_together_keep_the_noise_in_their_journals(tmp_path):
     loaded = case(tmp_path)
     members = {name: loaded.prepare() for name in ("north", "south")}

@@ -117,6 +117,7 @@ def test_gradient_law(reading):
         assert found == pytest.approx(plain, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_sensitivity_law_with_a_sensor_that_sees_the_parameter():
     """z = (u + R Q)^2 with the direct part inside of g: R and k are both found."""
     model = lp.Model(

@@ -85,6 +85,7 @@ def test_a_soliton_keeps_its_height():
     assert coarse / fine > 3.5
 
 
+@pytest.mark.slow
 def test_the_front_of_allen_cahn():
     D, r = 0.02, 3.0
     coarse, fine = orders(
@@ -112,7 +113,7 @@ def unknowns(mesh, *values):
     return *(lp.LogNormal(v, v) for v in values), start
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(deadline=None, max_examples=6)
 @given(st.floats(1e-3, 2.0), st.floats(0.1, 6.0), st.floats(0.1, 3.0))
 def test_checks_pass_for_random_parameters(small, one, other):

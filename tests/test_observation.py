@@ -221,6 +221,7 @@ def test_known_boundary_values_are_taken_from_the_samples():
     assert rebuilt[0] == 0.0
 
 
+@pytest.mark.slow
 def test_splits_are_kept_but_not_without_end():
     model = reaction(line(), ElementLineP1())
     observed = observe(model, lp.Full())

@@ -297,6 +297,7 @@ def markers(source: str, function: str) -> set[str]:
     return set(re.findall(r"pytest\.mark\.(\w+)", " ".join(map(ast.unparse, marked))))
 
 
+@pytest.mark.slow
 def test_guarantees_are_among_the_tests_of_what_users_rely_on():
     (left_out,) = re.findall(r'^USERS := -m "not \((.*)\)"$', MAKEFILE, re.MULTILINE)
     page = (ROOT / "docs" / "guarantees.md").read_text(encoding="utf-8")

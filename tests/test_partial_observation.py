@@ -76,6 +76,7 @@ def together(several: list[Found], low: float, high: float) -> tuple[float, floa
     return float(after / before), hit, float(np.mean([one.width[part] for one in several]))
 
 
+@pytest.mark.long
 def test_a_field_is_found_as_far_as_the_dynamics_carry_and_its_interval_tells_how_far():
     law = lp.SensitivityLaw(replay=lp.Replay())
     several = [found(seed, law) for seed in range(5)]
@@ -92,6 +93,7 @@ def test_a_field_is_found_as_far_as_the_dynamics_carry_and_its_interval_tells_ho
     assert 0.85 < widest < 1.15
 
 
+@pytest.mark.long
 def test_modes_that_are_too_few_mislead_where_nothing_is_seen():
     few, enough = (
         together([found(s, lp.SensitivityLaw(modes=m, replay=lp.Replay())) for s in (0, 1)], 0, 0.3)

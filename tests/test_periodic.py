@@ -116,6 +116,7 @@ def test_a_wave_once_around(element):
     assert model.X.norm(run[2] - model.initial(lambda x: f(x + 0.5))) < 0.01
 
 
+@pytest.mark.slow
 def test_the_speed_of_a_wave_is_found():
     model = advection(ring(ElementLineHermite()), speed=0.7)
     sensors = lp.Points([0.2, 0.5], noise=0.01)

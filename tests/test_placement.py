@@ -56,6 +56,7 @@ def test_the_sensor_does_what_was_promised(rod: Path):
         assert told == pytest.approx(dict(left), rel=2e-2)
 
 
+@pytest.mark.long
 def test_no_other_vertex_is_better(rod: Path):
     def mean(at: float) -> float:
         new = {SENSOR: {"role": "sensor", "column": "T_20", "at": f"{at} m", "noise": "0.05 K"}}
@@ -78,6 +79,7 @@ WALK = {
 }
 
 
+@pytest.mark.long
 def test_of_unknowns_that_move_it_keeps_its_promise_too(rod: Path):
     found = advice(rod, LAYERS, WALK)
     assert found.candidates == 41
@@ -90,6 +92,7 @@ def test_of_unknowns_that_move_it_keeps_its_promise_too(rod: Path):
     assert sum(s**2 for s in found.then.values()) < sum(s**2 for s in found.now.values())
 
 
+@pytest.mark.long
 def test_of_unknowns_that_move_hardly_another_vertex_is_better(rod: Path):
     def mean(at: float) -> float:
         new = {SENSOR: {"role": "sensor", "column": "T_20", "at": f"{at} m", "noise": "0.05 K"}}

@@ -84,7 +84,7 @@ def test_import_of_livepde_loads_no_matplotlib() -> None:
     assert found.stdout.strip() == "False"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_figures_leave_pyplot_alone() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from test_plots import *;"
@@ -207,6 +207,7 @@ def test_sensors_are_on_maps() -> None:
     assert np.array_equal(shown.get_xydata(), np.stack([x, y], axis=1))
 
 
+@pytest.mark.slow
 def test_a_field_in_space_is_its_range() -> None:
     data = dataset(fields=("q",), points=np.random.default_rng(0).random((3, 8)))
     assert texts(panel(drawn(plots.overview(data)), "q in space")) == ["range", "median"]

@@ -56,7 +56,7 @@ def test_exports_are_complete_and_sorted():
     assert set(livepde.__all__) <= set(dir(livepde))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_parts_are_there_without_being_imported():
     """`livepde.fem.Moment` does not depend on what else a program has used before."""
     parts = sorted(name for name in DOCUMENTED if name[1:] in livepde.__all__)

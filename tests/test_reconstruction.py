@@ -216,6 +216,7 @@ def test_missing_samples_shrink_it(norm):
     np.testing.assert_array_equal((part.G @ u)[5:9], 0.0)
 
 
+@pytest.mark.slow
 def test_many_patterns_of_missing_samples_are_forgotten_again():
     observed = bind(
         rod(ElementLineP1), lp.Points(np.linspace(0, 1, 8), reconstruction=Tikhonov("X", 0.1))
@@ -299,6 +300,7 @@ def samples(count=8):
     return [(0.1 * k, 1 + 0.01 * rng.standard_normal(size)) for k in range(1, count)]
 
 
+@pytest.mark.slow
 def test_the_gradient_law_uses_and_reports_it():
     found = [identifier(how).run(samples()) for how in (Pseudoinverse(), Tikhonov("V", 0.0))]
     np.testing.assert_allclose(found[0].last.q, found[1].last.q, rtol=1e-6)

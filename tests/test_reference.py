@@ -299,7 +299,7 @@ def test_jacobian_is_the_derivative(rule, nu):
     np.testing.assert_allclose(step.jacobian(r, None) @ direction, slope, rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "rule",
     [
@@ -373,6 +373,7 @@ def test_a_step_that_is_not_solved_is_an_error(monkeypatch):
         run(SHORT)
 
 
+@pytest.mark.slow
 def test_a_step_can_have_three_solutions():
     """nu = 0.01, t = 3.6: one continues the step before, one is found from r(0), one is between."""
     found = trajectory("partial, nu = 0.01")
@@ -389,7 +390,7 @@ def test_a_step_can_have_three_solutions():
 # --- numbers -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("nodes", "nu", "of_q", "of_u"),
     [
@@ -423,7 +424,7 @@ def test_errors_with_whole_elements_at_nu_0_01(change, of_q):
     assert error_q(run(replace(PAPER, nu=0.01, **change))) == pytest.approx(of_q, rel=5e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "of_q"),
     [

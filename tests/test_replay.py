@@ -40,6 +40,7 @@ def assimilated(monkeypatch):
     return taken
 
 
+@pytest.mark.slow
 def test_a_step_takes_no_more_stored_samples_again_than_a_slice(assimilated):
     identifier, counts = rod(slice=6, iterations=4), [0]
     for sample in readings(200):
@@ -52,6 +53,7 @@ def test_a_step_takes_no_more_stored_samples_again_than_a_slice(assimilated):
     assert each[few - 1] >= few  # so few are taken at once
 
 
+@pytest.mark.long
 def test_where_a_replay_ends_does_not_depend_on_the_slices():
     ends = {}
     for size in (3, 16, 1000):
@@ -67,6 +69,7 @@ def test_where_a_replay_ends_does_not_depend_on_the_slices():
         np.testing.assert_array_equal(ends[size][1].u, ends[1000][1].u)
 
 
+@pytest.mark.slow
 def test_a_run_ends_with_what_the_replay_under_way_finds():
     whole, sliced = rod(slice=1000, iterations=1), rod(slice=2, iterations=1)
     found, result = whole.run(readings(64)), sliced.run(readings(64))
@@ -78,6 +81,7 @@ def test_a_run_ends_with_what_the_replay_under_way_finds():
     sliced.step(1.0, [0.0, 0.0])  # it goes on from where it was
 
 
+@pytest.mark.slow
 def test_a_run_interrupted_within_a_replay_goes_on_to_the_bit():
     samples = list(readings(90))
     straight = rod(slice=3, iterations=2)
@@ -94,6 +98,7 @@ def test_a_run_interrupted_within_a_replay_goes_on_to_the_bit():
     np.testing.assert_array_equal(resumed.u, estimate.u)
 
 
+@pytest.mark.slow
 def test_a_fleet_ends_as_its_members_do():
     law = lp.SensitivityLaw(replay=lp.Replay(slice=2, iterations=1))
     fleet = lp.Fleet(

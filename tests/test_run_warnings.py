@@ -59,7 +59,7 @@ def test_a_process_that_is_missing_is_said():
     assert "The model does not explain the data" in found[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sensor_that_is_always_off_is_named():
     model = rod(lp.Normal(0.2, 0.1))
     found = doubts(run(model, model, shift=[0.0, 1.0, 0.0], replay=lp.Replay()))
@@ -69,7 +69,7 @@ def test_a_sensor_that_is_always_off_is_named():
     assert "sensor C" not in found[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_estimate_at_its_bound_is_said():
     narrow = rod(lp.Normal(0.2, 0.1, bounds=(0.0, 0.25)))
     found = doubts(run(narrow, rod(lp.Normal(0.2))))

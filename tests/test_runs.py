@@ -148,6 +148,7 @@ def test_drive_outside_of_the_main_thread():
 # --- directory -------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_comes_back_as_it_was(tmp_path, driven):
     data = written(tmp_path / "run", driven, case="title = 'x'\n")
     run = runs.open(tmp_path / "run")
@@ -226,6 +227,7 @@ def test_a_folder_that_vanishes(tmp_path, driven):
         writer.finish(status="finished", dataset=driven.result.to_xarray())
 
 
+@pytest.mark.slow
 def test_checkpoint_continues(tmp_path):
     first = identifier()
     whole = identifier()

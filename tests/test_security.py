@@ -185,7 +185,7 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     assert mine.read_text() == "mine"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_damaged_dataset_is_one_sentence(hostile):
     path = hostile / "estimates.nc"
     whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
@@ -266,7 +266,7 @@ def test_a_long_message_is_refused():
     assert json_row(b"[" * 100_000).broken
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_event_repeats_no_long_text(tmp_path):
     row = {"t": "x" * 500_000, "a": 1.0}
     run = live(tmp_path, Rows([row, *rows(2)]))
@@ -327,6 +327,7 @@ def test_on_this_machine_only_its_own_names_are_answered(serving):
         assert ask(server, Host=host)[0] == 403
 
 
+@pytest.mark.slow
 def test_a_token_opens_once_and_a_cookie_from_then_on(serving):
     server = serving(token=TOKEN)
     assert ask(server)[0] == 403
@@ -347,6 +348,7 @@ def test_a_token_opens_once_and_a_cookie_from_then_on(serving):
     assert headers["Referrer-Policy"] == "no-referrer"
 
 
+@pytest.mark.slow
 def test_no_token_is_repeated_to_who_does_not_know_it(serving):
     server = serving(token=TOKEN)
     _, text, headers = ask(server)
@@ -376,7 +378,7 @@ def test_tokens_that_are_none(host, token):
         Address(host, token=token)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
     server = serving(token=TOKEN)
     assert TOKEN in server.url
@@ -398,6 +400,7 @@ def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
     ]
 
 
+@pytest.mark.slow
 def test_requests_that_are_too_long_are_refused(serving):
     server = serving()
     assert ask(server, "/" + "x" * 20_000)[0] == 414
@@ -411,6 +414,7 @@ def test_requests_that_are_too_long_are_refused(serving):
     assert ask(server)[0] == 200
 
 
+@pytest.mark.slow
 def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
     before = {*threading.enumerate()}
     server = serving()
@@ -446,6 +450,7 @@ def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
     assert ask(server, Authorization=f"Bearer {token}")[0] == 200
 
 
+@pytest.mark.slow
 def test_who_may_not_ask_is_answered_before_a_body_is_read(serving):
     server = serving(token=TOKEN)
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
@@ -458,6 +463,7 @@ def test_who_may_not_ask_is_answered_before_a_body_is_read(serving):
     connection.close()
 
 
+@pytest.mark.slow
 def test_bodies_reach_the_page(serving, monkeypatch):
     """Those that are there at once, and one that is longer than what is waited for."""
 
@@ -476,6 +482,7 @@ def test_bodies_reach_the_page(serving, monkeypatch):
     server.close()
 
 
+@pytest.mark.slow
 def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
     """One who may ask, and sends the rest of a long body a byte at a time."""
     monkeypatch.setattr(pending_connections, "LONGEST", 0.5)

@@ -90,6 +90,7 @@ def stream(model, k, times, noise=0.0, seed=0):
     return sensors, samples
 
 
+@pytest.mark.slow
 def test_replay_makes_the_result_independent_of_the_prior():
     found = []
     for prior in (0.5, 1.0, 4.0):
@@ -103,6 +104,7 @@ def test_replay_makes_the_result_independent_of_the_prior():
     assert np.ptp(found) < 0.003
 
 
+@pytest.mark.slow
 def test_a_full_window_goes_on_from_the_estimate():
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.05 * np.arange(121), noise=0.01)
@@ -117,6 +119,7 @@ def test_a_full_window_goes_on_from_the_estimate():
     assert estimate.q[0] == pytest.approx(2.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_bounds_are_never_left():
     model = conductivity(bounds=(0.05, 1.5))
     sensors, samples = stream(conductivity(), 3.0, 0.05 * np.arange(61), noise=0.01)
@@ -165,6 +168,7 @@ def test_a_long_gap_leaves_no_more_uncertainty_than_the_prior():
     assert ident.step(t + 100.0, [np.nan, np.nan], inputs).q_std[0] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_a_field_by_modes_of_its_prior():
     """DESIGN.md, fact 5, a short run on clean data."""
     model = excited(16)
@@ -182,6 +186,7 @@ def test_a_field_by_modes_of_its_prior():
     assert estimate.u_std.shape == estimate.u.shape
 
 
+@pytest.mark.slow
 def test_a_field_beside_a_number():
     mesh = line(12)
     model = lp.Model(
@@ -202,6 +207,7 @@ def test_a_field_beside_a_number():
     np.testing.assert_allclose(predicted, states[-1], atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_sees_a_parameter():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
@@ -234,6 +240,7 @@ def test_passes_the_shipped_check(law, scheme):
     ).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_a_nonlinear_model_finds_its_rate():
     model = lp.Model(
         lp.Field(line(12), ElementLineP2(), quadrature=6),

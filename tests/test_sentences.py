@@ -64,6 +64,7 @@ def formats(path: Path) -> Iterator[tuple[int, str]]:
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", sorted({path.parent for path in FILES}), ids=lambda p: p.name)
 def test_sentences_say_standard_deviation(folder):
     wrong = [
@@ -76,6 +77,7 @@ def test_sentences_say_standard_deviation(folder):
     assert not wrong
 
 
+@pytest.mark.slow
 def test_no_number_has_more_than_six_digits():
     wrong = [
         f"{path.name}:{line}: {form}"

@@ -97,7 +97,7 @@ def test_predicts_the_shift_by_the_step() -> None:
     assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.2)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicts_the_shift_by_steps_across_jumps() -> None:
     """A heater that goes on and off: the jumps are shadowed, and each counts once."""
     mesh = lp.interval(0.0, 0.4, 20)
@@ -128,6 +128,7 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
     assert predicted == pytest.approx(actual, rel=0.4)
 
 
+@pytest.mark.slow
 def test_the_second_order_scheme_is_shifted_little() -> None:
     estimate = ran(identifier(), samples())
     actual = estimate.q - reference().q
@@ -164,6 +165,7 @@ def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
     assert abs(coarse.notes["a_mesh_shift"]) < 0.1 * fine.q_std[0]
 
 
+@pytest.mark.slow
 def test_predicts_the_shift_by_input_lines() -> None:
     """Against a run that is told the inputs ten times for each reading of the sensors."""
     rows = samples()
@@ -179,6 +181,7 @@ def test_predicts_the_shift_by_input_lines() -> None:
     assert_predicts(shifts(estimate, "input"), actual, better.q_std, 0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.01)])
 def test_no_number_of_the_filter_moves(evolution: Any) -> None:
     found = []
@@ -207,6 +210,7 @@ def test_intervals_hold_on_a_coarse_mesh() -> None:
     assert np.mean(held) >= 0.9
 
 
+@pytest.mark.slow
 def test_where_nothing_is_wrong_intervals_grow_little() -> None:
     rows = samples(width=WIDTH / 2)
     widened = ran(identifier(), rows)
@@ -222,6 +226,7 @@ def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
     assert (estimate.q_std <= 1.5 * 0.3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("replay", [None, lp.Replay()])
 def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> None:
     law, rows = lp.SensitivityLaw(replay=replay), samples()[:90]
@@ -235,6 +240,7 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> No
     assert dict(one.notes) == dict(other.notes)
 
 
+@pytest.mark.slow
 def test_a_replay_restarts_its_shadows() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
     plain = ran(identifier(8, scheme=ImplicitEuler()), samples())
@@ -245,6 +251,7 @@ def test_a_replay_restarts_its_shadows() -> None:
         assert np.abs(one - other).max() < 0.3 * np.abs(one).max()
 
 
+@pytest.mark.slow
 def test_holds_with_gaps_and_for_the_bank() -> None:
     rows = samples()
     gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
@@ -254,6 +261,7 @@ def test_holds_with_gaps_and_for_the_bank() -> None:
     assert bank.notes["discretisation_shift"] > 0.0
 
 
+@pytest.mark.slow
 def test_a_field_is_prolonged() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     line = lp.linear(mesh)
@@ -282,7 +290,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_speaks_and_names_the_cause() -> None:
     def said(cells: int, **k: Any) -> list[str]:
         data = identifier(cells, **k).run(samples()).to_xarray()

@@ -63,6 +63,7 @@ def run(one, pieces):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "rule"),
     [*((name, "plain") for name in MODELS), *(("rod", name) for name in LAWS), ("rod", "auto")],
@@ -80,6 +81,7 @@ def test_equals_separate_identifiers(model, rule):
         np.testing.assert_allclose(mine, theirs, rtol=1e-7, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["plain", "replay", "auto"])
 def test_goes_on_from_a_dump_at_any_batch(rule):
     """With identical numbers, and at its offset."""
@@ -102,6 +104,7 @@ def test_goes_on_from_a_dump_at_any_batch(rule):
         assert other.dump() == whole.dump()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("offset", "count", "said"),
     [
@@ -122,6 +125,7 @@ def test_refuses_a_batch_that_does_not_continue(offset, count, said):
     assert one.step(5, items[5:8]).status == ["ok"] * 3
 
 
+@pytest.mark.slow
 def test_a_sample_that_cannot_be_used_is_refused_alone():
     model = rod()
     items = stream(model, 6)
@@ -167,6 +171,7 @@ def test_a_sample_that_cannot_be_used_is_refused_alone():
     assert np.isnan(found.q[: len(poor)]).all()
 
 
+@pytest.mark.slow
 def test_a_step_that_was_broken_off_has_to_be_loaded_again(monkeypatch):
     """Some of its members have gone on, so that the same batch would give other numbers."""
     model = rod()
@@ -193,6 +198,7 @@ def test_a_step_that_was_broken_off_has_to_be_loaded_again(monkeypatch):
     assert np.array_equal(one.step(10, items[10:20]).q, other.step(10, items[10:20]).q)
 
 
+@pytest.mark.slow
 def test_dumps_of_others_are_refused():
     model = rod()
     content = shard(model).dump()
@@ -206,6 +212,7 @@ def test_dumps_of_others_are_refused():
         shard(model).load(lp.Fleet(model, SENSORS, law(), MEMBERS, u0=0.0).dump())
 
 
+@pytest.mark.slow
 def test_gives_an_arrow_table():
     pytest.importorskip("pyarrow", reason="'parquet' is not installed")
     model = rod()
@@ -230,6 +237,7 @@ def test_gives_an_arrow_table():
     assert "innovation T_1" in table.column_names
 
 
+@pytest.mark.slow
 def test_an_identifier_goes_on_by_itself():
     model = rod()
     items = stream(model, 6)

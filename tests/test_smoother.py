@@ -107,6 +107,7 @@ def compared(law, evolution, samples):
     return found, (mean[:, columns], std[:, columns])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_smoothed_is_the_least_squares_solution_over_all_times(name):
     law = Plain(rank=9, gate=np.inf, start_window=0)
@@ -115,6 +116,7 @@ def test_smoothed_is_the_least_squares_solution_over_all_times(name):
     np.testing.assert_allclose(std, deviations, rtol=1e-8, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_square_root_of_fewer_rows_is_as_good():
     """The default rank forgets directions of the state that hardly count."""
     samples = irregular()
@@ -158,6 +160,7 @@ def run(law=None, evolution=None, q=lambda t: 0.12, **options):
     return identifier.run(swinging(q), **options)
 
 
+@pytest.mark.slow
 def test_what_is_constant_has_one_value_at_all_times():
     result = run()
     data, smoothed = result.to_xarray(), result.smoothed()
@@ -169,7 +172,7 @@ def test_what_is_constant_has_one_value_at_all_times():
     np.testing.assert_allclose(spread, data.a_std[-1], rtol=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_names_times_and_fields_are_those_of_the_run():
     result = run(evolution=lp.RandomWalk(0.2), fields_every=50)
     data, smoothed = result.to_xarray(), result.smoothed()
@@ -187,7 +190,7 @@ def test_names_times_and_fields_are_those_of_the_run():
     assert float(smoothed.u_std.mean()) < 0.8 * float(data.u_std.mean())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_stays_as_it_is():
     identifier = lp.Identifier(conducting(), SENSORS, lp.SensitivityLaw())
     result = identifier.run(swinging(lambda t: 0.12))
@@ -202,7 +205,7 @@ def test_a_run_stays_as_it_is():
     assert new.t == 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_jump_stays_a_jump():
     """Before and after it the unknown is what it was there, as certain as all samples make it."""
     result = run(lp.SensitivityLaw(jumps=lp.Jumps()), q=lambda t: 0.1 if t < 7.0 else 0.3)
@@ -226,7 +229,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CHANGES)
 def test_the_bank_smooths_by_the_member_that_explains_all_samples(name):
     """With `jumps` a member leads at the end whose unknown has stayed since."""
@@ -238,6 +241,7 @@ def test_the_bank_smooths_by_the_member_that_explains_all_samples(name):
     assert np.mean(np.abs(errors[0]) < 1.96 * smoothed.a_std.values) > 0.85
 
 
+@pytest.mark.long
 def test_steps_that_failed_repeat_the_last_that_was_taken():
     stream = swinging(lambda t: 0.12)[:20]
     identifier = lp.Identifier(conducting(lp.RandomWalk(0.2)), SENSORS, lp.SensitivityLaw())
@@ -253,6 +257,7 @@ def test_no_samples_no_times():
     assert identifier.smoothed([]).sizes["time"] == 0
 
 
+@pytest.mark.slow
 def test_what_cannot_be_smoothed_says_so_in_a_sentence():
     model, stream = conducting(), swinging(lambda t: 0.12)[:3]
     for law, match in (
@@ -282,7 +287,7 @@ def case(tmp_path, monkeypatch):
     return "rod/case.toml"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_case_writes_it_beside_the_run(case):
     assert call("run", case, "--out", "whole")[0] == 0
     whole = runs.open("whole").dataset
@@ -304,6 +309,7 @@ def test_a_case_writes_it_beside_the_run(case):
     assert call("export", "whole", "whole.csv")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_case_that_cannot_be_smoothed_is_refused(case):
     assert "lets the past fade" in bad("run", case, "--set", "law.memory='3 h'")
     assert not Path("runs").exists()

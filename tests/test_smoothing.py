@@ -39,6 +39,7 @@ def test_local_polynomials_are_exact_for_their_degree_at_any_spacing(degree):
     assert np.abs(rough[20:, 0] - values[20:]).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [1, 2])
 def test_what_a_local_polynomial_misses_falls_with_its_order(degree):
     times = 0.01 * np.arange(400)
@@ -72,7 +73,7 @@ def test_smoothers_are_causal(stage):
     assert np.all(first[30] != second[30])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("stage", STAGES, ids=repr)
 def test_std_and_d_rate_are_those_of_the_smoothed_noise(stage):
     """Over 4000 independent channels, at the last of 40 irregular times."""

@@ -32,7 +32,7 @@ def test_balakrishnan(sigma, largest):
     np.testing.assert_allclose(power, x**sigma, rtol=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"])
 @pytest.mark.parametrize("zero", [False, True])
 @pytest.mark.parametrize("s", ORDERS)
@@ -50,7 +50,7 @@ def test_gram_is_the_spectral_power(name, zero, s):
     np.testing.assert_allclose(ratios, 1.0, rtol=1e-7 if s == int(s) else 1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("s", [0.0, 0.75, 1.0, 1.75, 2.0])
 def test_spaces_pass_their_check(name, s):
@@ -82,6 +82,7 @@ def test_other_large_spaces_keep_their_border(s, monkeypatch):
     assert isinstance(BorderedSpace(Q.border, Q.dim).factor, Leading)
 
 
+@pytest.mark.slow
 def test_names_of_orders():
     """inner="L2" and "H1" are orders 0 and 1; "H2" is order 2, a sparse form on C^1 elements."""
     for name, s in (("L2", 0.0), ("H1", 1.0), ("H2", 2.0)):
@@ -141,7 +142,7 @@ def test_products_with_other_unknowns():
     np.testing.assert_allclose(Phi.T @ gram @ Phi, np.eye(7), atol=1e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
     """H^s has the modes of H^1, with their variance to the power s; nothing is written out."""
     monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1000)
@@ -161,6 +162,7 @@ def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
         _ = two.Q.gram
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("s", [0.75, 1.5, 2.0])
 def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
     """The auxiliary unknowns change the linear algebra, not the result."""
@@ -185,7 +187,7 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
     np.testing.assert_allclose(found[0].u, found[1].u, atol=1e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("law", [lp.GradientLaw(gain=1e3), lp.SensitivityLaw(noise=1e-3)])
 @pytest.mark.parametrize("inner", [lp.Sobolev(0.75, 0.2), lp.Sobolev(1.5, 0.2), lp.Sobolev(2, 0.2)])
 def test_both_laws_identify(law, inner):

@@ -146,6 +146,7 @@ def test_modes(name):
     np.testing.assert_array_equal(few[Q.fixed], 0.0)
 
 
+@pytest.mark.slow
 def test_modes_of_a_large_space_are_those_of_a_dense_solver():
     model = reaction(MeshTri().refined(5), ElementTriP1())
     assert model.Q.dim > 400
@@ -190,7 +191,7 @@ def test_bad_unknowns():
         lp.Model(lp.Field(mesh, element), {"R b": lp.Normal()}, product)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_prior_variances_are_the_diagonal_of_the_inverse():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (12, 12))
     for inner in ("H1", lp.Sobolev(2.0, 0.3), lp.Sobolev(1.5, 0.3)):
@@ -200,7 +201,7 @@ def test_prior_variances_are_the_diagonal_of_the_inverse():
         assert model.Q.variance == pytest.approx(exact)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(spaces, "SOLVED", 250)
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (24, 24))
@@ -218,6 +219,7 @@ def test_prior_variances_of_large_fields_are_interpolated(monkeypatch: pytest.Mo
         assert (found[model.Q.fixed] == 0.0).all()
 
 
+@pytest.mark.slow
 def test_modes_and_total_variance_of_large_fields(monkeypatch: pytest.MonkeyPatch):
     model = reaction(MeshTri().refined(5), ElementTriP1(), q_dirichlet={"boundary": 0.0})
     Q, mass = model.Q, model.parameter_mass
@@ -239,6 +241,7 @@ def test_modes_and_total_variance_of_large_fields(monkeypatch: pytest.MonkeyPatc
     assert Q.spread(weights, phi) == Q.spread(weights, phi)
 
 
+@pytest.mark.slow
 def test_fewer_variances_are_solved_for_in_larger_fields(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(spaces, "LARGE", 200)
     monkeypatch.setattr(spaces, "FEWEST_SOLVED", 10)
@@ -254,6 +257,7 @@ def test_fewer_variances_are_solved_for_in_larger_fields(monkeypatch: pytest.Mon
     assert np.abs(left + held - exact).mean() < 0.25 * np.abs(model.Q.variance - exact).mean()
 
 
+@pytest.mark.slow
 def test_large_well_conditioned_spaces_need_no_factor(monkeypatch: pytest.MonkeyPatch):
     def make():
         return reaction(MeshTri().refined(5), ElementTriP1(), q_dirichlet={"boundary": 0.0})

@@ -47,7 +47,7 @@ def cubic(**options):
     return model, exact
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "order"), [("euler", 1), ("alexander", 2)])
 def test_order_in_time_with_moving_boundary_data(name, order):
     """The solution lies in the space, so all of the error is the scheme's."""
@@ -62,6 +62,7 @@ def test_order_in_time_with_moving_boundary_data(name, order):
     assert errors[-1] < (2e-2 if order == 1 else 2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("element", "order"), [(ElementLineP1(), 2), (ElementLineHermite(), 4)], ids=["P1", "Hermite"]
 )
@@ -101,6 +102,7 @@ def test_schemes_are_L_stable():
         assert abs(u).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_irregular_steps_keep_the_order():
     model, exact = cubic()
     rng = np.random.default_rng(0)

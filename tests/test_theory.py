@@ -130,7 +130,7 @@ def papers_constants(spaces):
     return dg.constants(spaces, model.parameter_space.interpolate(seed.q_true), [u])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("D", [1.0, -1.0, 0.1])
 @pytest.mark.parametrize("nodes", HERMITE_NODES)
 def test_the_papers_lipschitz_constant_is_one_on_every_mesh(nodes, D):
@@ -158,6 +158,7 @@ def test_norms_of_the_two_parts_of_the_papers_state(nodes):
     assert pytest.approx(3.10, rel=0.03) == found.V
 
 
+@pytest.mark.slow
 def test_the_norm_of_a_part_with_a_flux_is_that_of_the_law():
     """`stage_norms` is what the damping rule is given, and tends to `norms` with the mesh."""
     gaps = []
@@ -189,6 +190,7 @@ SENSORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_constants_hold_for_every_vector(name):
     model = excited(12, ElementLineHermite())
@@ -235,6 +237,7 @@ def _rough(u, v, x):
     return u * v + lp.dot(lp.grad(u), lp.grad(v)) + lp.fem.ddot(lp.fem.hess(u), lp.fem.hess(v))
 
 
+@pytest.mark.slow
 def test_lanczos_gives_what_the_dense_solver_gives(monkeypatch):
     model = excited(16)
     observed = observe(model, SENSORS["subdomain"])
@@ -302,7 +305,7 @@ def test_all_propositions_hold_on_the_excited_twin(u0, data):
     assert np.all(np.diff(energies) <= 1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("nu", [0.0, None], ids=["nu = 0", "nu of the paper"])
 def test_all_propositions_hold_on_the_papers_twin(nu):
     """Partial data: with gains that satisfy the conditions on mu (and nu)."""
@@ -334,6 +337,7 @@ def test_the_energy_never_grows_with_the_default_rule(gain):
     assert lines[0].ok
 
 
+@pytest.mark.slow
 def test_a_condition_that_fails_says_what_to_do():
     twin = twin_of(seed, 10)
     tracker = follow(twin, lp.GradientLaw(100.0, lp.laws.ResidualDamping(0.1)), 0.0)
@@ -345,6 +349,7 @@ def test_a_condition_that_fails_says_what_to_do():
     assert "hypothesis of the proposition" in str(failed)
 
 
+@pytest.mark.slow
 def test_noise_and_T_star():
     """Until T* the bounds of well_defined_noisy hold; (cond_d) fails from there on."""
     gain = 1000.0
@@ -365,6 +370,7 @@ def test_noise_and_T_star():
     assert with_sigma.lines[0].bound >= tracker.q_true**2
 
 
+@pytest.mark.slow
 def test_smoothed_data_with_the_papers_rule():
     """prop:wellposed_noisesmooth with the rule that fulfils its hypothesis."""
     gain = 1000.0
@@ -394,7 +400,7 @@ def test_trackers_refuse_an_empty_run():
 # --- T* online ------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("row", [0, 3, 4])
 def test_the_surrogate_of_T_star_is_within_a_factor_of_two(row):
     """Mean of five seeds, where noise (not the smoothing's own error) decides."""
@@ -463,6 +469,7 @@ def test_gramian_of_a_constant_state_is_that_of_one_matrix():
     assert latest.strength[0] == pytest.approx(0.2 * norm * 3.0, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_is_not_observed_is_not_pinned():
     model = excited(20)
     omega = lp.Subdomain(lambda x: x[0] < 0.5)
@@ -557,6 +564,7 @@ def test_links_refuse(options, words):
         dg.link(t, **given)
 
 
+@pytest.mark.slow
 def test_interpolation_along_a_run_stays_within_its_bounds():
     twin = twin_of(seed_excited, 30)
     tracker = follow(twin, lp.GradientLaw(1000.0, lp.laws.ResidualDamping(1.0)), 0.0)
@@ -570,6 +578,7 @@ def test_interpolation_along_a_run_stays_within_its_bounds():
 # --- the page -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_page_with_truth():
     twin = twin_of(seed_excited, 40, noise=RelativeNoise(1e-4))
     law = lp.GradientLaw(1000.0, lp.laws.ResidualDamping(1.0))
@@ -606,7 +615,7 @@ def test_the_page_of_a_run_without_any_measurement():
     assert any("no sample of the run holds a measurement" in note for note in found.notes)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_report_theory_of_a_run_directory(tmp_path):
     from livepde.cli import app
 
@@ -631,7 +640,7 @@ def test_report_theory_of_a_run_directory(tmp_path):
 # --- experiments ----------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_oracle_satisfies_the_bounds():
     oracle = experiment("oracle")
     plain, bound, with_mu, with_nu = oracle.run(samples=8)
@@ -642,6 +651,7 @@ def test_the_oracle_satisfies_the_bounds():
     assert with_nu.nu > 1
 
 
+@pytest.mark.slow
 def test_hindsight_prefers_the_strongest_pull():
     hindsight = experiment("hindsight")
     tried = hindsight.partial(100.0, samples=30, steps=(0.1, 10.0))

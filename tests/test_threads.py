@@ -280,6 +280,7 @@ def test_every_law_is_among_the_cases():
     assert {type(CASES[name].law) for name in COPIED} == concrete
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_identifiers_of_one_model_step_in_threads(name):
     case = CASES[name]
@@ -307,6 +308,7 @@ COPIED = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COPIED)
 def test_copies_of_an_identifier_step_in_threads(name):
     case = CASES[name]

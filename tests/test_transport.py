@@ -57,6 +57,7 @@ def at_the_end(model, q, cells, stop=6.0):
     return u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("inlet", "exact", "bound"), [("flux", fed_by_flux, 1e-3), ("fixed", ogata_banks, 4e-3)]
 )
@@ -77,7 +78,7 @@ def test_decay_on_the_way():
     assert np.abs(u - exact)[mesh.p[0] < 29].max() < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("inlet", ["flux", "fixed"])
 @pytest.mark.parametrize(("phi", "omega"), [(0.7, 0.3), (0.5, 0.05), (0.8, 3.0)])
 def test_immobile_water_against_the_laplace_transform(inlet, phi, omega):
@@ -91,6 +92,7 @@ def test_immobile_water_against_the_laplace_transform(inlet, phi, omega):
     assert found == pytest.approx(immobile(x, 6.0, phi, omega, inlet), abs=4e-3)
 
 
+@pytest.mark.slow
 def test_nothing_is_lost():
     """What flowed in is in the column: c and s with their shares of the water."""
     phi = 0.6
@@ -103,7 +105,7 @@ def test_nothing_is_lost():
     assert stored == pytest.approx(V * 6.0, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @settings(deadline=None, max_examples=10)
 @given(
     dispersion=st.floats(0.02, 5.0),

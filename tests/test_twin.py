@@ -68,6 +68,7 @@ def test_samples_carry_time_and_data_only() -> None:
         assert sample.inputs is None
 
 
+@pytest.mark.slow
 def test_estimator_never_receives_the_truth() -> None:
     # Two twins that differ in the names of their truth only through the data: an identifier that
     # is fed the same numbers by hand gives the same estimate to the last bit.
@@ -165,7 +166,7 @@ def test_weights_are_the_norm_of_the_observed_part() -> None:
     assert np.array_equal(twin(observation=SENSORS).weights, np.eye(2))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_absolute_noise() -> None:
     draws = [
         data(twin(observation=SENSORS, noise=AbsoluteNoise([0.1, 2.0]), seed=seed))

@@ -111,6 +111,7 @@ def found(
     return estimate
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", PLACES)
 def test_an_unknown_is_found_wherever_it_stands(place: str):
     model, truth = model_of(place), PLACES[place][2]
@@ -121,6 +122,7 @@ def test_an_unknown_is_found_wherever_it_stands(place: str):
     assert std < 0.1 * PLACES[place][1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("what", ["offset", "gain", "contact resistance"])
 def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
     reaction = PLACES["reaction"][3]

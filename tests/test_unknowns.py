@@ -46,6 +46,7 @@ def estimates(model: lp.Model, law: Any, samples: Any, **options: Any) -> list[l
     return found
 
 
+@pytest.mark.slow
 @given(st.floats(-8, 8), st.floats(-5, 5), st.floats(0.1, 10))
 def test_transforms_have_their_inverse_and_derivatives(latent: float, lower: float, width: float):
     a, h = np.array([latent]), 1e-6
@@ -222,6 +223,7 @@ def test_a_prior_alone_holds_for_a_region():
     assert (left.unit, right.unit) == ("m", "m")
 
 
+@pytest.mark.slow
 def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)
     samples = data(lambda t: 0.05, times)
@@ -234,7 +236,7 @@ def test_positive_unknowns_are_found_and_stay_positive():
     assert found[-1].q_std is not None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gradient_law_learns_a_positive_field_and_a_nonlinear_unknown():
     model = rod({"a": UNKNOWNS["field"], "c": lp.Normal(2.0, 1.0)}, A=None)
     assert model.latent.dim == 22
@@ -274,7 +276,7 @@ def rms(found: list[lp.Estimate], a: Any, after: float) -> tuple[float, float]:
 BARE = lp.SensitivityLaw(shadows=None, verdict=False)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_periodic_unknown_is_followed_without_delay():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -289,7 +291,7 @@ def test_a_periodic_unknown_is_followed_without_delay():
     assert 3 * error < slower < 0.03
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_random_walk_is_followed_with_an_honest_deviation():
     times, rate = np.arange(0.0, 60.0, 0.05), 0.02
     rng = np.random.default_rng(3)
@@ -302,7 +304,7 @@ def test_a_random_walk_is_followed_with_an_honest_deviation():
     assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gradient_law_rotates_a_periodic_unknown():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))
@@ -321,7 +323,7 @@ def test_the_gradient_law_rotates_a_periodic_unknown():
     assert 3 * errors["periodic"] < errors["constant"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_unknown_initial_state_is_found_with_the_diffusivity():
     start = lp.Field(
         mesh,
@@ -353,7 +355,7 @@ def test_an_initial_state_is_given_once():
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_gate_refuses_outliers_and_believes_what_lasts():
     times = np.arange(0.0, 8.0, 0.05)
     samples = data(lambda t: 0.3, times)
@@ -420,6 +422,7 @@ def test_functions_with_kinks_have_their_derivatives(kink: Any):
     check_model(rod({"a": lp.Normal(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_a_first_sample_at_the_start_says_what_is_unknown_there():
     model = rod(
         {"u0": lp.Normal(1.0, 1.0)},
@@ -444,6 +447,7 @@ def test_a_first_sample_at_the_start_says_what_is_unknown_there():
 HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}
 
 
+@pytest.mark.long
 def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
     common = {"prior": lp.LogNormal(0.5, 0.2), "evolution": lp.RandomWalk(0.01)}
     both = [lp.Piecewise(HALVES, **common, own=own) for own in ({}, {"r": lp.Scalar(**common)})]
@@ -454,6 +458,7 @@ def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
     np.testing.assert_allclose(own.q_std, plain.q_std, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_region_moves_and_another_does_not():
     walk = lp.Scalar(lp.Normal(0.5, 0.3), evolution=lp.RandomWalk(0.2))
     a = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), own={"r": walk})

@@ -89,6 +89,7 @@ def test_a_linear_displacement_is_exact(element: str):
     np.testing.assert_allclose(values, exact(points, 0.0), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_modulus_is_identified_from_a_boundary_that_moves():
     """Rollers on the left and below, a channel that pulls the right side, sensors on the top."""
     pulled = {"left": (0.0, None), "bottom": (None, 0.0), "right": (lp.Channel("pull"), None)}

@@ -91,6 +91,7 @@ def named(found: Verdict) -> list[tuple[str, str]]:
     return [(c.kind, c.subject) for f in found.findings for c in f.causes[:2]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stated", [1.0, 3.0, 1 / 3])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: int):
@@ -100,6 +101,7 @@ def test_a_right_model_is_trusted_whatever_noise_is_stated(stated: float, seed: 
     assert said == ([] if stated == 1.0 else ["noise"])
 
 
+@pytest.mark.slow
 def test_the_filter_gives_the_same_numbers_to_the_last_bit():
     z = shown() + errors()
     _, judged = run(z)
@@ -111,6 +113,7 @@ def test_the_filter_gives_the_same_numbers_to_the_last_bit():
         assert np.array_equal(judged.u, other.u)
 
 
+@pytest.mark.slow
 def test_an_offset_is_named_with_its_size():
     z = shown() + errors()
     z[:, 1] += 0.08
@@ -122,6 +125,7 @@ def test_an_offset_is_named_with_its_size():
     assert "channels.B.offset" in found.findings[0].sentence
 
 
+@pytest.mark.slow
 def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
     z = shown().copy()
     lag = 4 * (TIMES[1] - TIMES[0])
@@ -138,17 +142,20 @@ def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
     assert found.level == "do not trust"
 
 
+@pytest.mark.slow
 def test_a_sensor_elsewhere_is_named():
     found = run(shown() + errors(), places={**PLACES, "B": 0.56})[1].verdict
     assert ("position", "B") in named(found)
     assert "smaller x" in found.findings[0].sentence
 
 
+@pytest.mark.slow
 def test_a_missing_loss_is_named():
     found = run(shown(loss=0.6) + errors())[1].verdict
     assert ("loss", "") in named(found)
 
 
+@pytest.mark.slow
 def test_a_jump_is_named_and_turns_the_verdict_soon():
     half = len(TIMES) // 2
     z = np.concatenate([shown()[:half], shown(k=0.2)[half:]]) + errors()
@@ -165,6 +172,7 @@ def test_a_jump_is_named_and_turns_the_verdict_soon():
     assert ("jump", "k") in named(estimate.verdict)
 
 
+@pytest.mark.long
 def test_the_verdict_turns_back_when_a_fault_is_mended():
     count, begin, end = 700, 150, 300
     rng = np.random.default_rng(1)
@@ -183,6 +191,7 @@ def test_the_verdict_turns_back_when_a_fault_is_mended():
     assert "in the last" in estimate.verdict.sentences[0]
 
 
+@pytest.mark.slow
 def test_readings_that_the_gate_refuses_are_a_finding():
     z = shown() + errors()
     z[40::12, 0] += 50.0
@@ -208,6 +217,7 @@ def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
     assert list(discretised({}, ["k"])) == []
 
 
+@pytest.mark.slow
 def test_a_sensor_that_stands_still_is_named():
     z = shown() + errors()
     z[100:, 0] = z[100, 0]
@@ -216,6 +226,7 @@ def test_a_sensor_that_stands_still_is_named():
     assert found.level == "do not trust"
 
 
+@pytest.mark.slow
 def test_errors_that_follow_each_other_are_no_cause():
     rng = np.random.default_rng(3)
     e = rng.standard_normal((len(TIMES), 3))
@@ -228,6 +239,7 @@ def test_errors_that_follow_each_other_are_no_cause():
     assert found.level == "caution"
 
 
+@pytest.mark.slow
 def test_directions_move_the_estimate_by_what_they_say():
     """For an unknown source model and filter are linear: the shift by an offset is exact."""
     mesh = lp.interval(0.0, 1.0, 20)
@@ -266,6 +278,7 @@ def fed(inputs: Any, *, hold: bool = False) -> lp.Estimate:
     return estimate
 
 
+@pytest.mark.long
 def test_readings_that_are_held_as_settings_are_told():
     straight, held = fed(driven(TIMES)), fed(driven(TIMES), hold=True)
     (found,) = [f for f in held.verdict.findings if f.what == "hold"]
@@ -278,6 +291,7 @@ def test_readings_that_are_held_as_settings_are_told():
     assert fed(steps, hold=True).notes["hold_shift"] == 0.0
 
 
+@pytest.mark.long
 def test_gaps_of_a_channel_are_told_and_in_the_interval():
     whole, off, shifts = fed(driven(TIMES)), [], []
     for seed in range(5, 9):
@@ -294,6 +308,7 @@ def test_gaps_of_a_channel_are_told_and_in_the_interval():
     assert abs(np.mean(off) - np.mean(shifts)) < 0.5 * abs(np.mean(off))
 
 
+@pytest.mark.slow
 def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
     def identifier(judged: bool) -> lp.Identifier:
         sensors = lp.Points(PLACES, noise=NOISE)
@@ -327,6 +342,7 @@ def test_a_census_knows_what_the_unknowns_take_up():
     assert traces["borehole"][1] < VISIBLE < traces["rod"][1]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_carries_the_ledger():
     z = shown() + errors()
     z[:, 1] += 0.08
@@ -345,6 +361,7 @@ def test_a_checkpoint_carries_the_ledger():
     assert resumed.verdict.to_dict() == whole.verdict.to_dict()
 
 
+@pytest.mark.slow
 def test_withheld_sensors_are_judged_against_what_is_predicted():
     clean = shown(places=(0.25, 0.75, 0.5)) + errors()
     z = {"A": clean[:, 0], "C": clean[:, 1], "W": clean[:, 2]}
@@ -372,6 +389,7 @@ def test_few_samples_are_too_few():
     assert "too few to judge by" in estimate.verdict.sentences[0]
 
 
+@pytest.mark.long
 def test_a_bank_judges_by_its_leader():
     z = shown() + errors()
     z[:, 1] += 0.1
@@ -379,6 +397,7 @@ def test_a_bank_judges_by_its_leader():
     assert found.level != "trusted"
 
 
+@pytest.mark.slow
 def test_what_is_left_out_is_said():
     found = run(shown() + errors(), law=lp.SensitivityLaw(verdict="cheap"))[1].verdict
     assert any("missing sources" in text for text in found.untested)
@@ -388,6 +407,7 @@ def test_what_is_left_out_is_said():
         lp.SensitivityLaw(verdict="dear")
 
 
+@pytest.mark.slow
 def test_a_verdict_survives_json_and_stands_in_the_dataset():
     z = shown() + errors()
     z[:, 1] += 0.08

@@ -68,6 +68,7 @@ def test_shipped_checks():
     assert list(model.parameter_space.labels) == ["c2", "d"]
 
 
+@pytest.mark.slow
 def test_speed_and_damping_from_two_points():
     model = wave(STRING, lp.Normal(1.3, 0.3), lp.Normal(0.2, 0.3), FIXED)
     sensors = lp.Points([0.45, 0.8], of="w", noise=0.01)
@@ -89,6 +90,7 @@ def test_speed_and_damping_from_two_points():
     assert abs(d - 0.5) < 4 * d_std
 
 
+@pytest.mark.slow
 def test_the_speed_as_a_field():
     field = lp.Field(STRING, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=0.3))
     model = wave(STRING, field, 0.1, FIXED)
