@@ -1,0 +1,24 @@
+"""Both laws on PETSc vectors, for one process on many ranks of MPI.
+
+The process comes from a finite-element package that shares its mesh out, by the protocol
+`PetscModel`; `DolfinxModel` is one from UFL. Nothing here loads PETSc when it is imported: that and
+MPI start with the first model.
+"""
+
+from __future__ import annotations
+
+from livepde.petsc.dolfinx import DolfinxModel
+from livepde.petsc.filter import FilterReport, FilterState, PetscFilter, leading_modes, number_modes
+from livepde.petsc.model import PetscModel
+from livepde.petsc.step import ImplicitStep
+
+__all__ = [
+    "DolfinxModel",
+    "FilterReport",
+    "FilterState",
+    "ImplicitStep",
+    "PetscFilter",
+    "PetscModel",
+    "leading_modes",
+    "number_modes",
+]

@@ -1,0 +1,420 @@
+"""A `PetscModel` from UFL integrands, by DOLFINx; written for 0.5.2, Debian 12's.
+
+What another version calls differently stands in `Interface`, the only place to change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError, ModelError
+from livepde.linalg import Array, IntArray
+from livepde.petsc.model import MISSING, petsc_module
+from livepde.petsc.vectors import gathered, standard_vector
+
+__all__ = ["DolfinxModel"]
+
+OBSERVED, HIDDEN = 1, 2  # tags of cells
+
+
+class DolfinxModel:
+    """A process M u' + F(u, q, t) = 0 from UFL integrands.
+
+    Parameters
+    ----------
+    V
+        Scalar function space of the state u.
+    q
+        Function space of a field, or the start values of numbers, shape (m,).
+    form
+        Integrand (u, q, v, x, t) of F over the cells, linear in the test function v: B(u) + A(u) q
+        less the source. For numbers q is a tuple. x are the coordinates and t is the time.
+    boundary
+        Integrand of F over the boundary, with the same arguments; it sees the estimate, never data.
+    mass
+        Integrand (u, v) of M; default u v.
+    dirichlet
+        Pairs of a marker, coordinates (3, points) -> booleans, and a value, (x, t) -> numbers.
+    sensors
+        Points where u is read, shape (sensors, dimension); None: there are none.
+    omega
+        Marker of the observed cells, by their midpoints, coordinates (3, cells) -> booleans; None:
+        all of u is observed.
+    inner
+        Integrand (p, q) of the inner product of Q; default p q + grad p . grad q.
+    M_op, N_op
+        Integrands (u, v) of M_op and N_op of (MN1), (MN2); default u v + grad u . grad v.
+    symmetric
+        True if M/h + dF/du is symmetric positive definite.
+    """
+
+    def __init__(
+        self,
+        V: Any,
+        q: Any,
+        form: Callable[..., Any],
+        *,
+        boundary: Callable[..., Any] | None = None,
+        mass: Callable[..., Any] | None = None,
+        dirichlet: Sequence[tuple[Callable[..., Any], Callable[..., Any]]] = (),
+        sensors: Any = None,
+        omega: Callable[..., Any] | None = None,
+        inner: Callable[..., Any] | None = None,
+        M_op: Callable[..., Any] | None = None,
+        N_op: Callable[..., Any] | None = None,
+        symmetric: bool = False,
+    ) -> None:
+        self.api = api = Interface()
+        ufl = api.ufl
+        self.V, self.mesh, self.symmetric = V, V.mesh, symmetric
+        self.u, self.w = api.function(V), api.function(V)
+        self.time = api.constant(V.mesh, 0.0)
+        self._set_parameter(q)
+        self.boundary, self.form = boundary, form
+        self.v = ufl.TestFunction(V)
+        self._measures(omega)
+        trial = ufl.TrialFunction(V)
+        h1 = lambda a, b: ufl.inner(a, b) + ufl.inner(ufl.grad(a), ufl.grad(b))  # noqa: E731
+        weigh = mass or ufl.inner
+        pull, push = M_op or h1, N_op or h1
+        self.mass = self._matrix(weigh(trial, self.v) * ufl.dx)
+        self.mass_observed, self.pull = self.mass, self._matrix(pull(trial, self.v) * self.seen)
+        self.push = None
+        if omega is not None:
+            self.mass_observed = self._matrix(weigh(trial, self.v) * self.seen)
+            self.push = self._matrix(push(trial, self.v) * self.rest)
+        self.gram, self.mass_q = self._inner_products(inner or h1)
+        self._dirichlet = [(*api.located(V, marker), value) for marker, value in dirichlet]
+        rows = [dofs for dofs, _, _ in self._dirichlet]
+        start = self.create_u().getOwnershipRange()[0]
+        owned = np.unique(np.concatenate([*rows, np.zeros(0, dtype=int)]))
+        self.fixed: IntArray = (start + owned).astype(petsc_module().IntType)
+        self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
+        self.numbers_u = api.numbering(V)
+        self._kept: dict[tuple[str, bool], Any] = {}
+        slope = api.expanded(ufl.derivative(self._F(False), self.u))
+        self.linear = self.u not in slope.coefficients()
+
+    # --- vectors ----------------------------------------------------------------------------------
+
+    def create_u(self) -> Any:
+        """Return a zero vector of X."""
+        return standard_vector(self.mesh.comm, self.api.owned(self.V))
+
+    def create_q(self) -> Any:
+        """Return a zero vector of Q; numbers lie on rank 0."""
+        if self.numbers:
+            first = self.mesh.comm.rank == 0
+            return standard_vector(self.mesh.comm, len(self.numbers) if first else 0)
+        return standard_vector(self.mesh.comm, self.api.owned(self.Q))
+
+    def interpolate(self, function: Callable[[Array], Any], space: Any = None) -> Any:
+        """Return the coefficients of a function of coordinates (3, points) in V, or in Q."""
+        f = self.api.function(space or self.V)
+        f.interpolate(lambda x: np.broadcast_to(function(x), x.shape[1]).astype(float))
+        vector = standard_vector(self.mesh.comm, self.api.owned(space or self.V))
+        vector.getArray()[:] = f.x.array[: vector.getLocalSize()]
+        return vector
+
+    def parameter(self, value: Any) -> Any:
+        """Return q as a vector: numbers, or a field from a function of coordinates or a number."""
+        if not self.numbers:
+            return self.interpolate(value if callable(value) else lambda x: value, self.Q)
+        vector = self.create_q()
+        vector.getArray()[:] = np.asarray(value, dtype=float)[: vector.getLocalSize()]
+        return vector
+
+    # --- the protocol -----------------------------------------------------------------------------
+
+    def impose(self, u: Any, t: float) -> None:
+        values = u.getArray()
+        for dofs, x, value in self._dirichlet:
+            values[dofs] = value(x, t)
+
+    def residual(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
+        self._at(u, q, t, w)
+        split = w is not None
+        return self._vector("F", split, lambda: self._F(split))
+
+    def jacobian_u(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
+        self._at(u, q, t, w)
+        split = w is not None
+        return self._assembled("u", split, lambda: self.api.ufl.derivative(self._F(split), self.u))
+
+    def jacobian_q(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
+        self._at(u, q, t, w)
+        split = w is not None
+        if not self.numbers:
+            F = self.api.ufl.derivative
+            return self._assembled("q", split, lambda: F(self._F(split), self.q))
+        return self._columns(split)
+
+    def coupling(self, w: Any, q: Any, t: float) -> Any:
+        self._at(w, q, t, w)
+        if self.numbers:
+            raise ModelError("DolfinxModel: the paper's law needs a field q: use PetscFilter.")
+        derivative = self.api.ufl.derivative
+        return self._assembled("A", True, lambda: derivative(self._inside(), self.q))
+
+    # --- forms ------------------------------------------------------------------------------------
+
+    def _set_parameter(self, q: Any) -> None:
+        api = self.api
+        self.numbers: list[Any] = []
+        self.Q: Any = None
+        if hasattr(q, "dofmap"):
+            self.Q, self.q = q, api.function(q)
+            self.given: Any = self.q
+            self.numbers_q = api.numbering(q)
+            return
+        values = np.atleast_1d(np.asarray(q, dtype=float))
+        self.numbers = [api.constant(self.mesh, value) for value in values]
+        self.given = tuple(api.ufl.variable(one) for one in self.numbers)
+        self.numbers_q = np.arange(len(values) if self.mesh.comm.rank == 0 else 0)
+
+    def _measures(self, omega: Callable[..., Any] | None) -> None:
+        ufl = self.api.ufl
+        self.seen, self.rest = ufl.dx, None
+        if omega is not None:
+            tags = self.api.cell_tags(self.mesh, omega)
+            dx = ufl.Measure("dx", domain=self.mesh, subdomain_data=tags)
+            self.seen, self.rest = dx(OBSERVED), dx(HIDDEN)
+
+    def _integrand(self, integrand: Callable[..., Any], u: Any) -> Any:
+        x = self.api.ufl.SpatialCoordinate(self.mesh)
+        return integrand(u, self.given, self.v, x, self.time)
+
+    def _inside(self) -> Any:
+        """Return the part of F over omega, which sees the data w."""
+        return self._integrand(self.form, self.w) * self.seen
+
+    def _F(self, split: bool) -> Any:
+        """Return F at u; `split`: with the data w over omega."""
+        ufl, u = self.api.ufl, self.u
+        F = self._inside() if split else self._integrand(self.form, u) * ufl.dx
+        if split and self.rest is not None:
+            F = F + self._integrand(self.form, u) * self.rest
+        if self.boundary is not None:
+            F = F + self._integrand(self.boundary, u) * ufl.ds
+        return F
+
+    def _inner_products(self, inner: Callable[..., Any]) -> tuple[Any, Any]:
+        if self.numbers:
+            ones = self.create_q()
+            ones.set(1.0)
+            eye = petsc_module().Mat().createAIJ((ones.getSizes(), ones.getSizes()), nnz=1)
+            eye.setDiagonal(ones)
+            eye.assemble()
+            return eye, eye
+        ufl = self.api.ufl
+        p, r = ufl.TestFunction(self.Q), ufl.TrialFunction(self.Q)
+        return self._matrix(inner(r, p) * ufl.dx), self._matrix(ufl.inner(r, p) * ufl.dx)
+
+    # --- assembly ---------------------------------------------------------------------------------
+
+    def _at(self, u: Any, q: Any, t: float, w: Any) -> None:
+        """Make forms see these values."""
+        self.time.value = t
+        for function, values in ((self.u, u), (self.w, w)):
+            if values is not None:
+                self.api.assign(function, values)
+        if not self.numbers:
+            self.api.assign(self.q, q)
+            return
+        for constant, value in zip(self.numbers, gathered(q), strict=True):
+            constant.value = value
+
+    def _matrix(self, form: Any) -> Any:
+        return self.api.matrix(self.api.compiled(form))
+
+    def _assembled(self, name: str, split: bool, form: Callable[[], Any]) -> Any:
+        """Return a matrix that is assembled in place from the second time on; None: zero."""
+        key = (name, split)
+        if key not in self._kept:
+            expanded = self.api.expanded(form())
+            compiled = None if expanded.empty() else self.api.compiled(expanded)
+            self._kept[key] = compiled, compiled and self.api.matrix(compiled)
+            return self._kept[key][1]
+        compiled, matrix = self._kept[key]
+        return compiled and self.api.matrix(compiled, matrix)
+
+    def _vector(self, name: str, split: bool, form: Callable[[], Any]) -> Any:
+        key = (name, split)
+        if key not in self._kept:
+            self._kept[key] = self.api.compiled(form())
+        vector = self.create_u()
+        self.api.assemble(self._kept[key], vector)
+        return vector
+
+    def _columns(self, split: bool) -> Any:
+        """Return dF/dq for numbers, a dense matrix whose rows are shared out."""
+        sizes = self.create_u().getSizes(), self.create_q().getSizes()
+        key = ("columns", split)
+        if key not in self._kept:
+            self._kept[key] = petsc_module().Mat().createDense(sizes, comm=self.mesh.comm)
+            self._kept[key].setUp()
+        matrix, diff = self._kept[key], self.api.differentiated
+        for k, one in enumerate(self.given):
+            column = self._vector(f"q{k}", split, lambda one=one: diff(self._F(split), one))
+            matrix.getDenseArray()[:, k] = column.getArray()
+        matrix.assemble()
+        return matrix
+
+    def _readings(self, points: Any) -> Any:
+        """Return G: each point belongs to the lowest rank that has a cell with it."""
+        x = np.zeros((len(points), 3))
+        x[:, : np.shape(points)[1]] = points
+        cells, owner = self.api.cells_at(self.mesh, x), self.mesh.comm.rank
+        nobody = self.mesh.comm.size
+        owners = self.mesh.comm.allgather([owner if c >= 0 else nobody for c in cells])
+        first = np.min(owners, axis=0)
+        if (first == nobody).any():
+            lost = np.flatnonzero(first == nobody)[0]
+            raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside of the mesh.")
+        columns = self.create_u().getSizes()
+        G = petsc_module().Mat().createAIJ(((None, len(x)), columns), comm=self.mesh.comm)
+        G.setUp()
+        G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+        unit = self.api.function(self.V)  # making one takes all ranks
+        for k in np.flatnonzero(first == owner).tolist():
+            dofs, values = self.api.evaluation(unit, x[k], cells[k])
+            G.setValues([k], dofs, values)
+        G.assemble()
+        return G
+
+
+class Interface:
+    """Every call of DOLFINx whose name or form depends on its version: here those of 0.5.2."""
+
+    def __init__(self) -> None:
+        petsc_module()
+        try:
+            modules = (import_module(name) for name in ("ufl", "dolfinx", "dolfinx.fem.petsc"))
+            self.ufl, self.dolfinx, self.petsc = modules
+        except ModuleNotFoundError as error:
+            message = f"DolfinxModel needs DOLFINx (Debian's python3-dolfinx). {MISSING}"
+            raise ConfigurationError(message) from error
+
+    def function(self, space: Any) -> Any:
+        """Return a zero function of a space."""
+        return self.dolfinx.fem.Function(space)
+
+    def constant(self, mesh: Any, value: float) -> Any:
+        """Return a constant whose `value` can be set."""
+        return self.dolfinx.fem.Constant(mesh, float(value))
+
+    def compiled(self, form: Any) -> Any:
+        """Return a compiled form."""
+        return self.dolfinx.fem.form(form)
+
+    def expanded(self, form: Any) -> Any:
+        """Return a form with its derivatives carried out; `empty()` where it is zero."""
+        return self.ufl.algorithms.expand_derivatives(form)
+
+    def differentiated(self, form: Any, variable: Any) -> Any:
+        """Return the derivative of a form in a number, a `ufl.variable`."""
+        diff = self.ufl.diff
+        return self.ufl.Form(
+            [one.reconstruct(diff(one.integrand(), variable)) for one in form.integrals()]
+        )
+
+    def matrix(self, form: Any, matrix: Any = None) -> Any:
+        """Return the matrix of a compiled form, assembled in place where one is given."""
+        if matrix is None:
+            matrix = self.petsc.assemble_matrix(form)
+        else:
+            matrix.zeroEntries()
+            self.petsc.assemble_matrix(matrix, form)
+        matrix.assemble()
+        return matrix
+
+    def assemble(self, form: Any, vector: Any) -> None:
+        """Assemble a linear form into a vector."""
+        PETSc = petsc_module()
+        b = self.petsc.assemble_vector(form)
+        b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
+        vector.getArray()[:] = b.getArray()
+        b.destroy()
+
+    def assign(self, function: Any, vector: Any) -> None:
+        """Set the coefficients of a function, those of its ghosts among them."""
+        function.x.array[: vector.getLocalSize()] = vector.getArray(readonly=True)
+        function.x.scatter_forward()
+
+    def owned(self, space: Any) -> int:
+        """Return the number of owned coefficients of a space."""
+        return int(space.dofmap.index_map.size_local)
+
+    def located(self, V: Any, marker: Callable[..., Any]) -> tuple[IntArray, Array]:
+        """Return owned coefficients at marked points, and their coordinates, shape (3, points)."""
+        dofs = self.dolfinx.fem.locate_dofs_geometrical(V, marker)
+        dofs = dofs[dofs < self.owned(V)]
+        return dofs, V.tabulate_dof_coordinates()[dofs].T
+
+    def cell_tags(self, mesh: Any, marker: Callable[..., Any]) -> Any:
+        """Return tags of all cells: observed by their midpoints, or hidden."""
+        dim = mesh.topology.dim
+        cells = mesh.topology.index_map(dim)
+        local = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+        middle = self.dolfinx.mesh.compute_midpoints(mesh, dim, local)
+        values = np.where(marker(middle.T), OBSERVED, HIDDEN).astype(np.int32)
+        return self.dolfinx.mesh.meshtags(mesh, dim, local, values)
+
+    def cells_at(self, mesh: Any, x: Array) -> IntArray:
+        """Return an owned cell with each point, shape (points,), -1 where this rank has none."""
+        geometry, dim = self.dolfinx.geometry, mesh.topology.dim
+        found = np.full(len(x), -1)
+        owned = mesh.topology.index_map(dim).size_local
+        if not len(x) or not owned:
+            return found
+        tree = geometry.BoundingBoxTree(mesh, dim, padding=1e-10)
+        near = geometry.compute_collisions(tree, x)
+        hits = geometry.compute_colliding_cells(mesh, near, x)
+        for k in range(len(x)):
+            inside = [cell for cell in hits.links(k) if cell < owned]
+            found[k] = inside[0] if inside else -1
+        return found
+
+    def evaluation(self, f: Any, x: Array, cell: int) -> tuple[IntArray, Array]:
+        """Return global coefficients, and the values of their shape functions at a point.
+
+        f is a function of their space, to be used here.
+        """
+        V = f.function_space
+        dofs = V.dofmap.cell_dofs(cell)
+        values = np.zeros(len(dofs))
+        for k, dof in enumerate(dofs):
+            f.x.array[:] = 0.0
+            f.x.array[dof] = 1.0
+            values[k] = np.ravel(f.eval(x, cell))[0]
+        return V.dofmap.index_map.local_to_global(dofs).astype(petsc_module().IntType), values
+
+    def numbering(self, V: Any) -> IntArray:
+        """Return the numbers of owned coefficients in the mesh as it was given, for P1 or P0.
+
+        Raises
+        ------
+        ModelError
+            The element is another one.
+        """
+        mesh, owned = V.mesh, self.owned(V)
+        count = len(mesh.topology.original_cell_index)
+        dofs = V.dofmap.list.array.reshape(count, -1)
+        corners = mesh.geometry.dofmap.array.reshape(count, -1)
+        if dofs.shape[1] == 1:
+            given = np.asarray(mesh.topology.original_cell_index)[:, None]
+        elif dofs.shape == corners.shape:
+            given = np.asarray(mesh.geometry.input_global_indices)[corners]
+        else:
+            raise ModelError(
+                "DolfinxModel: coefficients keep their numbers on every number of ranks for "
+                "linear Lagrange and piecewise constant elements on straight meshes only."
+            )
+        numbers = np.full(owned + V.dofmap.index_map.num_ghosts, -1, dtype=np.int64)
+        numbers[dofs] = given
+        return numbers[:owned]

@@ -1,0 +1,160 @@
+"""One implicit Euler step on PETSc, and its tangents with the same operator and preconditioner."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from livepde.laws.base import Status
+from livepde.petsc.model import PetscModel, petsc_module
+from livepde.petsc.vectors import free_mask
+from livepde.stepping import StepFailed
+
+__all__ = ["ImplicitStep", "advance"]
+
+RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
+TINY = 1e-300
+REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
+PREFIX = "livepde_state_"
+
+State = TypeVar("State")
+
+
+def advance(
+    stage: Callable[[State, float, float], State],
+    state: State,
+    t0: float,
+    t1: float,
+    halvings: int = 6,
+) -> tuple[State, Status]:
+    """Return the state at t1 by stages over [t, t + h], halved where one fails, and a status.
+
+    With a status other than "ok" the state is that of t0.
+    """
+    count, done, now = 1, 0, state
+    while done < count:
+        h = (t1 - t0) / count
+        try:
+            now = stage(now, t0 + done * h, h)
+        except StepFailed as failure:
+            if count >= 2**halvings:
+                return state, Status.of(failure)
+            count, done = 2 * count, 2 * done
+        else:
+            done += 1
+    return now, Status()
+
+
+@dataclass(eq=False)
+class ImplicitStep:
+    """Newton's iteration for M (u+ - u)/h + F(u+, q, t + h) = 0, and S^{-1}, S = M/h + dF/du.
+
+    The preconditioner is algebraic multigrid (GAMG), kept from step to step until it needs
+    `REBUILD` times the iterations that it took when new. PETSc's options with the prefix
+    `livepde_state_` replace both.
+
+    Attributes
+    ----------
+    model
+        The process.
+    tolerance
+        Bound on the residual, in the dual norm weighed by the diagonal of M, relative to the terms
+        of the equation.
+    accuracy
+        Relative tolerance of the linear solver.
+    iterations
+        Maximum number of updates.
+    """
+
+    model: PetscModel
+    tolerance: float = 1e-9
+    accuracy: float = 1e-11
+    iterations: int = 20
+
+    def __post_init__(self) -> None:
+        mass = self.model.mass
+        self.free = free_mask(mass.createVecRight(), self.model.fixed)
+        self.weights = mass.getDiagonal()
+        self.weights.reciprocal()
+        self.S: Any = None
+        self.ksp: Any = None
+        self._best, self._last, self._width = 0, 0, 0.0
+
+    def solve(self, u: Any, q: Any, t: float, h: float) -> Any:
+        """Return u at t + h, a new vector; raises `StepFailed`."""
+        model, begin = self.model, u
+        u = begin.copy()
+        model.impose(u, t + h)
+        rate = begin.duplicate()
+        least = RESTING * self.dual(model.mass * begin) / h
+        stale = True
+        for count in range(self.iterations + 1):
+            model.mass.mult((u - begin) / h, rate)
+            force = model.residual(u, q, t + h)
+            size = max(self.dual(rate), self.dual(force), least, TINY)
+            force.axpy(1.0, rate)
+            found = self.dual(force) / size
+            if not math.isfinite(found):
+                raise StepFailed("not_finite", "the iteration left the range of finite numbers")
+            if count and found <= self.tolerance:
+                break
+            if count == self.iterations:
+                raise StepFailed(
+                    "not_converged", f"{count} updates left a relative residual of {found:.1e}"
+                )
+            if stale:
+                self.linearise(u, q, t + h, h)
+                stale = not model.linear
+            u.axpy(-1.0, self.back(force))
+        if stale:
+            self.linearise(u, q, t + h, h)
+        return u
+
+    def dual(self, functional: Any) -> float:
+        """Return the dual norm of a functional on the free coefficients, by the diagonal of M."""
+        free = functional * self.free
+        return math.sqrt(abs(float(free.dot(free * self.weights))))
+
+    def linearise(self, u: Any, q: Any, t: float, h: float) -> None:
+        """Assemble S = M/h + dF/du at a point, fixed coefficients eliminated."""
+        PETSc, model = petsc_module(), self.model
+        slope = model.jacobian_u(u, q, t)
+        if self.S is None:
+            self.S = slope.copy()
+        else:
+            slope.copy(self.S, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self.S.axpy(1.0 / h, model.mass, PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN)
+        self.S.zeroRowsColumns(model.fixed, 1.0)
+        if self.ksp is None:
+            self.ksp = self._solver()
+        rebuild = h != self._width or self._last > REBUILD * self._best + 1
+        self.ksp.getPC().setReusePreconditioner(not rebuild)
+        self.ksp.setOperators(self.S)
+        if rebuild:
+            self._best, self._width = 0, h
+
+    def back(self, b: Any) -> Any:
+        """Return S^{-1} b, zero at fixed coefficients; raises `StepFailed`."""
+        x = b.duplicate()
+        self.ksp.solve(b * self.free, x)
+        if self.ksp.getConvergedReason() < 0:
+            raise StepFailed(
+                "singular",
+                f"PETSc's solver stopped after {self.ksp.getIterationNumber()} iterations "
+                f"(reason {self.ksp.getConvergedReason()})",
+            )
+        self._last = self.ksp.getIterationNumber()
+        self._best = self._best or self._last
+        return x
+
+    def _solver(self) -> Any:
+        PETSc = petsc_module()
+        ksp = PETSc.KSP().create(self.model.mass.comm)
+        ksp.setOptionsPrefix(PREFIX)
+        ksp.setType("cg" if self.model.symmetric else "gmres")
+        ksp.setTolerances(rtol=self.accuracy, atol=0.0, max_it=500)
+        ksp.getPC().setType("gamg")
+        ksp.setFromOptions()
+        return ksp
