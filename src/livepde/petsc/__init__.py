@@ -10,6 +10,7 @@ from __future__ import annotations
 from livepde.petsc.dolfinx import DolfinxModel
 from livepde.petsc.filter import FilterReport, FilterState, PetscFilter, leading_modes, number_modes
 from livepde.petsc.model import PetscModel
+from livepde.petsc.observer import ObserverReport, ObserverState, PetscObserver
 from livepde.petsc.step import ImplicitStep
 
 __all__ = [
@@ -17,8 +18,11 @@ __all__ = [
     "FilterReport",
     "FilterState",
     "ImplicitStep",
+    "ObserverReport",
+    "ObserverState",
     "PetscFilter",
     "PetscModel",
+    "PetscObserver",
     "leading_modes",
     "number_modes",
 ]

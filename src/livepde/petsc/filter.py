@@ -25,7 +25,7 @@ from livepde.errors import LawError
 from livepde.laws.base import Status
 from livepde.linalg import Array, IntArray, Mask
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.step import ImplicitStep, advance
+from livepde.petsc.step import ImplicitStep, advance, multigrid
 from livepde.petsc.vectors import combined, gathered, inner, random_vector, zeros
 
 __all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
@@ -279,7 +279,7 @@ def _riesz(gram: Any) -> Any:
     solver = PETSc.KSP().create(gram.comm)
     solver.setOperators(gram)
     solver.setType("cg")
-    solver.getPC().setType("gamg")
+    solver.getPC().setType(multigrid())
     solver.setTolerances(rtol=1e-12)
     solver.setOptionsPrefix("livepde_riesz_")
     solver.setFromOptions()

@@ -12,7 +12,7 @@ from livepde.petsc.model import PetscModel, petsc_module
 from livepde.petsc.vectors import free_mask
 from livepde.stepping import StepFailed
 
-__all__ = ["ImplicitStep", "advance"]
+__all__ = ["ImplicitStep", "advance", "multigrid"]
 
 RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
 TINY = 1e-300
@@ -47,11 +47,16 @@ def advance(
     return now, Status()
 
 
+def multigrid() -> str:
+    """Return the algebraic multigrid of this PETSc: BoomerAMG if it was built with hypre."""
+    return "hypre" if petsc_module().Sys.hasExternalPackage("hypre") else "gamg"
+
+
 @dataclass(eq=False)
 class ImplicitStep:
     """Newton's iteration for M (u+ - u)/h + F(u+, q, t + h) = 0, and S^{-1}, S = M/h + dF/du.
 
-    The preconditioner is algebraic multigrid (GAMG), kept from step to step until it needs
+    The preconditioner is algebraic multigrid, kept from step to step until it needs
     `REBUILD` times the iterations that it took when new. PETSc's options with the prefix
     `livepde_state_` replace both.
 
@@ -155,6 +160,6 @@ class ImplicitStep:
         ksp.setOptionsPrefix(PREFIX)
         ksp.setType("cg" if self.model.symmetric else "gmres")
         ksp.setTolerances(rtol=self.accuracy, atol=0.0, max_it=500)
-        ksp.getPC().setType("gamg")
+        ksp.getPC().setType(multigrid())
         ksp.setFromOptions()
         return ksp

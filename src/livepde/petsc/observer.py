@@ -1,0 +1,541 @@
+"""The paper's law on PETSc vectors: u and q in one coupled implicit step.
+
+Boiger and Kaltenbacher (2016), (est_exact_q) and (est_exact_u), or (noisy_q), (noisy_u) for a
+smoothed u_alpha, where u_alpha is known on omega. With w = u_alpha on omega and u elsewhere, and
+r = u - u_alpha on omega, y = (u, q) solves
+
+    M (u - c_u)/h + F(u, q, t; w) + theta M_op r + nu N_op u    = 0
+    G_Q ((q - c_q)/h + sigma q)/gain - A(w)^T r                 = 0
+
+together, so that with full data the terms with A cancel in the energy, as in (align:neplusnr).
+theta = mu/||r||_V~ is that of a damping rule, as Assumption cond:mu02. Newton's linear systems
+
+    K = [[M/h + dF/du + theta M_op + nu N_op + b a^T,  A], [-A(w)^T,  G_Q (1/h + sigma)/gain]]
+
+are solved by GMRES, preconditioned by PETSc's field split: a lower Schur factorisation, algebraic
+multigrid for the first block and for the second one plus A^T D^-1 A, D the row sums of the first
+(`selfp`). b a^T is the derivative of theta, and is left out of the preconditioner.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.laws.base import Status
+from livepde.laws.damping import Damping, Residual, ResidualDamping
+from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
+from livepde.petsc.model import PetscModel, petsc_module
+from livepde.petsc.step import RESTING, TINY, advance, multigrid
+from livepde.petsc.vectors import free_mask, random_vector, zeros
+from livepde.stepping import StepFailed
+
+__all__ = ["ObserverReport", "ObserverState", "PetscObserver"]
+
+PREFIX = "livepde_coupled_"
+OPTIONS = {  # of PETSc; one that the user has set stays
+    "ksp_type": "fgmres",
+    "ksp_gmres_restart": "60",
+    "pc_type": "fieldsplit",
+    "pc_fieldsplit_type": "schur",
+    "pc_fieldsplit_schur_fact_type": "lower",
+    "pc_fieldsplit_schur_precondition": "selfp",
+    "fieldsplit_0_ksp_type": "preonly",
+    "fieldsplit_1_mat_schur_complement_ainv_type": "lump",
+    "fieldsplit_1_ksp_type": "preonly",
+}
+ITERATIONS = 120  # of GMRES for one update
+REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
+FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
+STIFFEST = 1e12  # times 1/h, of theta
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverState:
+    """Estimates after a sample.
+
+    Attributes
+    ----------
+    t
+        Time of the sample.
+    u, q
+        Estimates, vectors of shapes (n,) and (m,).
+    u_alpha
+        Data of the sample, shape (n,); None before the first one.
+    rate_u, rate_q
+        Last change of u - u_alpha and q per unit of time, with which the next step begins.
+    excitation
+        State of the gate.
+    """
+
+    t: float
+    u: Any
+    q: Any
+    u_alpha: Any
+    rate_u: Any
+    rate_q: Any
+    excitation: ExcitationLevel
+
+
+@dataclass(frozen=True, eq=False)
+class ObserverReport:
+    """What a sample has brought.
+
+    Attributes
+    ----------
+    status
+        "ok", or the kind of failure with its remedy; then the state is that of before.
+    residual
+        ||r||_X before the step could reduce it: that of the estimate of before.
+    held
+        True if the gate has held q, because nothing but noise excites it.
+    updates, iterations
+        Newton's updates, and the iterations of GMRES for them.
+    """
+
+    status: Status
+    residual: float
+    held: bool
+    updates: int
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class PetscObserver:
+    """The online method of Boiger and Kaltenbacher, for a field q and u observed on a subdomain.
+
+    Parameters
+    ----------
+    model
+        The process; F has to be affine in q.
+    gain
+        Scale of the inner product of Q, > 0.
+    damping
+        Rule for theta = mu/||r||_V~.
+    nu, sigma
+        Weight of P N P u, and stabilising term of (noisy_q), >= 0.
+    lower, upper
+        Bounds of each coefficient of q.
+    gate
+        When q is held, because nothing excites it but noise; None: never.
+    tolerance
+        Bound on the residual of both lines, in dual norms weighed by the diagonals of M and G_Q,
+        relative to their terms.
+    iterations
+        Maximum number of Newton's updates in a step.
+    """
+
+    model: PetscModel
+    gain: float = 1.0
+    damping: Damping = field(default_factory=ResidualDamping)
+    nu: float = 0.0
+    sigma: float = 0.0
+    lower: float = -np.inf
+    upper: float = np.inf
+    gate: ExcitationGate | None = field(default_factory=ExcitationGate)
+    tolerance: float = 1e-7
+    iterations: int = 20
+    solver: CoupledSolver = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.gain) and self.gain > 0):
+            raise LawError(f"PetscObserver: gain must be a positive number; got {self.gain}.")
+        for name in ("nu", "sigma"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise LawError(f"PetscObserver: {name} must be a number >= 0; got {value}.")
+        if not self.lower < self.upper:
+            raise LawError(
+                f"PetscObserver: lower must be less than upper; got {self.lower} and {self.upper}."
+            )
+        object.__setattr__(self, "solver", CoupledSolver(self))
+
+    def init(self, q0: Any, u0: Any, t0: float = 0.0) -> ObserverState:
+        """Return the state at the start."""
+        u = u0.copy()
+        self.model.impose(u, t0)
+        return ObserverState(t0, u, q0.copy(), None, None, None, ExcitationLevel.none())
+
+    def step(
+        self, state: ObserverState, t: float, u_alpha: Any
+    ) -> tuple[ObserverState, ObserverReport]:
+        """Return the state after a sample: u_alpha at t, its values outside of omega unused.
+
+        Raises
+        ------
+        LawError
+            t is not later than the sample before.
+        """
+        if not t > state.t:
+            raise LawError(f"PetscObserver: t must be later than {state.t}; got {t}.")
+        data = self.solver.within(u_alpha)
+        self.model.impose(data, t)
+        path = (state.t, data if state.u_alpha is None else state.u_alpha, t, data)
+        held = self.gate is not None and self.gate.closed(state.excitation)
+        self.solver.begin(path, held)
+        before = self.solver.residual_norm(state.u, data)
+        new, status = advance(self._stage, state, state.t, t)
+        report = ObserverReport(status, before, held, self.solver.updates, self.solver.krylov)
+        if not status.ok:
+            return state, report
+        np.clip(new.q.getArray(), self.lower, self.upper, out=new.q.getArray())
+        excitation = state.excitation
+        if self.gate is not None:
+            excitation = self.gate.add(excitation, *self.solver.probed(new.u, data, new.q, t))
+        change = new.u - state.u - (data - path[1])
+        rates = change / (t - state.t), (new.q - state.q) / (t - state.t)
+        first = None if state.u_alpha is None else rates
+        return replace(
+            new,
+            u_alpha=data,
+            rate_u=None if first is None else first[0],
+            rate_q=None if first is None else first[1],
+            excitation=excitation,
+        ), report
+
+    def _stage(self, state: ObserverState, t: float, h: float) -> ObserverState:
+        u, q = self.solver.solve(state, t, h)
+        return replace(state, t=t + h, u=u, q=q)
+
+
+class CoupledSolver:
+    """Newton's iteration for the coupled step, and its linear solver.
+
+    Attributes
+    ----------
+    updates, krylov
+        Newton's updates since `begin`, and iterations of GMRES.
+    """
+
+    def __init__(self, law: PetscObserver) -> None:
+        self.law, self.model = law, law.model
+        mass, gram = self.model.mass, self.model.gram
+        self.free = free_mask(mass.createVecRight(), self.model.fixed)
+        self.weights = mass.getDiagonal(), gram.getDiagonal()
+        for diagonal in self.weights:
+            diagonal.reciprocal()
+        self.unseen = self.model.mass_observed.getDiagonal().getArray() <= 0.0
+        self.operator = CoupledOperator()
+        self.ksp: Any = None
+        self.updates = self.krylov = 0
+        self._best, self._slow, self._width = 0.0, False, 0.0  # iterations for a digit, and step
+        self._probes: Any = None
+        self._tests: Any = None
+
+    def begin(self, path: tuple[float, Any, float, Any], held: bool) -> None:
+        """Take up a sample: times and data at both ends, and whether q is held."""
+        self.path, self.held = path, held
+        self.updates = self.krylov = 0
+
+    def within(self, u_alpha: Any) -> Any:
+        """Return data with zeros where no observed cell is."""
+        data = u_alpha.copy()
+        data.getArray()[self.unseen] = 0.0
+        return data
+
+    def data(self, t: float) -> Any:
+        """Return u_alpha at a time within the interval, interpolated."""
+        t0, old, t1, new = self.path
+        return new if t == t1 else old + (new - old) * ((t - t0) / (t1 - t0))
+
+    def residual_norm(self, u: Any, u_alpha: Any) -> float:
+        """Return ||r||_X."""
+        r = (u - u_alpha) * self.free
+        return math.sqrt(abs(float(r.dot(self.model.mass_observed * r))))
+
+    def solve(self, state: ObserverState, t: float, h: float) -> tuple[Any, Any]:
+        """Return (u, q) at t + h; raises `StepFailed`."""
+        stage = Stage(self, state, t + h, h, self.data(t + h))
+        u, q = state.u.copy(), state.q.copy()
+        u.axpy(1.0, self.data(t + h) - self.data(t))
+        if state.rate_u is not None:
+            u.axpy(h, state.rate_u)
+            if not self.held:
+                q.axpy(h, state.rate_q)
+        self.model.impose(u, t + h)
+        for count in range(self.law.iterations + 1):
+            found = stage.evaluate(u, q)
+            if not math.isfinite(found):
+                raise StepFailed("not_finite", "the iteration left the range of finite numbers")
+            if found <= self.law.tolerance:
+                return u, q
+            if count == self.law.iterations:
+                break
+            du, dq = self._update(stage, u, q, found)
+            self.updates += 1
+            u.axpy(-1.0, du)
+            q.axpy(-1.0, dq)
+        raise StepFailed(
+            "not_converged", f"{self.law.iterations} updates left a relative residual of {found:.1e}"
+        )
+
+    def _update(self, stage: Stage, u: Any, q: Any, found: float) -> tuple[Any, Any]:
+        """Return the solution of K x = residual, to the accuracy that Newton makes use of."""
+        PETSc, K = petsc_module(), self.operator
+        stage.linearise(K, u, q)
+        if stage.h != self._width or self._slow:
+            self._build(K)
+            self._best, self._width = 0.0, stage.h
+        b = PETSc.Vec().createNest([stage.first, stage.second], comm=u.comm)
+        x = PETSc.Vec().createNest([zeros(u), zeros(q)], comm=u.comm)
+        accuracy = min(max(0.3 * self.law.tolerance / found, FORCING), 0.3)
+        self.ksp.setTolerances(rtol=accuracy, atol=0.0, max_it=ITERATIONS)
+        self.ksp.solve(b, x)
+        reason, count = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
+        if reason < 0 and reason != PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT:
+            raise StepFailed("singular", f"PETSc's solver stopped with reason {reason}")
+        digits = -math.log10(accuracy)
+        self._best = self._best or count / digits
+        self._slow = count > REBUILD * self._best * digits + 2
+        self.krylov += count
+        du, dq = x.getNestSubVecs()
+        return du, dq
+
+    def _build(self, K: CoupledOperator) -> None:
+        """Make the solver, with a preconditioner of the blocks as they are now."""
+        PETSc = petsc_module()
+        options = PETSc.Options(PREFIX)
+        blocks = {f"fieldsplit_{k}_pc_type": multigrid() for k in (0, 1)}
+        for name, value in (OPTIONS | blocks).items():
+            if not options.hasName(name):
+                options[name] = value
+        nest = K.nested()
+        sizes = nest.getSizes()[0]
+        shell = PETSc.Mat().createPython((sizes, sizes), K, comm=nest.comm)
+        shell.setUp()
+        self.ksp = PETSc.KSP().create(nest.comm)
+        self.ksp.setOptionsPrefix(PREFIX)
+        self.ksp.setOperators(shell, nest)
+        self.ksp.setFromOptions()
+        parts = ((str(k), part) for k, part in enumerate(nest.getNestISs()[0]))
+        self.ksp.getPC().setFieldSplitIS(*parts)
+        self.ksp.getPC().setReusePreconditioner(True)
+
+    def dual(self, functional: Any, line: int) -> float:
+        """Return the dual norm of a functional on u (line 0), or q (line 1), by a diagonal."""
+        return math.sqrt(abs(float(functional.dot(functional * self.weights[line]))))
+
+    def riesz(self, functional: Any) -> Any:
+        """Return the Riesz representative in X of a functional on the inside of omega."""
+        if self._tests is None:
+            self._tests = Tests(self.model, self.free)
+        return self._tests(functional)
+
+    def probed(self, u: Any, u_alpha: Any, q: Any, t: float) -> tuple[Any, Any]:
+        """Return (A(w) e_k, p_k) and (A(u) e_k, p_k), each of shape (PROBES,)."""
+        if self._probes is None:
+            self._probes = probes(self.model, self.free)
+        found = []
+        for w in (u_alpha, u):
+            A = self.model.coupling(w, q, t)
+            found.append(np.array([(A * e).dot(p) for e, p in self._probes]))
+        return found[0], found[1]
+
+
+class Stage:
+    """The equation of one coupled step: its residual, and its Jacobian at the last iterate."""
+
+    def __init__(
+        self, solver: CoupledSolver, state: ObserverState, t: float, h: float, u_alpha: Any
+    ) -> None:
+        self.solver, self.law, self.model = solver, solver.law, solver.model
+        self.begin_u, self.begin_q, self.t, self.h, self.w = state.u, state.q, t, h, u_alpha
+        self.A_in: Any = None
+        self.least = RESTING * solver.dual(self.model.mass * state.u, 0) / h
+        self.least_q = RESTING * solver.dual(self.model.gram * state.q, 1) * self.weight
+        self._observed: Residual | None = None
+        self._start: tuple[Any, Any] | None = None
+
+    @property
+    def weight(self) -> float:
+        """Weight of G_Q in K; while q is held it is so large that q stays."""
+        held = 1e12 if self.solver.held else 1.0
+        return held * (1.0 / self.h + self.law.sigma) / self.law.gain
+
+    def evaluate(self, u: Any, q: Any) -> float:
+        """Evaluate the residual of both lines and return its relative size."""
+        model, law, dual = self.model, self.law, self.solver.dual
+        r = (u - self.w) * self.solver.free
+        self.Mr, self.mass_r = model.pull * r, model.mass_observed * r
+        self.norms = self.measured(r, self.Mr, self.mass_r)
+        self.theta = min(law.damping.theta(self.norms), STIFFEST / self.h)
+        rate = model.mass * ((u - self.begin_u) / self.h)
+        force = self.force(u, q)
+        terms = rate, force, self.Mr * self.theta
+        self.first = (terms[0] + terms[1] + terms[2]) * self.solver.free
+        size = max(self.least, TINY, *(dual(term * self.solver.free, 0) for term in terms))
+        back = zeros(q)
+        self.A_in.multTranspose(r, back)
+        drift = 0.0 if self.solver.held else law.sigma / law.gain
+        change = model.gram * ((q - self.begin_q) * self.weight + self.begin_q * drift)
+        self.second = change - back
+        size_q = max(self.least_q, TINY, dual(change, 1), dual(back, 1))
+        return max(dual(self.first, 0) / size, dual(self.second, 1) / size_q)
+
+    def force(self, u: Any, q: Any) -> Any:
+        """Return F(u, q, t; w) + nu N_op u; with all of u observed it is affine in q alone."""
+        model, law = self.model, self.law
+        if self.A_in is None:
+            self.A_in = model.coupling(self.w, q, self.t)
+        if model.push is None:
+            if self._start is None:
+                self._start = model.residual(u, q, self.t, self.w), q.copy()
+            return self._start[0] + self.A_in * (q - self._start[1])
+        force = model.residual(u, q, self.t, self.w)
+        if law.nu:
+            force.axpy(law.nu, model.push * u)
+        return force
+
+    def measured(self, r: Any, Mr: Any, mass_r: Any) -> Residual:
+        """Return the norms of r that a damping rule may use."""
+        return Residual(
+            abs(float(r.dot(mass_r))), abs(float(r.dot(Mr))), lambda: self._squared(Mr), self.seen
+        )
+
+    def seen(self) -> Residual:
+        """Return the norms of u_alpha."""
+        if self._observed is None:
+            z = self.w * self.solver.free
+            pulled, weighed = self.model.pull * z, self.model.mass_observed * z
+            X, VX = abs(float(z.dot(weighed))), abs(float(z.dot(pulled)))
+            self._observed = Residual(X, VX, lambda: self._squared(pulled))
+        return self._observed
+
+    def _squared(self, functional: Any) -> float:
+        """Return the squared dual norm of a functional: ||r||_V~^2 of M_op r."""
+        return abs(float(functional.dot(self.solver.riesz(functional))))
+
+    def linearise(self, K: CoupledOperator, u: Any, q: Any) -> None:
+        """Put the blocks of the Jacobian into K."""
+        PETSc, model, law = petsc_module(), self.model, self.law
+        other = PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN
+        S = model.mass.copy()
+        S.scale(1.0 / self.h)
+        slope = model.jacobian_u(u, q, self.t, self.w)
+        if slope is not None:
+            S.axpy(1.0, slope, other)
+        S.axpy(self.theta, model.pull, other)
+        if law.nu and model.push is not None:
+            S.axpy(law.nu, model.push, other)
+        S.zeroRowsColumns(model.fixed, 1.0)
+        A = self.A_in
+        if model.push is not None:
+            A = model.jacobian_q(u, q, self.t, self.w)
+        K.S, K.A, K.A_in, K.H = S, A, self.A_in, (model.gram, self.weight)
+        K.free, K.border = self.solver.free, self._slope()
+
+    def _slope(self) -> tuple[Any, Any] | None:
+        """Return b and a of the derivative b a^T of theta M_op r in theta; None if it is zero."""
+        if self.theta >= STIFFEST / self.h:
+            return None
+        dX, dVX, dV = self.law.damping.slopes(self.norms)
+        row = self.mass_r * (2.0 * dX) + self.Mr * (2.0 * dVX)
+        if dV:
+            row.axpy(2.0 * dV, self.model.pull * self.solver.riesz(self.Mr))
+        return self.Mr * self.solver.free, row * self.solver.free
+
+
+class CoupledOperator:
+    """K as a matrix of Python for PETSc, and as nested blocks for its preconditioner.
+
+    Attributes
+    ----------
+    S, A, A_in, H
+        Blocks: of u; dF/dq and A(w), whose rows `free` is to mask; gram matrix and its weight.
+    border
+        (b, a): b a^T is added to S; None: nothing.
+    """
+
+    S: Any
+    A: Any
+    A_in: Any
+    H: tuple[Any, float]
+    free: Any
+    border: tuple[Any, Any] | None
+
+    def mult(self, matrix: Any, x: Any, y: Any) -> None:
+        """Set y = K x."""
+        (u, q), (first, second) = x.getNestSubVecs(), y.getNestSubVecs()
+        self.S.mult(u, first)
+        driven = self.A * q
+        driven.pointwiseMult(driven, self.free)
+        first.axpy(1.0, driven)
+        if self.border is not None:
+            first.axpy(self.border[1].dot(u), self.border[0])
+        gram, weight = self.H
+        gram.mult(q, second)
+        back = second.duplicate()
+        self.A_in.multTranspose(u * self.free, back)
+        second.scale(weight)
+        second.axpy(-1.0, back)
+
+    def nested(self) -> Any:
+        """Return the blocks without the border, copied."""
+        A, A_in = self.A.copy(), self.A_in.copy()
+        A.diagonalScale(L=self.free)
+        A_in.diagonalScale(L=self.free)
+        back = A_in.transpose()
+        back.scale(-1.0)
+        H = self.H[0].copy()
+        H.scale(self.H[1])
+        nest = petsc_module().Mat().createNest([[self.S, A], [back, H]], comm=self.S.comm)
+        nest.assemble()
+        return nest
+
+
+class Tests:
+    """Test functions that stay within omega: the Riesz map behind ||r||_V~ (MN1)."""
+
+    def __init__(self, model: PetscModel, free: Any) -> None:
+        PETSc = petsc_module()
+        inside, hidden = free.copy(), (model.mass - model.mass_observed).getDiagonal()
+        hidden.abs()
+        size = model.mass.getDiagonal()
+        outside = hidden.getArray() > 1e-12 * size.getArray()
+        inside.getArray()[outside] = 0.0
+        start = free.getOwnershipRange()[0]
+        rows = start + np.flatnonzero(inside.getArray() == 0.0)
+        matrix = model.mass.copy()
+        matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0)
+        self.inside = inside
+        self.solver = PETSc.KSP().create(matrix.comm)
+        self.solver.setOperators(matrix)
+        self.solver.setType("cg")
+        self.solver.getPC().setType("jacobi")
+        self.solver.setTolerances(rtol=1e-10)
+
+    def __call__(self, functional: Any) -> Any:
+        x = functional.duplicate()
+        self.solver.solve(functional * self.inside, x)
+        return x
+
+
+def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
+    """Return pairs (e_k, p_k) for the gate: e_k in the unit ball of Q, p_k smooth on omega."""
+    PETSc = petsc_module()
+    solvers = []
+    stiff = model.pull.copy()
+    stiff.axpy(1e-6, model.mass, PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN)
+    stiff.zeroRowsColumns(model.fixed, 1.0)
+    for matrix in (model.gram, stiff):
+        solver = PETSc.KSP().create(matrix.comm)
+        solver.setOperators(matrix)
+        solver.setType("cg")
+        solver.getPC().setType(multigrid())
+        solver.setTolerances(rtol=1e-8)
+        solvers.append(solver)
+    q, u = model.gram.createVecRight(), model.mass.createVecRight()
+    found = []
+    for seed in range(PROBES):
+        e, p = zeros(q), zeros(u)
+        load = random_vector(q, model.numbers_q, 2 * seed + 101)
+        solvers[0].solve(load, e)
+        e.scale(1.0 / math.sqrt(abs(float(e.dot(model.gram * e)))))
+        load = model.mass_observed * random_vector(u, model.numbers_u, 2 * seed + 102)
+        solvers[1].solve(load * free, p)
+        found.append((e, p))
+    return found
