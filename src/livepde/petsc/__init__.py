@@ -7,6 +7,8 @@ MPI start with the first model.
 
 from __future__ import annotations
 
+from livepde.petsc.check import check_petsc_model
+from livepde.petsc.checkpoint import load_state, save_state
 from livepde.petsc.dolfinx import DolfinxModel
 from livepde.petsc.filter import FilterReport, FilterState, PetscFilter, leading_modes, number_modes
 from livepde.petsc.model import PetscModel
@@ -23,6 +25,9 @@ __all__ = [
     "PetscFilter",
     "PetscModel",
     "PetscObserver",
+    "check_petsc_model",
     "leading_modes",
+    "load_state",
     "number_modes",
+    "save_state",
 ]

@@ -30,7 +30,7 @@ from livepde.laws.base import Status
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.step import RESTING, TINY, advance, multigrid
+from livepde.petsc.step import RESTING, SAME, TINY, advance, multigrid
 from livepde.petsc.vectors import free_mask, random_vector, zeros
 from livepde.stepping import StepFailed
 
@@ -137,7 +137,7 @@ class PetscObserver:
     lower: float = -np.inf
     upper: float = np.inf
     gate: ExcitationGate | None = field(default_factory=ExcitationGate)
-    tolerance: float = 1e-7
+    tolerance: float = 1e-6
     iterations: int = 20
     solver: CoupledSolver = field(init=False, repr=False)
 
@@ -277,7 +277,7 @@ class CoupledSolver:
         """Return the solution of K x = residual, to the accuracy that Newton makes use of."""
         PETSc, K = petsc_module(), self.operator
         stage.linearise(K, u, q)
-        if stage.h != self._width or self._slow:
+        if abs(stage.h - self._width) > SAME * stage.h or self._slow:
             self._build(K)
             self._best, self._width = 0.0, stage.h
         b = PETSc.Vec().createNest([stage.first, stage.second], comm=u.comm)

@@ -16,6 +16,7 @@ __all__ = ["ImplicitStep", "advance", "multigrid"]
 
 RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
 TINY = 1e-300
+SAME = 1e-9  # of a step: steps that are the same but for rounding
 REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
 PREFIX = "livepde_state_"
 
@@ -134,7 +135,7 @@ class ImplicitStep:
         self.S.zeroRowsColumns(model.fixed, 1.0)
         if self.ksp is None:
             self.ksp = self._solver()
-        rebuild = h != self._width or self._last > REBUILD * self._best + 1
+        rebuild = abs(h - self._width) > SAME * h or self._last > REBUILD * self._best + 1
         self.ksp.getPC().setReusePreconditioner(not rebuild)
         self.ksp.setOperators(self.S)
         if rebuild:
