@@ -30,7 +30,7 @@ from livepde.petsc.vectors import combined, gathered, inner, random_vector, zero
 
 __all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
 
-ACCURATE = 1e-10  # relative change of the variances of modes
+ACCURATE = 1e-14  # relative change of the variances of modes
 
 
 @dataclass(frozen=True, eq=False)

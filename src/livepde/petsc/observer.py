@@ -27,6 +27,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
+from livepde.laws.coupled.stage import nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
@@ -52,6 +53,8 @@ ITERATIONS = 120  # of GMRES for one update
 REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
 FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
 STIFFEST = 1e12  # times 1/h, of theta
+SHORTEST = 1e-3  # part of an update that is tried
+SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,21 +260,55 @@ class CoupledSolver:
             if not self.held:
                 q.axpy(h, state.rate_q)
         self.model.impose(u, t + h)
-        for count in range(self.law.iterations + 1):
-            found = stage.evaluate(u, q)
-            if not math.isfinite(found):
-                raise StepFailed("not_finite", "the iteration left the range of finite numbers")
+        try:
+            return self._newton(stage, u.copy(), q.copy())
+        except StepFailed:
+            return self._by_theta(stage, u, q)
+
+    def _newton(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
+        """Return the solution, from a start that is overwritten; raises `StepFailed`."""
+        found = stage.evaluate(u, q)
+        for _ in range(self.law.iterations):
             if found <= self.law.tolerance:
                 return u, q
-            if count == self.law.iterations:
-                break
             du, dq = self._update(stage, u, q, found)
             self.updates += 1
+            before, part = found, 1.0
             u.axpy(-1.0, du)
             q.axpy(-1.0, dq)
-        raise StepFailed(
-            "not_converged", f"{self.law.iterations} updates left a relative residual of {found:.1e}"
-        )
+            found = stage.evaluate(u, q)
+            # A sufficient decrease proportional to the step (Armijo), else half of the update.
+            while not found <= (1.0 - 0.1 * part) * before and part > SHORTEST:
+                part *= 0.5
+                u.axpy(part, du)
+                q.axpy(part, dq)
+                found = stage.evaluate(u, q)
+            if not math.isfinite(found):
+                raise StepFailed("not_finite", "the iteration left the range of finite numbers")
+            if found >= before:
+                break
+        if found <= self.law.tolerance:
+            return u, q
+        raise StepFailed("not_converged", f"the updates left a relative residual of {found:.1e}")
+
+    def _by_theta(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
+        """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
+
+        With theta given the step is all but linear, and theta is the root of a scalar function.
+        """
+        stage.evaluate(u, q)
+
+        def gap(theta: float) -> float:
+            nonlocal u, q
+            stage.given = theta
+            u, q = self._newton(stage, u, q)
+            return stage.rule() - theta
+
+        root = nearest_root(gap, max(stage.theta, SMALLEST))
+        if root is None:
+            raise StepFailed("not_converged", "no weight theta of the damping solves the step")
+        gap(root)
+        return u, q
 
     def _update(self, stage: Stage, u: Any, q: Any, found: float) -> tuple[Any, Any]:
         """Return the solution of K x = residual, to the accuracy that Newton makes use of."""
@@ -344,6 +381,7 @@ class Stage:
     ) -> None:
         self.solver, self.law, self.model = solver, solver.law, solver.model
         self.begin_u, self.begin_q, self.t, self.h, self.w = state.u, state.q, t, h, u_alpha
+        self.given: float | None = None
         self.A_in: Any = None
         self.least = RESTING * solver.dual(self.model.mass * state.u, 0) / h
         self.least_q = RESTING * solver.dual(self.model.gram * state.q, 1) * self.weight
@@ -362,7 +400,7 @@ class Stage:
         r = (u - self.w) * self.solver.free
         self.Mr, self.mass_r = model.pull * r, model.mass_observed * r
         self.norms = self.measured(r, self.Mr, self.mass_r)
-        self.theta = min(law.damping.theta(self.norms), STIFFEST / self.h)
+        self.theta = self.rule() if self.given is None else self.given
         rate = model.mass * ((u - self.begin_u) / self.h)
         force = self.force(u, q)
         terms = rate, force, self.Mr * self.theta
@@ -375,6 +413,10 @@ class Stage:
         self.second = change - back
         size_q = max(self.least_q, TINY, dual(change, 1), dual(back, 1))
         return max(dual(self.first, 0) / size, dual(self.second, 1) / size_q)
+
+    def rule(self) -> float:
+        """Return theta of the damping rule at the last iterate."""
+        return min(self.law.damping.theta(self.norms), STIFFEST / self.h)
 
     def force(self, u: Any, q: Any) -> Any:
         """Return F(u, q, t; w) + nu N_op u; with all of u observed it is affine in q alone."""
@@ -430,7 +472,7 @@ class Stage:
 
     def _slope(self) -> tuple[Any, Any] | None:
         """Return b and a of the derivative b a^T of theta M_op r in theta; None if it is zero."""
-        if self.theta >= STIFFEST / self.h:
+        if self.given is not None or self.theta >= STIFFEST / self.h:
             return None
         dX, dVX, dV = self.law.damping.slopes(self.norms)
         row = self.mass_r * (2.0 * dX) + self.Mr * (2.0 * dVX)
