@@ -49,9 +49,7 @@ def numbers():
             for name, prior, std in zip(("k", "s"), PRIOR, STD, strict=True)
         },
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.s * u * v,
-        B=[
-            lp.On(side, lambda u, v, x: 0.5 * (u - 1.0) * v) for side in ("right", "bottom", "top")
-        ],
+        B=[lp.On(side, lambda u, v, x: 0.5 * (u - 1.0) * v) for side in ("right", "bottom", "top")],
         f=lambda x, t: source(x[0], np.sin(t)),
     )
 
@@ -136,4 +134,3 @@ def solved():
         **{f"{name}.q": one.q for name, one in found.items()},
         **{f"{name}.u": one.u for name, one in found.items()},
     }
-

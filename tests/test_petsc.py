@@ -163,7 +163,7 @@ def test_the_gate_holds_q_at_rest_and_not_before(found):
 def test_the_filter_refuses_outliers_for_a_while_and_keeps_to_its_bounds(found):
     used, inside = found(2)["robust.used"], found(2)["robust.inside"]
     assert used[:, 2].tolist() == [False, False, True, False, False, True]
-    assert used[:, 0].all()
+    assert used[:3, 0].all()
     assert not used[2, 1]  # no reading
     assert inside[:, 0].min() >= 0.1
     assert inside[:, 1].max() <= 1.05
@@ -206,6 +206,4 @@ def test_a_mistake_is_said_in_a_sentence(name, sentence, found):
     said = json.loads(str(found(2)["said"]))
     assert said[name].startswith(sentence)
     if name == "another model":
-        assert "written for u and q with [357, 2] coefficients; this model has [357, 357]" in said[
-            name
-        ]
+        assert "with [357, 2] coefficients; this model has [357, 357]" in said[name]

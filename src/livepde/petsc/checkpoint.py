@@ -27,6 +27,8 @@ from livepde.petsc.vectors import zeros
 
 __all__ = ["load_state", "save_state"]
 
+OBSERVED = ("u", "q", "u_alpha", "rate_u", "rate_q")  # vectors of an observer's state
+
 
 def save_state(path: Path | str, model: PetscModel, state: FilterState | ObserverState) -> None:
     """Write a state of `PetscFilter` or `PetscObserver`; all ranks call it."""
@@ -35,7 +37,7 @@ def save_state(path: Path | str, model: PetscModel, state: FilterState | Observe
     fields, numbers = _numbers(state)
     viewer = petsc_module().Viewer().createMPIIO(str(vectors), "w", comm=comm)
     for name, vector in fields:
-        order = model.numbers_q if name in ("q", "rate_q") else model.numbers_u
+        order = model.numbers_q if _is_parameter(name) else model.numbers_u
         _ordered(vector, order).view(viewer)
     viewer.destroy()
     if comm.rank == 0:
@@ -66,12 +68,11 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
             f"{sizes}: take the mesh of before."
         )
     u, q = model.mass.createVecRight(), model.gram.createVecRight()
-    viewer = petsc_module().Viewer().createMPIIO(
-        str(path.parent / numbers["vectors"]), "r", comm=u.comm
-    )
+    beside = str(path.parent / numbers["vectors"])
+    viewer = petsc_module().Viewer().createMPIIO(beside, "r", comm=u.comm)
     vectors = []
     for name in numbers["names"]:
-        like, order = (q, model.numbers_q) if name in ("q", "rate_q") else (u, model.numbers_u)
+        like, order = (q, model.numbers_q) if _is_parameter(name) else (u, model.numbers_u)
         vectors.append(_loaded(like, order, viewer))
     viewer.destroy()
     return _state(numbers, dict(zip(numbers["names"], vectors, strict=True)))
@@ -81,10 +82,10 @@ def _numbers(state: FilterState | ObserverState) -> tuple[list[tuple[str, Any]],
     """Return the vectors of a state with their names, and the rest of it for JSON."""
     if isinstance(state, FilterState):
         fields = [("u", state.u), *((f"U{k}", row) for k, row in enumerate(state.U))]
+        fields += [(f"q{k}", mode) for k, mode in enumerate(state.modes)]
         small = {"a": state.a.tolist(), "C": state.C.tolist(), "refused": state.refused.tolist()}
         return fields, {"kind": "filter", "t": state.t, **small}
-    names = ("u", "q", "u_alpha", "rate_u", "rate_q")
-    found = [(name, getattr(state, name)) for name in names]
+    found = [(name, getattr(state, name)) for name in OBSERVED]
     level = {k: np.asarray(v).tolist() for k, v in asdict(state.excitation).items()}
     numbers = {"kind": "observer", "t": state.t, "excitation": level}
     return [pair for pair in found if pair[1] is not None], numbers
@@ -95,16 +96,17 @@ def _state(numbers: dict[str, Any], vectors: dict[str, Any]) -> FilterState | Ob
         rows = tuple(vectors[f"U{k}"] for k in range(len(numbers["a"])))
         a, C = np.array(numbers["a"]), np.array(numbers["C"])
         refused = np.array(numbers["refused"], dtype=int)
-        return FilterState(numbers["t"], vectors["u"], rows, a, C, refused)
-    level = {k: np.array(v) if isinstance(v, list) else v for k, v in numbers["excitation"].items()}
-    names = ("u_alpha", "rate_u", "rate_q")
-    return ObserverState(
-        numbers["t"],
-        vectors["u"],
-        vectors["q"],
-        *(vectors.get(name) for name in names),
-        ExcitationLevel(**level),
-    )
+        modes = tuple(vectors[f"q{k}"] for k in range(len(a)))
+        return FilterState(numbers["t"], vectors["u"], rows, a, C, refused, modes)
+    level: dict[str, Any] = numbers["excitation"]
+    level |= {k: np.array(v) for k, v in level.items() if isinstance(v, list)}
+    found = {name: vectors.get(name) for name in OBSERVED}
+    return ObserverState(t=numbers["t"], excitation=ExcitationLevel(**level), **found)
+
+
+def _is_parameter(name: str) -> bool:
+    """Return whether a vector of a state is one of Q."""
+    return name.startswith(("q", "rate_q"))
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -6,8 +6,8 @@ What another version calls differently stands in `Interface`, the only place to 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import import_module
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -79,16 +79,15 @@ class DolfinxModel:
         self.v = ufl.TestFunction(V)
         self._measures(omega)
         trial = ufl.TrialFunction(V)
-        h1 = lambda a, b: ufl.inner(a, b) + ufl.inner(ufl.grad(a), ufl.grad(b))  # noqa: E731
-        weigh = mass or ufl.inner
-        pull, push = M_op or h1, N_op or h1
+        weigh: Callable[..., Any] = mass or ufl.inner
+        pull, push = M_op or self._h1, N_op or self._h1
         self.mass = self._matrix(weigh(trial, self.v) * ufl.dx)
         self.mass_observed, self.pull = self.mass, self._matrix(pull(trial, self.v) * self.seen)
         self.push = None
         if omega is not None:
             self.mass_observed = self._matrix(weigh(trial, self.v) * self.seen)
             self.push = self._matrix(push(trial, self.v) * self.rest)
-        self.gram, self.mass_q = self._inner_products(inner or h1)
+        self.gram, self.mass_q = self._inner_products(inner or self._h1)
         self._dirichlet = [(*api.located(V, marker), value) for marker, value in dirichlet]
         rows = [dofs for dofs, _, _ in self._dirichlet]
         start = self.create_u().getOwnershipRange()[0]
@@ -162,6 +161,10 @@ class DolfinxModel:
         return self._assembled("A", True, lambda: derivative(self._inside(), self.q))
 
     # --- forms ------------------------------------------------------------------------------------
+
+    def _h1(self, a: Any, b: Any) -> Any:
+        ufl = self.api.ufl
+        return ufl.inner(a, b) + ufl.inner(ufl.grad(a), ufl.grad(b))
 
     def _set_parameter(self, q: Any) -> None:
         api = self.api
@@ -258,12 +261,15 @@ class DolfinxModel:
         if key not in self._kept:
             self._kept[key] = petsc_module().Mat().createDense(sizes, comm=self.mesh.comm)
             self._kept[key].setUp()
-        matrix, diff = self._kept[key], self.api.differentiated
+        matrix = self._kept[key]
         for k, one in enumerate(self.given):
-            column = self._vector(f"q{k}", split, lambda one=one: diff(self._F(split), one))
-            matrix.getDenseArray()[:, k] = column.getArray()
+            slope = partial(self._slope, split, one)
+            matrix.getDenseArray()[:, k] = self._vector(f"q{k}", split, slope).getArray()
         matrix.assemble()
         return matrix
+
+    def _slope(self, split: bool, number: Any) -> Any:
+        return self.api.differentiated(self._F(split), number)
 
     def _readings(self, points: Any) -> Any:
         """Return G: each point belongs to the lowest rank that has a cell with it."""

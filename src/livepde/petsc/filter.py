@@ -1,8 +1,8 @@
 """The reduced-order filter on PETSc vectors.
 
 Moireau, Chapelle and Le Tallec (2008), as `livepde.laws.filter` has it for one process. With
-q = q_prior + Phi a, a ~ N(0, I), S the Jacobian of a step, A = dF/dq and P = [U C]^T [U C] the joint
-covariance of u and a,
+q = q_prior + Phi a, a ~ N(0, I), S the Jacobian of a step, A = dF/dq and P = [U C]^T [U C] the
+joint covariance of u and a,
 
     predict   one implicit step for u;   S U+_i = M U_i/h - A(u+) Phi C_i        for each row i
     update    d = z - G u+,  Y = U G^T,  W W^T = (I + Y N^-1 Y^T)^-1
@@ -47,6 +47,8 @@ class FilterState:
         Unknowns in prior standard deviations, shape (k,), and their square root, shape (k, k).
     refused
         How many readings of each sensor the gate has refused in a row, shape (sensors,).
+    modes
+        The columns of Phi that a is relative to, k vectors of shape (m,): a checkpoint has them.
     """
 
     t: float
@@ -55,6 +57,7 @@ class FilterState:
     a: Array
     C: Array
     refused: IntArray
+    modes: tuple[Any, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +131,8 @@ class PetscFilter:
         k, u = len(self.modes), u0.copy()
         self.model.impose(u, t0)
         rows = [zeros(u) for _ in range(k)]
-        count = self.model.sensors.getSize()[0]
-        return FilterState(t0, u, tuple(rows), np.zeros(k), np.eye(k), np.zeros(count, dtype=int))
+        none = np.zeros(self.model.sensors.getSize()[0], dtype=int)
+        return FilterState(t0, u, tuple(rows), np.zeros(k), np.eye(k), none, tuple(self.modes))
 
     def step(self, state: FilterState, t: float, z: Any) -> tuple[FilterState, FilterReport]:
         """Return the state after a sample z at t, shape (sensors,), NaN where a reading is missing.
@@ -152,13 +155,13 @@ class PetscFilter:
 
     def parameter(self, state: FilterState) -> Any:
         """Return the estimate of q within its bounds, a new vector."""
-        return self._bounded(combined(state.a, self.modes, self.prior))
+        return self._bounded(combined(state.a, state.modes, self.prior))
 
     def deviation(self, state: FilterState) -> Any:
         """Return the standard deviation of each coefficient of q, a new vector."""
         square = zeros(self.prior)
         for row in state.C:
-            direction = self._direction(row)
+            direction = combined(row, state.modes)
             square.axpy(1.0, direction * direction)
         square.sqrtabs()
         return square
@@ -171,7 +174,7 @@ class PetscFilter:
         for row, c in zip(state.U, state.C, strict=True):
             b = self.model.mass * row
             b.scale(1.0 / h)
-            b.axpy(-1.0, A * self._direction(c))
+            b.axpy(-1.0, A * combined(c, state.modes))
             rows.append(self.stepper.back(b))
         return replace(state, t=t + h, u=u, U=tuple(rows))
 
@@ -189,16 +192,12 @@ class PetscFilter:
         C = W.T @ state.C
         u, a = combined(half, U, state.u), state.a + half @ C
         refused = np.where(used, 0, state.refused + far)
-        new = FilterState(state.t, u, tuple(U), a, C, refused)
+        new = replace(state, u=u, U=tuple(U), a=a, C=C, refused=refused)
         return self._projected(new), FilterReport(Status(), d, expected, used)
 
     def read(self, u: Any) -> Array:
         """Return G u, shape (sensors,), on every rank."""
         return gathered(self.model.sensors * u)
-
-    def _direction(self, a: Array) -> Any:
-        """Return Phi a, a new vector."""
-        return combined(a, self.modes)
 
     def _bounded(self, q: Any) -> Any:
         values = q.getArray()
@@ -209,13 +208,13 @@ class PetscFilter:
         """Return the state with an estimate beyond the bounds projected onto them."""
         if np.isinf(self.lower) and np.isinf(self.upper):
             return state
-        q = combined(state.a, self.modes, self.prior)
+        q = combined(state.a, state.modes, self.prior)
         excess = self._bounded(q.copy()) - q
         if excess.norm() == 0.0:
             return state
-        square = np.array([inner(one, self.modes) for one in self.modes])
-        shift = np.linalg.solve(square, inner(excess, self.modes))
-        weights = np.linalg.solve(state.C.T, shift)
+        square = np.array([inner(one, state.modes) for one in state.modes])
+        shift = np.linalg.solve(square, inner(excess, state.modes))
+        weights: Array = np.linalg.solve(state.C.T, shift)
         return replace(state, u=combined(weights, state.U, state.u), a=state.a + shift)
 
 
@@ -227,13 +226,13 @@ def contraction(Y: Array, d: Array) -> tuple[Array, Array]:
     """
     k = len(Y)
     stacked = np.block([[np.eye(k), np.zeros((k, 1))], [Y.T, d[:, None]]])
-    upper = np.linalg.qr(stacked, mode="r")
+    upper: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
     W: Array = solve_triangular(upper[:k, :k], np.eye(k))
     return W, upper[:k, k]
 
 
 def number_modes(like: Any, std: Any) -> list[Any]:
-    """Return the columns of Phi for numbers: prior standard deviations, shape (m,), as a diagonal."""
+    """Return the columns of Phi for numbers, from prior standard deviations, shape (m,)."""
     start, end = like.getOwnershipRange()
     found = []
     for k, value in enumerate(np.broadcast_to(np.asarray(std, dtype=float), like.getSize())):
@@ -248,8 +247,8 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
     """Return the leading modes of the prior N(0, G_Q^-1) of a field, as columns of Phi.
 
     Eigenvectors of M_Q x = lambda G_Q x, largest lambda first, x^T G_Q x = 1, by subspace iteration
-    with twice as many vectors. Their start is the same on every number of ranks; each has the sign
-    of its mean.
+    with twice as many vectors. Their start is the same on every number of ranks. Modes of equal
+    variance, as on a square, and signs may differ from run to run: a state carries its own.
     """
     solver = _riesz(model.gram)
     like = model.gram.createVecRight()
@@ -269,8 +268,6 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
         values = found[::-1]
         if settled:
             break
-    for mode in basis[:count]:
-        mode.scale(1.0 if (model.mass_q * mode).sum() >= 0.0 else -1.0)
     return basis[:count]
 
 

@@ -36,9 +36,9 @@ class PetscModel(Protocol):
 
     F holds all terms without a time derivative, B(u) + A(u) q - f in the letters of the paper, as a
     dual vector of X. u in X has n coefficients and q in Q has m; both are vectors of type
-    "standard", of which every rank owns a part. An action is the product with a matrix (`mult`), its
-    transpose `multTranspose`: a matrix may be a shell, except where "assembled" is said. A matrix
-    belongs to the model, and holds until the same method is called again.
+    "standard", of which every rank owns a part. An action is the product with a matrix (`mult`),
+    its transpose `multTranspose`: a matrix may be a shell, except where "assembled" is said. A
+    matrix belongs to the model, and holds until the same method is called again.
 
     `w` in the methods below is data of the state on the observed subdomain omega, shape (n,): there
     F sees w, and u elsewhere, as the paper splits its integrals. Without w, F sees u everywhere.

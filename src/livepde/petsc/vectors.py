@@ -10,7 +10,15 @@ import numpy as np
 from livepde.linalg import Array, IntArray
 from livepde.petsc.model import petsc_module
 
-__all__ = ["combined", "free_mask", "gathered", "inner", "random_vector", "standard_vector", "zeros"]
+__all__ = [
+    "combined",
+    "free_mask",
+    "gathered",
+    "inner",
+    "random_vector",
+    "standard_vector",
+    "zeros",
+]
 
 
 def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
@@ -21,7 +29,7 @@ def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
 
 
 def inner(x: Any, vectors: Sequence[Any]) -> Array:
-    """Return the inner products of x with several vectors, by one reduction, the same everywhere."""
+    """Return the inner products of x with several vectors, by one reduction, on every rank."""
     own = x.getArray(readonly=True)
     local = np.array([one.getArray(readonly=True) @ own for one in vectors])
     total: Array = x.comm.tompi4py().allreduce(local)
