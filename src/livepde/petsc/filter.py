@@ -214,7 +214,7 @@ class PetscFilter:
             return state
         square = np.array([inner(one, state.modes) for one in state.modes])
         shift = np.linalg.solve(square, inner(excess, state.modes))
-        weights: Array = np.linalg.solve(state.C.T, shift)
+        weights = np.asarray(np.linalg.solve(state.C.T, shift), dtype=float)
         return replace(state, u=combined(weights, state.U, state.u), a=state.a + shift)
 
 
