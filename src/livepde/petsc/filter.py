@@ -24,9 +24,9 @@ from scipy.linalg import solve_triangular
 from livepde.errors import LawError
 from livepde.laws.base import Status
 from livepde.linalg import Array, IntArray, Mask
-from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.step import ImplicitStep, advance, multigrid
-from livepde.petsc.vectors import combined, gathered, inner, random_vector, zeros
+from livepde.petsc.model import PetscModel
+from livepde.petsc.step import ImplicitStep, advance
+from livepde.petsc.vectors import combined, definite_solver, gathered, inner, random_vector, zeros
 
 __all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
 
@@ -250,7 +250,7 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
     with twice as many vectors. Their start is the same on every number of ranks. Modes of equal
     variance, as on a square, and signs may differ from run to run: a state carries its own.
     """
-    solver = _riesz(model.gram)
+    solver = definite_solver(model.gram, 1e-12)
     like = model.gram.createVecRight()
     basis = [random_vector(like, model.numbers_q, seed) for seed in range(1, 2 * count + 3)]
     values = np.zeros(len(basis))
@@ -269,15 +269,3 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
         if settled:
             break
     return basis[:count]
-
-
-def _riesz(gram: Any) -> Any:
-    PETSc = petsc_module()
-    solver = PETSc.KSP().create(gram.comm)
-    solver.setOperators(gram)
-    solver.setType("cg")
-    solver.getPC().setType(multigrid())
-    solver.setTolerances(rtol=1e-12)
-    solver.setOptionsPrefix("livepde_riesz_")
-    solver.setFromOptions()
-    return solver

@@ -20,7 +20,7 @@ multigrid for the first block and for the second one plus A^T D^-1 A, D the row 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,8 @@ from livepde.laws.coupled.stage import nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.step import RESTING, SAME, TINY, advance, multigrid
-from livepde.petsc.vectors import free_mask, random_vector, zeros
+from livepde.petsc.step import RESTING, SAME, TINY, advance
+from livepde.petsc.vectors import definite_solver, free_mask, multigrid, random_vector, zeros
 from livepde.stepping import StepFailed
 
 __all__ = ["ObserverReport", "ObserverState", "PetscObserver"]
@@ -53,24 +53,21 @@ ITERATIONS = 120  # of GMRES for one update
 REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
 FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
 STIFFEST = 1e12  # times 1/h, of theta
+HOLD = 1e12  # times the weight of G_Q: then q is held
 SHORTEST = 1e-3  # part of an update that is tried
 SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 
 
 @dataclass(frozen=True, eq=False)
 class ObserverState:
-    """Estimates after a sample.
+    """Estimates u and q at a time t, the data u_alpha there, and what the next step begins with.
 
     Attributes
     ----------
-    t
-        Time of the sample.
-    u, q
-        Estimates, vectors of shapes (n,) and (m,).
-    u_alpha
-        Data of the sample, shape (n,); None before the first one.
+    t, u, q, u_alpha
+        Vectors of shapes (n,), (m,) and (n,); u_alpha is None before the first sample.
     rate_u, rate_q
-        Last change of u - u_alpha and q per unit of time, with which the next step begins.
+        Last change of u - u_alpha and q per unit of time.
     excitation
         State of the gate.
     """
@@ -86,14 +83,12 @@ class ObserverState:
 
 @dataclass(frozen=True, eq=False)
 class ObserverReport:
-    """What a sample has brought.
+    """Result of a sample.
 
     Attributes
     ----------
     status
         "ok", or the kind of failure with its remedy; then the state is that of before.
-    residual
-        ||r||_X before the step could reduce it: that of the estimate of before.
     held
         True if the gate has held q, because nothing but noise excites it.
     updates, iterations
@@ -101,7 +96,6 @@ class ObserverReport:
     """
 
     status: Status
-    residual: float
     held: bool
     updates: int
     iterations: int
@@ -161,7 +155,8 @@ class PetscObserver:
         """Return the state at the start."""
         u = u0.copy()
         self.model.impose(u, t0)
-        return ObserverState(t0, u, q0.copy(), None, None, None, ExcitationLevel.none())
+        rates = zeros(u), zeros(q0)
+        return ObserverState(t0, u, q0.copy(), None, *rates, ExcitationLevel.none())
 
     def step(
         self, state: ObserverState, t: float, u_alpha: Any
@@ -175,43 +170,35 @@ class PetscObserver:
         """
         if not t > state.t:
             raise LawError(f"PetscObserver: t must be later than {state.t}; got {t}.")
-        data = self.solver.within(u_alpha)
+        solver, data = self.solver, u_alpha.copy()
+        data.getArray()[solver.unseen] = 0.0
         self.model.impose(data, t)
-        path = (state.t, data if state.u_alpha is None else state.u_alpha, t, data)
+        old = data if state.u_alpha is None else state.u_alpha
         held = self.gate is not None and self.gate.closed(state.excitation)
-        self.solver.begin(path, held)
-        before = self.solver.residual_norm(state.u, data)
-        new, status = advance(self._stage, state, state.t, t)
-        report = ObserverReport(status, before, held, self.solver.updates, self.solver.krylov)
+        solver.begin((state.t, old, t, data), (state.rate_u, state.rate_q), held)
+        (u, q), status = advance(solver.solve, (state.u, state.q), state.t, t)
+        report = ObserverReport(status, held, solver.updates, solver.iterations)
         if not status.ok:
             return state, report
-        np.clip(new.q.getArray(), self.lower, self.upper, out=new.q.getArray())
-        excitation = state.excitation
+        np.clip(q.getArray(), self.lower, self.upper, out=q.getArray())
+        excitation, rates = state.excitation, (state.rate_u, state.rate_q)
         if self.gate is not None:
-            excitation = self.gate.add(excitation, *self.solver.probed(new.u, data, new.q, t))
-        change = new.u - state.u - (data - path[1])
-        rates = change / (t - state.t), (new.q - state.q) / (t - state.t)
-        first = None if state.u_alpha is None else rates
-        return replace(
-            new,
-            u_alpha=data,
-            rate_u=None if first is None else first[0],
-            rate_q=None if first is None else first[1],
-            excitation=excitation,
-        ), report
-
-    def _stage(self, state: ObserverState, t: float, h: float) -> ObserverState:
-        u, q = self.solver.solve(state, t, h)
-        return replace(state, t=t + h, u=u, q=q)
+            excitation = self.gate.add(excitation, *solver.probed(u, data, q, t))
+        if state.u_alpha is not None:
+            change = u - state.u - (data - old)
+            rates = change / (t - state.t), (q - state.q) / (t - state.t)
+        return ObserverState(t, u, q, data, *rates, excitation), report
 
 
 class CoupledSolver:
-    """Newton's iteration for the coupled step, and its linear solver.
+    """Newton's iteration for coupled steps, and K as a matrix of Python for PETSc's GMRES.
 
     Attributes
     ----------
-    updates, krylov
+    updates, iterations
         Newton's updates since `begin`, and iterations of GMRES.
+    unseen
+        Owned coefficients of u without a part in omega, a mask.
     """
 
     def __init__(self, law: PetscObserver) -> None:
@@ -222,43 +209,27 @@ class CoupledSolver:
         for diagonal in self.weights:
             diagonal.reciprocal()
         self.unseen = self.model.mass_observed.getDiagonal().getArray() <= 0.0
-        self.operator = CoupledOperator()
         self.ksp: Any = None
-        self.updates = self.krylov = 0
+        self.updates = self.iterations = 0
         self._best, self._slow, self._width = 0.0, False, 0.0  # iterations for a digit, and step
-        self._probes: Any = None
-        self._tests: Any = None
+        self._pairs: list[tuple[Any, Any]] = []
+        self._tests: tuple[Any, Any] | None = None
 
-    def begin(self, path: tuple[float, Any, float, Any], held: bool) -> None:
-        """Take up a sample: times and data at both ends, and whether q is held."""
-        self.path, self.held = path, held
-        self.updates = self.krylov = 0
-
-    def within(self, u_alpha: Any) -> Any:
-        """Return data with zeros where no observed cell is."""
-        data = u_alpha.copy()
-        data.getArray()[self.unseen] = 0.0
-        return data
+    def begin(self, path: tuple[float, Any, float, Any], rates: Any, held: bool) -> None:
+        """Take up a sample: times and data at both ends, rates, and whether q is held."""
+        self.path, self.rates, self.held = path, rates, held
+        self.updates = self.iterations = 0
 
     def data(self, t: float) -> Any:
         """Return u_alpha at a time within the interval, interpolated."""
         t0, old, t1, new = self.path
         return new if t == t1 else old + (new - old) * ((t - t0) / (t1 - t0))
 
-    def residual_norm(self, u: Any, u_alpha: Any) -> float:
-        """Return ||r||_X."""
-        r = (u - u_alpha) * self.free
-        return math.sqrt(abs(float(r.dot(self.model.mass_observed * r))))
-
-    def solve(self, state: ObserverState, t: float, h: float) -> tuple[Any, Any]:
-        """Return (u, q) at t + h; raises `StepFailed`."""
-        stage = Stage(self, state, t + h, h, self.data(t + h))
-        u, q = state.u.copy(), state.q.copy()
-        u.axpy(1.0, self.data(t + h) - self.data(t))
-        if state.rate_u is not None:
-            u.axpy(h, state.rate_u)
-            if not self.held:
-                q.axpy(h, state.rate_q)
+    def solve(self, y: tuple[Any, Any], t: float, h: float) -> tuple[Any, Any]:
+        """Return (u, q) at t + h from that at t; raises `StepFailed`."""
+        stage = Stage(self, y, t + h, h, self.data(t + h))
+        u = y[0] + self.data(t + h) - self.data(t) + self.rates[0] * h
+        q = y[1] + self.rates[1] * (0.0 if self.held else h)
         self.model.impose(u, t + h)
         try:
             return self._newton(stage, u.copy(), q.copy())
@@ -271,8 +242,7 @@ class CoupledSolver:
         for _ in range(self.law.iterations):
             if found <= self.law.tolerance:
                 return u, q
-            du, dq = self._update(stage, u, q, found)
-            self.updates += 1
+            du, dq = self._update(stage, found)
             before, part = found, 1.0
             u.axpy(-1.0, du)
             q.axpy(-1.0, dq)
@@ -310,15 +280,16 @@ class CoupledSolver:
         gap(root)
         return u, q
 
-    def _update(self, stage: Stage, u: Any, q: Any, found: float) -> tuple[Any, Any]:
+    def _update(self, stage: Stage, found: float) -> tuple[Any, Any]:
         """Return the solution of K x = residual, to the accuracy that Newton makes use of."""
-        PETSc, K = petsc_module(), self.operator
-        stage.linearise(K, u, q)
+        PETSc = petsc_module()
+        self.stage = stage
+        stage.linearise()
         if abs(stage.h - self._width) > SAME * stage.h or self._slow:
-            self._build(K)
+            self._build(stage)
             self._best, self._width = 0.0, stage.h
-        b = PETSc.Vec().createNest([stage.first, stage.second], comm=u.comm)
-        x = PETSc.Vec().createNest([zeros(u), zeros(q)], comm=u.comm)
+        b = PETSc.Vec().createNest([stage.first, stage.second], comm=self.free.comm)
+        x = PETSc.Vec().createNest([zeros(stage.first), zeros(stage.second)], comm=self.free.comm)
         accuracy = min(max(0.3 * self.law.tolerance / found, FORCING), 0.3)
         self.ksp.setTolerances(rtol=accuracy, atol=0.0, max_it=ITERATIONS)
         self.ksp.solve(b, x)
@@ -328,11 +299,12 @@ class CoupledSolver:
         digits = -math.log10(accuracy)
         self._best = self._best or count / digits
         self._slow = count > REBUILD * self._best * digits + 2
-        self.krylov += count
+        self.updates += 1
+        self.iterations += count
         du, dq = x.getNestSubVecs()
         return du, dq
 
-    def _build(self, K: CoupledOperator) -> None:
+    def _build(self, stage: Stage) -> None:
         """Make the solver, with a preconditioner of the blocks as they are now."""
         PETSc = petsc_module()
         options = PETSc.Options(PREFIX)
@@ -340,9 +312,9 @@ class CoupledSolver:
         for name, value in (OPTIONS | blocks).items():
             if not options.hasName(name):
                 options[name] = value
-        nest = K.nested()
+        nest = stage.nested()
         sizes = nest.getSizes()[0]
-        shell = PETSc.Mat().createPython((sizes, sizes), K, comm=nest.comm)
+        shell = PETSc.Mat().createPython((sizes, sizes), self, comm=nest.comm)
         shell.setUp()
         self.ksp = PETSc.KSP().create(nest.comm)
         self.ksp.setOptionsPrefix(PREFIX)
@@ -352,60 +324,89 @@ class CoupledSolver:
         self.ksp.getPC().setFieldSplitIS(*parts)
         self.ksp.getPC().setReusePreconditioner(True)
 
+    def mult(self, matrix: Any, x: Any, y: Any) -> None:
+        """Set y = K x; PETSc calls it."""
+        stage, (u, q), (first, second) = self.stage, x.getNestSubVecs(), y.getNestSubVecs()
+        stage.S.mult(u, first)
+        first.axpy(1.0, (stage.A * q) * self.free)
+        if stage.border is not None:
+            first.axpy(stage.border[1].dot(u), stage.border[0])
+        self.model.gram.mult(q, second)
+        second.scale(stage.weight)
+        back = zeros(second)
+        stage.A_in.multTranspose(u * self.free, back)
+        second.axpy(-1.0, back)
+
     def dual(self, functional: Any, line: int) -> float:
         """Return the dual norm of a functional on u (line 0), or q (line 1), by a diagonal."""
         return math.sqrt(abs(float(functional.dot(functional * self.weights[line]))))
 
     def riesz(self, functional: Any) -> Any:
-        """Return the Riesz representative in X of a functional on the inside of omega."""
+        """Return the Riesz representative in X among the functions that stay within omega."""
         if self._tests is None:
-            self._tests = Tests(self.model, self.free)
-        return self._tests(functional)
+            model, inside = self.model, self.free.copy()
+            hidden = (model.mass - model.mass_observed).getDiagonal().getArray()
+            size = model.mass.getDiagonal().getArray()
+            inside.getArray()[np.abs(hidden) > 1e-12 * size] = 0.0
+            rows = inside.getOwnershipRange()[0] + np.flatnonzero(inside.getArray() == 0.0)
+            matrix = model.mass.copy()
+            matrix.zeroRowsColumns(rows.astype(petsc_module().IntType), 1.0)
+            self._tests = inside, definite_solver(matrix, 1e-10)
+        inside, solver = self._tests
+        x = zeros(functional)
+        solver.solve(functional * inside, x)
+        return x
 
     def probed(self, u: Any, u_alpha: Any, q: Any, t: float) -> tuple[Any, Any]:
-        """Return (A(w) e_k, p_k) and (A(u) e_k, p_k), each of shape (PROBES,)."""
-        if self._probes is None:
-            self._probes = probes(self.model, self.free)
+        """Return (A(w) e_k, p_k) and (A(u) e_k, p_k) for the gate, each of shape (PROBES,)."""
+        self._pairs = self._pairs or probes(self.model, self.free)
         found = []
         for w in (u_alpha, u):
             A = self.model.coupling(w, q, t)
-            found.append(np.array([(A * e).dot(p) for e, p in self._probes]))
+            found.append(np.array([(A * e).dot(p) for e, p in self._pairs]))
         return found[0], found[1]
 
 
 class Stage:
-    """The equation of one coupled step: its residual, and its Jacobian at the last iterate."""
+    """The equation of one coupled step from y = (u, q): its residual and its Jacobian.
+
+    Attributes
+    ----------
+    first, second
+        Residuals of both lines at the last iterate.
+    weight
+        Weight of G_Q in K; while q is held it is so large that q stays.
+    given
+        theta where it is not the rule's; None: it is.
+    S, A, A_in, border
+        Blocks of K: that of u without b a^T; dF/dq and A(w), whose rows are to be masked; (b, a).
+    """
 
     def __init__(
-        self, solver: CoupledSolver, state: ObserverState, t: float, h: float, u_alpha: Any
+        self, solver: CoupledSolver, y: tuple[Any, Any], t: float, h: float, w: Any
     ) -> None:
         self.solver, self.law, self.model = solver, solver.law, solver.model
-        self.begin_u, self.begin_q, self.t, self.h, self.w = state.u, state.q, t, h, u_alpha
+        self.begin_u, self.begin_q, self.t, self.h, self.w = *y, t, h, w
+        self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
         self.given: float | None = None
-        self.A_in: Any = None
-        self.least = RESTING * solver.dual(self.model.mass * state.u, 0) / h
-        self.least_q = RESTING * solver.dual(self.model.gram * state.q, 1) * self.weight
+        self.A_in = self.model.coupling(w, y[1], t)
+        self.least = RESTING * solver.dual(self.model.mass * y[0], 0) / h
+        self.least_q = RESTING * solver.dual(self.model.gram * y[1], 1) * self.weight
         self._observed: Residual | None = None
         self._start: tuple[Any, Any] | None = None
 
-    @property
-    def weight(self) -> float:
-        """Weight of G_Q in K; while q is held it is so large that q stays."""
-        held = 1e12 if self.solver.held else 1.0
-        return held * (1.0 / self.h + self.law.sigma) / self.law.gain
-
     def evaluate(self, u: Any, q: Any) -> float:
         """Evaluate the residual of both lines and return its relative size."""
-        model, law, dual = self.model, self.law, self.solver.dual
-        r = (u - self.w) * self.solver.free
-        self.Mr, self.mass_r = model.pull * r, model.mass_observed * r
-        self.norms = self.measured(r, self.Mr, self.mass_r)
+        model, law, dual, free = self.model, self.law, self.solver.dual, self.solver.free
+        self.at = u, q
+        r = (u - self.w) * free
+        self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
+        X, VX = abs(float(r.dot(mass_r))), abs(float(r.dot(Mr)))
+        self.norms = Residual(X, VX, lambda: self._squared(Mr), self.seen)
         self.theta = self.rule() if self.given is None else self.given
-        rate = model.mass * ((u - self.begin_u) / self.h)
-        force = self.force(u, q)
-        terms = rate, force, self.Mr * self.theta
-        self.first = (terms[0] + terms[1] + terms[2]) * self.solver.free
-        size = max(self.least, TINY, *(dual(term * self.solver.free, 0) for term in terms))
+        terms = model.mass * ((u - self.begin_u) / self.h), self.force(u, q), Mr * self.theta
+        self.first = (terms[0] + terms[1] + terms[2]) * free
+        size = max(self.least, TINY, *(dual(term * free, 0) for term in terms))
         back = zeros(q)
         self.A_in.multTranspose(r, back)
         drift = 0.0 if self.solver.held else law.sigma / law.gain
@@ -420,23 +421,13 @@ class Stage:
 
     def force(self, u: Any, q: Any) -> Any:
         """Return F(u, q, t; w) + nu N_op u; with all of u observed it is affine in q alone."""
-        model, law = self.model, self.law
-        if self.A_in is None:
-            self.A_in = model.coupling(self.w, q, self.t)
-        if model.push is None:
+        if self.model.push is None:
             if self._start is None:
-                self._start = model.residual(u, q, self.t, self.w), q.copy()
+                self._start = self.model.residual(u, q, self.t, self.w), q.copy()
             return self._start[0] + self.A_in * (q - self._start[1])
-        force = model.residual(u, q, self.t, self.w)
-        if law.nu:
-            force.axpy(law.nu, model.push * u)
+        force = self.model.residual(u, q, self.t, self.w)
+        force.axpy(self.law.nu, self.model.push * u)
         return force
-
-    def measured(self, r: Any, Mr: Any, mass_r: Any) -> Residual:
-        """Return the norms of r that a damping rule may use."""
-        return Residual(
-            abs(float(r.dot(mass_r))), abs(float(r.dot(Mr))), lambda: self._squared(Mr), self.seen
-        )
 
     def seen(self) -> Residual:
         """Return the norms of u_alpha."""
@@ -451,24 +442,18 @@ class Stage:
         """Return the squared dual norm of a functional: ||r||_V~^2 of M_op r."""
         return abs(float(functional.dot(self.solver.riesz(functional))))
 
-    def linearise(self, K: CoupledOperator, u: Any, q: Any) -> None:
-        """Put the blocks of the Jacobian into K."""
-        PETSc, model, law = petsc_module(), self.model, self.law
-        other = PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN
-        S = model.mass.copy()
+    def linearise(self) -> None:
+        """Assemble the blocks of K at the last iterate."""
+        model, other = self.model, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN
+        self.S = S = model.mass.copy()
         S.scale(1.0 / self.h)
-        slope = model.jacobian_u(u, q, self.t, self.w)
-        if slope is not None:
-            S.axpy(1.0, slope, other)
         S.axpy(self.theta, model.pull, other)
-        if law.nu and model.push is not None:
-            S.axpy(law.nu, model.push, other)
-        S.zeroRowsColumns(model.fixed, 1.0)
-        A = self.A_in
+        self.A, self.border = self.A_in, self._slope()
         if model.push is not None:
-            A = model.jacobian_q(u, q, self.t, self.w)
-        K.S, K.A, K.A_in, K.H = S, A, self.A_in, (model.gram, self.weight)
-        K.free, K.border = self.solver.free, self._slope()
+            S.axpy(1.0, model.jacobian_u(*self.at, self.t, self.w), other)
+            S.axpy(self.law.nu, model.push, other)
+            self.A = model.jacobian_q(*self.at, self.t, self.w)
+        S.zeroRowsColumns(model.fixed, 1.0)
 
     def _slope(self) -> tuple[Any, Any] | None:
         """Return b and a of the derivative b a^T of theta M_op r in theta; None if it is zero."""
@@ -480,104 +465,32 @@ class Stage:
             row.axpy(2.0 * dV, self.model.pull * self.solver.riesz(self.Mr))
         return self.Mr * self.solver.free, row * self.solver.free
 
-
-class CoupledOperator:
-    """K as a matrix of Python for PETSc, and as nested blocks for its preconditioner.
-
-    Attributes
-    ----------
-    S, A, A_in, H
-        Blocks: of u; dF/dq and A(w), whose rows `free` is to mask; gram matrix and its weight.
-    border
-        (b, a): b a^T is added to S; None: nothing.
-    """
-
-    S: Any
-    A: Any
-    A_in: Any
-    H: tuple[Any, float]
-    free: Any
-    border: tuple[Any, Any] | None
-
-    def mult(self, matrix: Any, x: Any, y: Any) -> None:
-        """Set y = K x."""
-        (u, q), (first, second) = x.getNestSubVecs(), y.getNestSubVecs()
-        self.S.mult(u, first)
-        driven = self.A * q
-        driven.pointwiseMult(driven, self.free)
-        first.axpy(1.0, driven)
-        if self.border is not None:
-            first.axpy(self.border[1].dot(u), self.border[0])
-        gram, weight = self.H
-        gram.mult(q, second)
-        back = second.duplicate()
-        self.A_in.multTranspose(u * self.free, back)
-        second.scale(weight)
-        second.axpy(-1.0, back)
-
     def nested(self) -> Any:
         """Return the blocks without the border, copied."""
-        A, A_in = self.A.copy(), self.A_in.copy()
-        A.diagonalScale(L=self.free)
-        A_in.diagonalScale(L=self.free)
+        A, A_in, H = self.A.copy(), self.A_in.copy(), self.model.gram.copy()
+        A.diagonalScale(L=self.solver.free)
+        A_in.diagonalScale(L=self.solver.free)
         back = A_in.transpose()
         back.scale(-1.0)
-        H = self.H[0].copy()
-        H.scale(self.H[1])
+        H.scale(self.weight)
         nest = petsc_module().Mat().createNest([[self.S, A], [back, H]], comm=self.S.comm)
         nest.assemble()
         return nest
 
 
-class Tests:
-    """Test functions that stay within omega: the Riesz map behind ||r||_V~ (MN1)."""
-
-    def __init__(self, model: PetscModel, free: Any) -> None:
-        PETSc = petsc_module()
-        inside, hidden = free.copy(), (model.mass - model.mass_observed).getDiagonal()
-        hidden.abs()
-        size = model.mass.getDiagonal()
-        outside = hidden.getArray() > 1e-12 * size.getArray()
-        inside.getArray()[outside] = 0.0
-        start = free.getOwnershipRange()[0]
-        rows = start + np.flatnonzero(inside.getArray() == 0.0)
-        matrix = model.mass.copy()
-        matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 1.0)
-        self.inside = inside
-        self.solver = PETSc.KSP().create(matrix.comm)
-        self.solver.setOperators(matrix)
-        self.solver.setType("cg")
-        self.solver.getPC().setType("jacobi")
-        self.solver.setTolerances(rtol=1e-10)
-
-    def __call__(self, functional: Any) -> Any:
-        x = functional.duplicate()
-        self.solver.solve(functional * self.inside, x)
-        return x
-
-
 def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
     """Return pairs (e_k, p_k) for the gate: e_k in the unit ball of Q, p_k smooth on omega."""
-    PETSc = petsc_module()
-    solvers = []
     stiff = model.pull.copy()
-    stiff.axpy(1e-6, model.mass, PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN)
+    stiff.axpy(1e-6, model.mass, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN)
     stiff.zeroRowsColumns(model.fixed, 1.0)
-    for matrix in (model.gram, stiff):
-        solver = PETSc.KSP().create(matrix.comm)
-        solver.setOperators(matrix)
-        solver.setType("cg")
-        solver.getPC().setType(multigrid())
-        solver.setTolerances(rtol=1e-8)
-        solvers.append(solver)
+    of_q, of_u = definite_solver(model.gram, 1e-8), definite_solver(stiff, 1e-8)
     q, u = model.gram.createVecRight(), model.mass.createVecRight()
     found = []
-    for seed in range(PROBES):
+    for seed in range(101, 101 + PROBES):
         e, p = zeros(q), zeros(u)
-        load = random_vector(q, model.numbers_q, 2 * seed + 101)
-        solvers[0].solve(load, e)
+        of_q.solve(random_vector(q, model.numbers_q, seed), e)
         e.scale(1.0 / math.sqrt(abs(float(e.dot(model.gram * e)))))
-        load = model.mass_observed * random_vector(u, model.numbers_u, 2 * seed + 102)
-        solvers[1].solve(load * free, p)
+        load = model.mass_observed * random_vector(u, model.numbers_u, PROBES + seed)
+        of_u.solve(load * free, p)
         found.append((e, p))
     return found

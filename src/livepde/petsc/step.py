@@ -9,10 +9,10 @@ from typing import Any, TypeVar
 
 from livepde.laws.base import Status
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.vectors import free_mask
+from livepde.petsc.vectors import free_mask, multigrid
 from livepde.stepping import StepFailed
 
-__all__ = ["ImplicitStep", "advance", "multigrid"]
+__all__ = ["ImplicitStep", "advance"]
 
 RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
 TINY = 1e-300
@@ -46,11 +46,6 @@ def advance(
         else:
             done += 1
     return now, Status()
-
-
-def multigrid() -> str:
-    """Return the algebraic multigrid of this PETSc: BoomerAMG if it was built with hypre."""
-    return "hypre" if petsc_module().Sys.hasExternalPackage("hypre") else "gamg"
 
 
 @dataclass(eq=False)

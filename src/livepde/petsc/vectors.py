@@ -12,11 +12,11 @@ from livepde.petsc.model import petsc_module
 
 __all__ = [
     "combined",
-    "free_mask",
+    "definite_solver",
     "gathered",
     "inner",
+    "multigrid",
     "random_vector",
-    "standard_vector",
     "zeros",
 ]
 
@@ -72,6 +72,21 @@ def zeros(like: Any) -> Any:
     vector = like.duplicate()
     vector.set(0.0)
     return vector
+
+
+def definite_solver(matrix: Any, accuracy: float) -> Any:
+    """Return a solver for a symmetric positive definite matrix, to a relative accuracy."""
+    solver = petsc_module().KSP().create(matrix.comm)
+    solver.setOperators(matrix)
+    solver.setType("cg")
+    solver.getPC().setType(multigrid())
+    solver.setTolerances(rtol=accuracy)
+    return solver
+
+
+def multigrid() -> str:
+    """Return the algebraic multigrid of this PETSc: BoomerAMG if it was built with hypre."""
+    return "hypre" if petsc_module().Sys.hasExternalPackage("hypre") else "gamg"
 
 
 def standard_vector(comm: Any, local: int) -> Any:
