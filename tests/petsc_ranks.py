@@ -221,8 +221,10 @@ def refusals(domain, folder):
         "sample time": lambda: observer.step(observer.init(prior, u), 0.0, u),
         "numbers": lambda: observer.step(observer.init(prior, u), 0.1, u),
         "outside": lambda: petsc.DolfinxModel(V, V, form, sensors=[(2.0, 2.0)]),
-        "element": lambda: petsc.DolfinxModel(
-            dolfinx.fem.FunctionSpace(domain, ("Lagrange", 2)), V, form
+        "element": lambda: (
+            petsc.DolfinxModel(
+                dolfinx.fem.FunctionSpace(domain, ("Lagrange", 2)), V, form
+            ).numbers_u
         ),
         "no checkpoint": lambda: petsc.load_state(folder / "none.json", few),
         "another model": lambda: petsc.load_state(folder / "small.json", model),

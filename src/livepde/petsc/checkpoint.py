@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import secrets
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,27 +27,33 @@ from livepde.petsc.vectors import zeros
 
 __all__ = ["load_state", "save_state"]
 
-OBSERVED = ("u", "q", "u_alpha", "rate_u", "rate_q")  # vectors of an observer's state
+OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
+OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X
 
 
 def save_state(path: Path | str, model: PetscModel, state: FilterState | ObserverState) -> None:
     """Write a state of `PetscFilter` or `PetscObserver`; all ranks call it."""
     path, comm = Path(path), state.u.comm.tompi4py()
-    vectors = Path(f"{path}.{comm.bcast(secrets.token_hex(4))}.vectors")
-    fields, numbers = _numbers(state)
-    viewer = petsc_module().Viewer().createMPIIO(str(vectors), "w", comm=comm)
-    for name, vector in fields:
-        order = model.numbers_q if _is_parameter(name) else model.numbers_u
-        _ordered(vector, order).view(viewer)
+    beside = Path(f"{path}.{comm.bcast(secrets.token_hex(4))}.vectors")
+    numbers: dict[str, Any] = {"vectors": beside.name, "kind": type(state).__name__}
+    numbers["sizes"] = _sizes(model)
+    viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
+    for name, value in ((one.name, getattr(state, one.name)) for one in fields(state)):
+        if name in OF_Q + OF_U:
+            parts = value if isinstance(value, tuple) else [] if value is None else [value]
+            for vector in parts:
+                _ordered(vector, model.numbers_q if name in OF_Q else model.numbers_u).view(viewer)
+            numbers[name] = len(parts)
+        elif isinstance(value, ExcitationLevel):
+            numbers[name] = {k: np.asarray(v).tolist() for k, v in asdict(value).items()}
+        else:
+            numbers[name] = np.asarray(value).tolist()
     viewer.destroy()
     if comm.rank == 0:
         old = _read(path)["vectors"] if path.exists() else None
-        numbers |= {"vectors": vectors.name, "names": [name for name, _ in fields]}
-        numbers["sizes"] = [model.mass.getSize()[0], model.gram.getSize()[0]]
         write_bytes(path, json.dumps(numbers).encode(), sync=True)
-        if old is not None:
-            (path.parent / old).unlink(missing_ok=True)
-            (path.parent / f"{old}.info").unlink(missing_ok=True)
+        for name in () if old is None else (old, f"{old}.info"):
+            (path.parent / name).unlink(missing_ok=True)
     comm.barrier()
 
 
@@ -61,52 +67,35 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
     """
     path = Path(path)
     numbers = _read(path)
-    sizes = [model.mass.getSize()[0], model.gram.getSize()[0]]
-    if numbers["sizes"] != sizes:
+    if numbers["sizes"] != _sizes(model):
         raise RunError(
             f"{path}: written for u and q with {numbers['sizes']} coefficients; this model has "
-            f"{sizes}: take the mesh of before."
+            f"{_sizes(model)}: take the mesh of before."
         )
+    kind: Any = FilterState if numbers["kind"] == "FilterState" else ObserverState
     u, q = model.mass.createVecRight(), model.gram.createVecRight()
     beside = str(path.parent / numbers["vectors"])
-    viewer = petsc_module().Viewer().createMPIIO(beside, "r", comm=u.comm)
-    vectors = []
-    for name in numbers["names"]:
-        like, order = (q, model.numbers_q) if _is_parameter(name) else (u, model.numbers_u)
-        vectors.append(_loaded(like, order, viewer))
+    viewer, found = petsc_module().Viewer().createMPIIO(beside, "r", comm=u.comm), {}
+    for name, value in ((one.name, numbers[one.name]) for one in fields(kind)):
+        if name in OF_Q + OF_U:
+            given = (q, model.numbers_q) if name in OF_Q else (u, model.numbers_u)
+            parts = tuple(_loaded(*given, viewer) for _ in range(value))
+            found[name] = parts if name in ("U", "modes") else parts[0] if parts else None
+        else:
+            found[name] = _value(value)
+    if "excitation" in found:
+        level = {k: _value(v) for k, v in numbers["excitation"].items()}
+        found["excitation"] = ExcitationLevel(**level)
     viewer.destroy()
-    return _state(numbers, dict(zip(numbers["names"], vectors, strict=True)))
+    return kind(**found)
 
 
-def _numbers(state: FilterState | ObserverState) -> tuple[list[tuple[str, Any]], dict[str, Any]]:
-    """Return the vectors of a state with their names, and the rest of it for JSON."""
-    if isinstance(state, FilterState):
-        fields = [("u", state.u), *((f"U{k}", row) for k, row in enumerate(state.U))]
-        fields += [(f"q{k}", mode) for k, mode in enumerate(state.modes)]
-        small = {"a": state.a.tolist(), "C": state.C.tolist(), "refused": state.refused.tolist()}
-        return fields, {"kind": "filter", "t": state.t, **small}
-    found = [(name, getattr(state, name)) for name in OBSERVED]
-    level = {k: np.asarray(v).tolist() for k, v in asdict(state.excitation).items()}
-    numbers = {"kind": "observer", "t": state.t, "excitation": level}
-    return [pair for pair in found if pair[1] is not None], numbers
+def _sizes(model: PetscModel) -> list[int]:
+    return [model.mass.getSize()[0], model.gram.getSize()[0]]
 
 
-def _state(numbers: dict[str, Any], vectors: dict[str, Any]) -> FilterState | ObserverState:
-    if numbers["kind"] == "filter":
-        rows = tuple(vectors[f"U{k}"] for k in range(len(numbers["a"])))
-        a, C = np.array(numbers["a"]), np.array(numbers["C"])
-        refused = np.array(numbers["refused"], dtype=int)
-        modes = tuple(vectors[f"q{k}"] for k in range(len(a)))
-        return FilterState(numbers["t"], vectors["u"], rows, a, C, refused, modes)
-    level: dict[str, Any] = numbers["excitation"]
-    level |= {k: np.array(v) for k, v in level.items() if isinstance(v, list)}
-    found = {name: vectors.get(name) for name in OBSERVED}
-    return ObserverState(t=numbers["t"], excitation=ExcitationLevel(**level), **found)
-
-
-def _is_parameter(name: str) -> bool:
-    """Return whether a vector of a state is one of Q."""
-    return name.startswith(("q", "rate_q"))
+def _value(value: Any) -> Any:
+    return np.array(value) if isinstance(value, list) else value
 
 
 def _read(path: Path) -> dict[str, Any]:

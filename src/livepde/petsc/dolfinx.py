@@ -6,7 +6,7 @@ What another version calls differently stands in `Interface`, the only place to 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cached_property
 from importlib import import_module
 from typing import Any
 
@@ -72,8 +72,8 @@ class DolfinxModel:
         self.api = api = Interface()
         ufl = api.ufl
         self.V, self.mesh, self.symmetric = V, V.mesh, symmetric
-        self.u, self.w = api.function(V), api.function(V)
-        self.time = api.constant(V.mesh, 0.0)
+        self.u, self.w = api.fem.Function(V), api.fem.Function(V)
+        self.time = api.fem.Constant(V.mesh, 0.0)
         self._set_parameter(q)
         self.boundary, self.form = boundary, form
         self.v = ufl.TestFunction(V)
@@ -94,8 +94,8 @@ class DolfinxModel:
         owned = np.unique(np.concatenate([*rows, np.zeros(0, dtype=int)]))
         self.fixed: IntArray = (start + owned).astype(petsc_module().IntType)
         self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
-        self.numbers_u = api.numbering(V)
-        self._kept: dict[tuple[str, bool], Any] = {}
+        self._forms: dict[tuple[str, bool], Any] = {}
+        self._matrices: dict[tuple[str, bool], Any] = {}
         slope = api.expanded(ufl.derivative(self._F(False), self.u))
         self.linear = self.u not in slope.coefficients()
 
@@ -114,7 +114,7 @@ class DolfinxModel:
 
     def interpolate(self, function: Callable[[Array], Any], space: Any = None) -> Any:
         """Return the coefficients of a function of coordinates (3, points) in V, or in Q."""
-        f = self.api.function(space or self.V)
+        f = self.api.fem.Function(space or self.V)
         f.interpolate(lambda x: np.broadcast_to(function(x), x.shape[1]).astype(float))
         vector = standard_vector(self.mesh.comm, self.api.owned(space or self.V))
         vector.getArray()[:] = f.x.array[: vector.getLocalSize()]
@@ -137,28 +137,31 @@ class DolfinxModel:
 
     def residual(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         self._at(u, q, t, w)
-        split = w is not None
-        return self._vector("F", split, lambda: self._F(split))
+        return self._vector("F", w is not None)
 
     def jacobian_u(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         self._at(u, q, t, w)
-        split = w is not None
-        return self._assembled("u", split, lambda: self.api.ufl.derivative(self._F(split), self.u))
+        return self._assembled("u", w is not None)
 
     def jacobian_q(self, u: Any, q: Any, t: float, w: Any = None) -> Any:
         self._at(u, q, t, w)
-        split = w is not None
-        if not self.numbers:
-            F = self.api.ufl.derivative
-            return self._assembled("q", split, lambda: F(self._F(split), self.q))
-        return self._columns(split)
+        return self._columns(w is not None) if self.numbers else self._assembled("q", w is not None)
 
     def coupling(self, w: Any, q: Any, t: float) -> Any:
-        self._at(w, q, t, w)
         if self.numbers:
             raise ModelError("DolfinxModel: the paper's law needs a field q: use PetscFilter.")
-        derivative = self.api.ufl.derivative
-        return self._assembled("A", True, lambda: derivative(self._inside(), self.q))
+        self._at(w, q, t, w)
+        return self._assembled("A", True)
+
+    @cached_property
+    def numbers_u(self) -> IntArray:
+        return self.api.numbering(self.V)
+
+    @cached_property
+    def numbers_q(self) -> IntArray:
+        if self.numbers:
+            return np.arange(self.create_q().getLocalSize())
+        return self.api.numbering(self.Q)
 
     # --- forms ------------------------------------------------------------------------------------
 
@@ -171,14 +174,12 @@ class DolfinxModel:
         self.numbers: list[Any] = []
         self.Q: Any = None
         if hasattr(q, "dofmap"):
-            self.Q, self.q = q, api.function(q)
+            self.Q, self.q = q, api.fem.Function(q)
             self.given: Any = self.q
-            self.numbers_q = api.numbering(q)
             return
         values = np.atleast_1d(np.asarray(q, dtype=float))
-        self.numbers = [api.constant(self.mesh, value) for value in values]
+        self.numbers = [api.fem.Constant(self.mesh, value) for value in values.tolist()]
         self.given = tuple(api.ufl.variable(one) for one in self.numbers)
-        self.numbers_q = np.arange(len(values) if self.mesh.comm.rank == 0 else 0)
 
     def _measures(self, omega: Callable[..., Any] | None) -> None:
         ufl = self.api.ufl
@@ -233,43 +234,52 @@ class DolfinxModel:
             constant.value = value
 
     def _matrix(self, form: Any) -> Any:
-        return self.api.matrix(self.api.compiled(form))
+        return self.api.matrix(self.api.fem.form(form))
 
-    def _assembled(self, name: str, split: bool, form: Callable[[], Any]) -> Any:
+    def _form(self, name: str, split: bool) -> Any:
+        """Return F, its derivative in "u", in "q" or in the number of an index, or "A" of w."""
+        derivative = self.api.ufl.derivative
+        if name == "A":
+            return derivative(self._inside(), self.q)
+        F = self._F(split)
+        if name in ("u", "q"):
+            F = derivative(F, self.u if name == "u" else self.q)
+        elif name != "F":
+            F = self.api.differentiated(F, self.given[int(name)])
+        return F
+
+    def _compiled(self, name: str, split: bool) -> Any:
+        """Return a compiled form; None where it is zero."""
+        if (name, split) not in self._forms:
+            form = self.api.expanded(self._form(name, split))
+            self._forms[name, split] = None if form.empty() else self.api.fem.form(form)
+        return self._forms[name, split]
+
+    def _assembled(self, name: str, split: bool) -> Any:
         """Return a matrix that is assembled in place from the second time on; None: zero."""
-        key = (name, split)
-        if key not in self._kept:
-            expanded = self.api.expanded(form())
-            compiled = None if expanded.empty() else self.api.compiled(expanded)
-            self._kept[key] = compiled, compiled and self.api.matrix(compiled)
-            return self._kept[key][1]
-        compiled, matrix = self._kept[key]
-        return compiled and self.api.matrix(compiled, matrix)
+        form, key = self._compiled(name, split), (name, split)
+        if form is not None:
+            self._matrices[key] = self.api.matrix(form, self._matrices.get(key))
+        return self._matrices.get(key)
 
-    def _vector(self, name: str, split: bool, form: Callable[[], Any]) -> Any:
-        key = (name, split)
-        if key not in self._kept:
-            self._kept[key] = self.api.compiled(form())
-        vector = self.create_u()
-        self.api.assemble(self._kept[key], vector)
+    def _vector(self, name: str, split: bool) -> Any:
+        form, vector = self._compiled(name, split), self.create_u()
+        if form is not None:
+            self.api.assemble(form, vector)
         return vector
 
     def _columns(self, split: bool) -> Any:
         """Return dF/dq for numbers, a dense matrix whose rows are shared out."""
         sizes = self.create_u().getSizes(), self.create_q().getSizes()
         key = ("columns", split)
-        if key not in self._kept:
-            self._kept[key] = petsc_module().Mat().createDense(sizes, comm=self.mesh.comm)
-            self._kept[key].setUp()
-        matrix = self._kept[key]
-        for k, one in enumerate(self.given):
-            slope = partial(self._slope, split, one)
-            matrix.getDenseArray()[:, k] = self._vector(f"q{k}", split, slope).getArray()
+        if key not in self._matrices:
+            self._matrices[key] = petsc_module().Mat().createDense(sizes, comm=self.mesh.comm)
+            self._matrices[key].setUp()
+        matrix = self._matrices[key]
+        for k in range(len(self.given)):
+            matrix.getDenseArray()[:, k] = self._vector(str(k), split).getArray()
         matrix.assemble()
         return matrix
-
-    def _slope(self, split: bool, number: Any) -> Any:
-        return self.api.differentiated(self._F(split), number)
 
     def _readings(self, points: Any) -> Any:
         """Return G: each point belongs to the lowest rank that has a cell with it."""
@@ -286,7 +296,7 @@ class DolfinxModel:
         G = petsc_module().Mat().createAIJ(((None, len(x)), columns), comm=self.mesh.comm)
         G.setUp()
         G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
-        unit = self.api.function(self.V)  # making one takes all ranks
+        unit = self.api.fem.Function(self.V)  # making one takes all ranks
         for k in np.flatnonzero(first == owner).tolist():
             dofs, values = self.api.evaluation(unit, x[k], cells[k])
             G.setValues([k], dofs, values)
@@ -302,21 +312,10 @@ class Interface:
         try:
             modules = (import_module(name) for name in ("ufl", "dolfinx", "dolfinx.fem.petsc"))
             self.ufl, self.dolfinx, self.petsc = modules
+            self.fem = self.dolfinx.fem
         except ModuleNotFoundError as error:
             message = f"DolfinxModel needs DOLFINx (Debian's python3-dolfinx). {MISSING}"
             raise ConfigurationError(message) from error
-
-    def function(self, space: Any) -> Any:
-        """Return a zero function of a space."""
-        return self.dolfinx.fem.Function(space)
-
-    def constant(self, mesh: Any, value: float) -> Any:
-        """Return a constant whose `value` can be set."""
-        return self.dolfinx.fem.Constant(mesh, float(value))
-
-    def compiled(self, form: Any) -> Any:
-        """Return a compiled form."""
-        return self.dolfinx.fem.form(form)
 
     def expanded(self, form: Any) -> Any:
         """Return a form with its derivatives carried out; `empty()` where it is zero."""
@@ -358,7 +357,7 @@ class Interface:
 
     def located(self, V: Any, marker: Callable[..., Any]) -> tuple[IntArray, Array]:
         """Return owned coefficients at marked points, and their coordinates, shape (3, points)."""
-        dofs = self.dolfinx.fem.locate_dofs_geometrical(V, marker)
+        dofs = self.fem.locate_dofs_geometrical(V, marker)
         dofs = dofs[dofs < self.owned(V)]
         return dofs, V.tabulate_dof_coordinates()[dofs].T
 

@@ -19,10 +19,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
+from livepde.laws.filter import contraction
 from livepde.linalg import Array, IntArray, Mask
 from livepde.petsc.model import PetscModel
 from livepde.petsc.step import ImplicitStep, advance
@@ -187,7 +187,7 @@ class PetscFilter:
         present = np.isfinite(d)
         far = present & (np.abs(np.where(present, d, 0.0)) > self.gate * expected)
         used = present & (~far | (state.refused >= self.patience))
-        W, half = contraction(Y[:, used], d[used] / noise[used])
+        (W,), (half,), _ = contraction((Y * used)[None], np.where(used, d / noise, 0.0)[None])
         U = [combined(W[: i + 1, i], state.U[: i + 1]) for i in range(len(W))]
         C = W.T @ state.C
         u, a = combined(half, U, state.u), state.a + half @ C
@@ -216,19 +216,6 @@ class PetscFilter:
         shift = np.linalg.solve(square, inner(excess, state.modes))
         weights = np.asarray(np.linalg.solve(state.C.T, shift), dtype=float)
         return replace(state, u=combined(weights, state.U, state.u), a=state.a + shift)
-
-
-def contraction(Y: Array, d: Array) -> tuple[Array, Array]:
-    """Return upper triangular W with W W^T = (I + Y Y^T)^-1, and W^T Y d.
-
-    Y and d are in units of the noise, shapes (k, readings) and (readings,). R = W^-1 and W^T Y d
-    come from one QR factorisation of [I 0; Y^T d]: no matrix is squared.
-    """
-    k = len(Y)
-    stacked = np.block([[np.eye(k), np.zeros((k, 1))], [Y.T, d[:, None]]])
-    upper: Array = np.asarray(np.linalg.qr(stacked, mode="r"))
-    W: Array = solve_triangular(upper[:k, :k], np.eye(k))
-    return W, upper[:k, k]
 
 
 def number_modes(like: Any, std: Any) -> list[Any]:

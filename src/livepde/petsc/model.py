@@ -61,9 +61,6 @@ class PetscModel(Protocol):
         N_op of (MN2), integrated over the rest, assembled, shape (n, n); None: omega is everything.
     fixed
         Global numbers of owned coefficients of u with Dirichlet values.
-    numbers_u, numbers_q
-        For each owned coefficient a number from 0 to n - 1, or m - 1, that does not depend on the
-        number of ranks: the order in a checkpoint.
     linear
         True if F is affine in u: one Newton update solves an implicit step.
     symmetric
@@ -78,10 +75,21 @@ class PetscModel(Protocol):
     pull: Any
     push: Any
     fixed: IntArray
-    numbers_u: IntArray
-    numbers_q: IntArray
     linear: bool
     symmetric: bool
+
+    @property
+    def numbers_u(self) -> IntArray:
+        """A number from 0 to n - 1 for each owned coefficient of u, on any number of ranks the same.
+
+        It gives the order in checkpoints.
+        """
+        ...
+
+    @property
+    def numbers_q(self) -> IntArray:
+        """The same for q, from 0 to m - 1."""
+        ...
 
     def impose(self, u: Any, t: float) -> None:
         """Set the Dirichlet values of a time in u."""

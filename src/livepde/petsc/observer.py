@@ -390,6 +390,8 @@ class Stage:
         self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
         self.given: float | None = None
         self.A_in = self.model.coupling(w, y[1], t)
+        # F is then affine in q alone, and evaluated once.
+        self.known = self.model.push is None and self.model.jacobian_u(*y, t, w) is None
         self.least = RESTING * solver.dual(self.model.mass * y[0], 0) / h
         self.least_q = RESTING * solver.dual(self.model.gram * y[1], 1) * self.weight
         self._observed: Residual | None = None
@@ -420,13 +422,14 @@ class Stage:
         return min(self.law.damping.theta(self.norms), STIFFEST / self.h)
 
     def force(self, u: Any, q: Any) -> Any:
-        """Return F(u, q, t; w) + nu N_op u; with all of u observed it is affine in q alone."""
-        if self.model.push is None:
+        """Return F(u, q, t; w) + nu N_op u."""
+        if self.known:
             if self._start is None:
                 self._start = self.model.residual(u, q, self.t, self.w), q.copy()
             return self._start[0] + self.A_in * (q - self._start[1])
         force = self.model.residual(u, q, self.t, self.w)
-        force.axpy(self.law.nu, self.model.push * u)
+        if self.model.push is not None:
+            force.axpy(self.law.nu, self.model.push * u)
         return force
 
     def seen(self) -> Residual:
@@ -450,8 +453,9 @@ class Stage:
         S.axpy(self.theta, model.pull, other)
         self.A, self.border = self.A_in, self._slope()
         if model.push is not None:
-            S.axpy(1.0, model.jacobian_u(*self.at, self.t, self.w), other)
             S.axpy(self.law.nu, model.push, other)
+        if not self.known:
+            S.axpy(1.0, model.jacobian_u(*self.at, self.t, self.w), other)
             self.A = model.jacobian_q(*self.at, self.t, self.w)
         S.zeroRowsColumns(model.fixed, 1.0)
 
