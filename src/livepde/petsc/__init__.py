@@ -10,18 +10,14 @@ from __future__ import annotations
 from livepde.petsc.check import check_petsc_model
 from livepde.petsc.checkpoint import load_state, save_state
 from livepde.petsc.dolfinx import DolfinxModel
-from livepde.petsc.filter import FilterReport, FilterState, PetscFilter, leading_modes, number_modes
+from livepde.petsc.filter import PetscFilter, leading_modes, number_modes
 from livepde.petsc.model import PetscModel
-from livepde.petsc.observer import ObserverReport, ObserverState, PetscObserver
+from livepde.petsc.observer import PetscObserver
 from livepde.petsc.step import ImplicitStep
 
 __all__ = [
     "DolfinxModel",
-    "FilterReport",
-    "FilterState",
     "ImplicitStep",
-    "ObserverReport",
-    "ObserverState",
     "PetscFilter",
     "PetscModel",
     "PetscObserver",

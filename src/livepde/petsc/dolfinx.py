@@ -96,7 +96,7 @@ class DolfinxModel:
         self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
         self._forms: dict[tuple[str, bool], Any] = {}
         self._matrices: dict[tuple[str, bool], Any] = {}
-        slope = api.expanded(ufl.derivative(self._F(False), self.u))
+        slope = ufl.algorithms.expand_derivatives(self._form("u", False))
         self.linear = self.u not in slope.coefficients()
 
     # --- vectors ----------------------------------------------------------------------------------
@@ -245,13 +245,15 @@ class DolfinxModel:
         if name in ("u", "q"):
             F = derivative(F, self.u if name == "u" else self.q)
         elif name != "F":
-            F = self.api.differentiated(F, self.given[int(name)])
+            ufl, number = self.api.ufl, self.given[int(name)]
+            terms = [one.reconstruct(ufl.diff(one.integrand(), number)) for one in F.integrals()]
+            F = ufl.Form(terms)
         return F
 
     def _compiled(self, name: str, split: bool) -> Any:
         """Return a compiled form; None where it is zero."""
         if (name, split) not in self._forms:
-            form = self.api.expanded(self._form(name, split))
+            form = self.api.ufl.algorithms.expand_derivatives(self._form(name, split))
             self._forms[name, split] = None if form.empty() else self.api.fem.form(form)
         return self._forms[name, split]
 
@@ -316,17 +318,6 @@ class Interface:
         except ModuleNotFoundError as error:
             message = f"DolfinxModel needs DOLFINx (Debian's python3-dolfinx). {MISSING}"
             raise ConfigurationError(message) from error
-
-    def expanded(self, form: Any) -> Any:
-        """Return a form with its derivatives carried out; `empty()` where it is zero."""
-        return self.ufl.algorithms.expand_derivatives(form)
-
-    def differentiated(self, form: Any, variable: Any) -> Any:
-        """Return the derivative of a form in a number, a `ufl.variable`."""
-        diff = self.ufl.diff
-        return self.ufl.Form(
-            [one.reconstruct(diff(one.integrand(), variable)) for one in form.integrals()]
-        )
 
     def matrix(self, form: Any, matrix: Any = None) -> Any:
         """Return the matrix of a compiled form, assembled in place where one is given."""

@@ -25,7 +25,7 @@ from livepde.laws.base import Status
 from livepde.laws.filter import contraction
 from livepde.linalg import Array, IntArray, Mask
 from livepde.petsc.model import PetscModel
-from livepde.petsc.step import ImplicitStep, advance
+from livepde.petsc.step import ImplicitStep, advance, require_order
 from livepde.petsc.vectors import combined, definite_solver, gathered, inner, random_vector, zeros
 
 __all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
@@ -39,16 +39,14 @@ class FilterState:
 
     Attributes
     ----------
-    t
-        Time of the sample.
     u, U
         State, and k rows of the square root, vectors of shape (n,).
     a, C
         Unknowns in prior standard deviations, shape (k,), and their square root, shape (k, k).
     refused
-        How many readings of each sensor the gate has refused in a row, shape (sensors,).
+        Readings of each sensor that the gate has refused in a row, shape (sensors,).
     modes
-        The columns of Phi that a is relative to, k vectors of shape (m,): a checkpoint has them.
+        The columns of Phi, k vectors of shape (m,): a checkpoint has them.
     """
 
     t: float
@@ -62,16 +60,9 @@ class FilterState:
 
 @dataclass(frozen=True, eq=False)
 class FilterReport:
-    """What a sample has brought.
+    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used.
 
-    Attributes
-    ----------
-    status
-        "ok", or the kind of failure with its remedy; then the state is that of before.
-    innovation, expected
-        z - G u, and its expected standard deviation, shape (sensors,).
-    used
-        Sensors whose readings were used: neither missing nor refused by the gate.
+    With a status other than "ok" the state is that of before.
     """
 
     status: Status
@@ -120,10 +111,7 @@ class PetscFilter:
         noise = np.asarray(self.noise, dtype=float)
         if not (np.isfinite(noise).all() and (noise > 0.0).all()):
             raise LawError(f"PetscFilter: noise must be positive; got {self.noise}.")
-        if not self.lower < self.upper:
-            raise LawError(
-                f"PetscFilter: lower must be less than upper; got {self.lower} and {self.upper}."
-            )
+        require_order("PetscFilter", self.lower, self.upper)
         object.__setattr__(self, "stepper", ImplicitStep(self.model))
 
     def init(self, u0: Any, t0: float = 0.0) -> FilterState:

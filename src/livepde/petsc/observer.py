@@ -20,6 +20,7 @@ multigrid for the first block and for the second one plus A^T D^-1 A, D the row 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,24 +32,19 @@ from livepde.laws.coupled.stage import nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.step import RESTING, SAME, TINY, advance
+from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order
 from livepde.petsc.vectors import definite_solver, free_mask, multigrid, random_vector, zeros
 from livepde.stepping import StepFailed
 
 __all__ = ["ObserverReport", "ObserverState", "PetscObserver"]
 
 PREFIX = "livepde_coupled_"
-OPTIONS = {  # of PETSc; one that the user has set stays
-    "ksp_type": "fgmres",
-    "ksp_gmres_restart": "60",
-    "pc_type": "fieldsplit",
-    "pc_fieldsplit_type": "schur",
-    "pc_fieldsplit_schur_fact_type": "lower",
-    "pc_fieldsplit_schur_precondition": "selfp",
-    "fieldsplit_0_ksp_type": "preonly",
-    "fieldsplit_1_mat_schur_complement_ainv_type": "lump",
-    "fieldsplit_1_ksp_type": "preonly",
-}
+OPTIONS = """
+ksp_type fgmres, ksp_gmres_restart 60, pc_type fieldsplit, pc_fieldsplit_type schur,
+pc_fieldsplit_schur_fact_type lower, pc_fieldsplit_schur_precondition selfp,
+fieldsplit_0_ksp_type preonly, fieldsplit_1_ksp_type preonly, fieldsplit_0_pc_type {multigrid},
+fieldsplit_1_pc_type {multigrid}, fieldsplit_1_mat_schur_complement_ainv_type lump
+"""  # of PETSc; one that the user has set stays
 ITERATIONS = 120  # of GMRES for one update
 REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
 FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
@@ -60,16 +56,9 @@ SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/ti
 
 @dataclass(frozen=True, eq=False)
 class ObserverState:
-    """Estimates u and q at a time t, the data u_alpha there, and what the next step begins with.
+    """Estimates u and q at a time t, and the data u_alpha there, None before the first sample.
 
-    Attributes
-    ----------
-    t, u, q, u_alpha
-        Vectors of shapes (n,), (m,) and (n,); u_alpha is None before the first sample.
-    rate_u, rate_q
-        Last change of u - u_alpha and q per unit of time.
-    excitation
-        State of the gate.
+    The next step begins with the last change of u - u_alpha and q per unit of time.
     """
 
     t: float
@@ -83,16 +72,9 @@ class ObserverState:
 
 @dataclass(frozen=True, eq=False)
 class ObserverReport:
-    """Result of a sample.
+    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES.
 
-    Attributes
-    ----------
-    status
-        "ok", or the kind of failure with its remedy; then the state is that of before.
-    held
-        True if the gate has held q, because nothing but noise excites it.
-    updates, iterations
-        Newton's updates, and the iterations of GMRES for them.
+    With a status other than "ok" the state is that of before.
     """
 
     status: Status
@@ -145,10 +127,7 @@ class PetscObserver:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
                 raise LawError(f"PetscObserver: {name} must be a number >= 0; got {value}.")
-        if not self.lower < self.upper:
-            raise LawError(
-                f"PetscObserver: lower must be less than upper; got {self.lower} and {self.upper}."
-            )
+        require_order("PetscObserver", self.lower, self.upper)
         object.__setattr__(self, "solver", CoupledSolver(self))
 
     def init(self, q0: Any, u0: Any, t0: float = 0.0) -> ObserverState:
@@ -191,15 +170,7 @@ class PetscObserver:
 
 
 class CoupledSolver:
-    """Newton's iteration for coupled steps, and K as a matrix of Python for PETSc's GMRES.
-
-    Attributes
-    ----------
-    updates, iterations
-        Newton's updates since `begin`, and iterations of GMRES.
-    unseen
-        Owned coefficients of u without a part in omega, a mask.
-    """
+    """Newton's iteration for coupled steps, and K as a matrix of Python for PETSc's GMRES."""
 
     def __init__(self, law: PetscObserver) -> None:
         self.law, self.model = law, law.model
@@ -208,6 +179,7 @@ class CoupledSolver:
         self.weights = mass.getDiagonal(), gram.getDiagonal()
         for diagonal in self.weights:
             diagonal.reciprocal()
+        # A mask of owned coefficients of u without a part in omega.
         self.unseen = self.model.mass_observed.getDiagonal().getArray() <= 0.0
         self.ksp: Any = None
         self.updates = self.iterations = 0
@@ -308,8 +280,7 @@ class CoupledSolver:
         """Make the solver, with a preconditioner of the blocks as they are now."""
         PETSc = petsc_module()
         options = PETSc.Options(PREFIX)
-        blocks = {f"fieldsplit_{k}_pc_type": multigrid() for k in (0, 1)}
-        for name, value in (OPTIONS | blocks).items():
+        for name, value in map(str.split, OPTIONS.format(multigrid=multigrid()).split(",")):
             if not options.hasName(name):
                 options[name] = value
         nest = stage.nested()
@@ -370,16 +341,8 @@ class CoupledSolver:
 class Stage:
     """The equation of one coupled step from y = (u, q): its residual and its Jacobian.
 
-    Attributes
-    ----------
-    first, second
-        Residuals of both lines at the last iterate.
-    weight
-        Weight of G_Q in K; while q is held it is so large that q stays.
-    given
-        theta where it is not the rule's; None: it is.
-    S, A, A_in, border
-        Blocks of K: that of u without b a^T; dF/dq and A(w), whose rows are to be masked; (b, a).
+    Blocks of K are S without b a^T, A and A_in, whose rows are to be masked, and G_Q times a
+    weight; the border is (b, a).
     """
 
     def __init__(
@@ -388,7 +351,7 @@ class Stage:
         self.solver, self.law, self.model = solver, solver.law, solver.model
         self.begin_u, self.begin_q, self.t, self.h, self.w = *y, t, h, w
         self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
-        self.given: float | None = None
+        self.given: float | None = None  # theta, where it is not the rule's
         self.A_in = self.model.coupling(w, y[1], t)
         # F is then affine in q alone, and evaluated once.
         self.known = self.model.push is None and self.model.jacobian_u(*y, t, w) is None
@@ -403,8 +366,7 @@ class Stage:
         self.at = u, q
         r = (u - self.w) * free
         self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
-        X, VX = abs(float(r.dot(mass_r))), abs(float(r.dot(Mr)))
-        self.norms = Residual(X, VX, lambda: self._squared(Mr), self.seen)
+        self.norms = Residual(*self.squares(r, mass_r, Mr), self.seen)
         self.theta = self.rule() if self.given is None else self.given
         terms = model.mass * ((u - self.begin_u) / self.h), self.force(u, q), Mr * self.theta
         self.first = (terms[0] + terms[1] + terms[2]) * free
@@ -437,13 +399,13 @@ class Stage:
         if self._observed is None:
             z = self.w * self.solver.free
             pulled, weighed = self.model.pull * z, self.model.mass_observed * z
-            X, VX = abs(float(z.dot(weighed))), abs(float(z.dot(pulled)))
-            self._observed = Residual(X, VX, lambda: self._squared(pulled))
+            self._observed = Residual(*self.squares(z, weighed, pulled))
         return self._observed
 
-    def _squared(self, functional: Any) -> float:
-        """Return the squared dual norm of a functional: ||r||_V~^2 of M_op r."""
-        return abs(float(functional.dot(self.solver.riesz(functional))))
+    def squares(self, r: Any, Mr: Any, pulled: Any) -> tuple[float, float, Callable[[], float]]:
+        """Return the squared norms of r in X, VX~ and V~, the last as a function."""
+        X, VX = abs(float(r.dot(Mr))), abs(float(r.dot(pulled)))
+        return X, VX, lambda: abs(float(pulled.dot(self.solver.riesz(pulled))))
 
     def linearise(self) -> None:
         """Assemble the blocks of K at the last iterate."""

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from livepde.errors import LawError
 from livepde.laws.base import Status
 from livepde.petsc.model import PetscModel, petsc_module
 from livepde.petsc.vectors import free_mask, multigrid
@@ -19,16 +20,13 @@ TINY = 1e-300
 SAME = 1e-9  # of a step: steps that are the same but for rounding
 REBUILD = 1.5  # times the iterations with a new preconditioner: then it is built again
 PREFIX = "livepde_state_"
+SHORTEST = 64  # steps that an interval is divided into at the most
 
 State = TypeVar("State")
 
 
 def advance(
-    stage: Callable[[State, float, float], State],
-    state: State,
-    t0: float,
-    t1: float,
-    halvings: int = 6,
+    stage: Callable[[State, float, float], State], state: State, t0: float, t1: float
 ) -> tuple[State, Status]:
     """Return the state at t1 by stages over [t, t + h], halved where one fails, and a status.
 
@@ -40,7 +38,7 @@ def advance(
         try:
             now = stage(now, t0 + done * h, h)
         except StepFailed as failure:
-            if count >= 2**halvings:
+            if count >= SHORTEST:
                 return state, Status.of(failure)
             count, done = 2 * count, 2 * done
         else:
@@ -48,25 +46,21 @@ def advance(
     return now, Status()
 
 
+def require_order(who: str, lower: float, upper: float) -> None:
+    """Raise `LawError` if bounds are not in order."""
+    if not lower < upper:
+        raise LawError(f"{who}: lower must be less than upper; got {lower} and {upper}.")
+
+
 @dataclass(eq=False)
 class ImplicitStep:
     """Newton's iteration for M (u+ - u)/h + F(u+, q, t + h) = 0, and S^{-1}, S = M/h + dF/du.
 
-    The preconditioner is algebraic multigrid, kept from step to step until it needs
-    `REBUILD` times the iterations that it took when new. PETSc's options with the prefix
-    `livepde_state_` replace both.
+    The preconditioner is algebraic multigrid, kept until it needs `REBUILD` times the iterations
+    that it took when new. PETSc's options with the prefix `livepde_state_` replace both.
 
-    Attributes
-    ----------
-    model
-        The process.
-    tolerance
-        Bound on the residual, in the dual norm weighed by the diagonal of M, relative to the terms
-        of the equation.
-    accuracy
-        Relative tolerance of the linear solver.
-    iterations
-        Maximum number of updates.
+    `tolerance` bounds the residual, in the dual norm weighed by the diagonal of M, relative to the
+    terms of the equation; `accuracy` is that of the linear solver, `iterations` bounds the updates.
     """
 
     model: PetscModel
