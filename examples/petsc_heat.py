@@ -1,6 +1,6 @@
 """Conductivity and loss of a plate from three thermometers, on many ranks, by the filter.
 
-On one rank: python examples/petsc_heat.py; on four: mpirun -n 4 python -m mpi4py examples/petsc_heat.py.
+On four ranks: mpirun -n 4 python -m mpi4py examples/petsc_heat.py.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""A reaction q(x) on a plate whose temperature is seen everywhere, on many ranks, by the paper's law.
+"""A reaction q(x) on a plate that is seen everywhere, on many ranks, by the paper's law.
 
 Half way the state is saved and loaded again, which another number of ranks could do, too:
 mpirun -n 4 python -m mpi4py examples/petsc_reaction.py.

@@ -17,7 +17,7 @@ from petsc4py import PETSc
 
 from livepde import petsc
 from livepde.errors import LivepdeError
-from livepde.laws.damping import ConstantDamping
+from livepde.laws.damping import ConstantDamping, ResidualDamping
 from livepde.laws.excitation import ExcitationGate
 from livepde.petsc.vectors import gathered
 
@@ -238,6 +238,25 @@ def refusals(domain, folder):
     return found
 
 
+def opened(domain):
+    """Residual of the state's equation after a step without damping, with a Robin boundary."""
+    V = space(domain)
+    model = petsc.DolfinxModel(
+        V,
+        V,
+        lambda u, q, v, x, t: ufl.dot(ufl.grad(u), ufl.grad(v)) + q * u * v - 10.0 * v,
+        boundary=lambda u, q, v, x, t: 5.0 * u**3 * v,
+    )
+    damping = ResidualDamping(0.0)
+    law = petsc.PetscObserver(model, gain=10.0, damping=damping, gate=None, tolerance=1e-9)
+    begin, data = model.interpolate(lambda x: 2.0), model.interpolate(lambda x: 2.0 + x[0])
+    state, report = law.step(law.init(model.parameter(0.5), begin), 0.1, data)
+    assert report.status.ok
+    rate = model.mass * ((state.u - begin) / 0.1)
+    left = rate + model.residual(state.u, state.q, 0.1, data)
+    return left.norm() / rate.norm()
+
+
 def failures(domain):
     """Status of steps that have no solution; nothing moves meanwhile."""
     V = space(domain)
@@ -276,6 +295,6 @@ if __name__ == "__main__":
         folder = Path(sys.argv[1]).parent
         said = refusals(domain, folder)
         found |= shares(domain) | checked(domain) | robust(domain)
-        found |= {"said": json.dumps(said), "failed": failures(domain)}
+        found |= {"said": json.dumps(said), "failed": failures(domain), "open": opened(domain)}
     if COMM.rank == 0:
         np.savez(sys.argv[1], ranks=COMM.size, **found)

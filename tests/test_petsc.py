@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -207,3 +208,40 @@ def test_a_mistake_is_said_in_a_sentence(name, sentence, found):
     assert said[name].startswith(sentence)
     if name == "another model":
         assert "with [357, 2] coefficients; this model has [357, 357]" in said[name]
+
+
+@needs_mpi
+def test_examples_find_their_truth_on_two_ranks():
+    examples = HERE.parent / "examples"
+    lines = mpirun(2, examples / "petsc_heat.py").splitlines()
+    for line, name, truth in zip(lines, "ks", (0.4, 1.5), strict=True):
+        found, value, std = re.fullmatch(r"(\w) = ([\d.]+) ± ([\d.]+)", line).groups()
+        assert found == name
+        assert abs(float(value) - truth) < 3 * float(std) < 0.05 * truth
+    (said,) = mpirun(2, examples / "petsc_reaction.py").splitlines()
+    first, last = map(float, re.findall(r"\d+\.\d+", said))
+    assert last < 0.002 < 0.5 < first
+
+
+@needs_mpi
+def test_the_benchmark_compares_numbers_of_ranks():
+    command = ["petsc", "--size", "2700", "--samples", "1", "--json"]
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks", *command],
+        cwd=HERE.parent,
+        env={**os.environ, **SETTINGS},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert len(found["checks"]) == 5  # three shares, and q of both laws on two ranks
+    (table,) = found["tables"]
+    assert [row[0] for row in table["rows"]] == [1, 1, 2, 2, 2, 2]
+
+
+@needs_mpi
+def test_a_boundary_term_sees_the_estimate(found):
+    """Then the equation is not affine in q alone, even where all of u is observed."""
+    assert found(2)["open"] < 1e-7

@@ -19,18 +19,10 @@ ROUNDING = 1e-10
 def check_petsc_model(
     model: PetscModel, u: Any, q: Any, t: float = 0.0, w: Any = None, *, seed: int = 1
 ) -> CheckReport:
-    """Check what the laws rely on, at a point.
+    """Check what the laws rely on, at a point u, q, t, in random directions.
 
-    Parameters
-    ----------
-    model
-        The process.
-    u, q, t
-        State and parameter, shapes (n,) and (m,), and time.
-    w
-        Data on omega: with them as `PetscObserver` uses the model, without as `PetscFilter` does.
-    seed
-        Of the random directions.
+    With data w on omega the model is checked as `PetscObserver` uses it, without as `PetscFilter`
+    does.
     """
     du = random_vector(u, model.numbers_u, seed) * free_mask(u, model.fixed)
     dq = random_vector(q, model.numbers_q, seed + 1)

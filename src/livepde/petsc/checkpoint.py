@@ -82,10 +82,7 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
             parts = tuple(_loaded(*given, viewer) for _ in range(value))
             found[name] = parts if name in ("U", "modes") else parts[0] if parts else None
         else:
-            found[name] = _value(value)
-    if "excitation" in found:
-        level = {k: _value(v) for k, v in numbers["excitation"].items()}
-        found["excitation"] = ExcitationLevel(**level)
+            found[name] = _decoded(value)
     viewer.destroy()
     return kind(**found)
 
@@ -94,7 +91,9 @@ def _sizes(model: PetscModel) -> list[int]:
     return [model.mass.getSize()[0], model.gram.getSize()[0]]
 
 
-def _value(value: Any) -> Any:
+def _decoded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return ExcitationLevel(**{k: _decoded(v) for k, v in value.items()})
     return np.array(value) if isinstance(value, list) else value
 
 

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from importlib import import_module
 from typing import Any
 
 import numpy as np
 
-from livepde.errors import ConfigurationError, ModelError
+from livepde.errors import ModelError
 from livepde.linalg import Array, IntArray
-from livepde.petsc.model import MISSING, petsc_module
+from livepde.petsc.model import petsc_module
 from livepde.petsc.vectors import gathered, standard_vector
 
 __all__ = ["DolfinxModel"]
@@ -36,8 +35,9 @@ class DolfinxModel:
         less the source. For numbers q is a tuple. x are the coordinates and t is the time.
     boundary
         Integrand of F over the boundary, with the same arguments; it sees the estimate, never data.
-    mass
-        Integrand (u, v) of M; default u v.
+    mass, inner
+        Integrands (u, v) of M and (p, q) of the inner product of Q; default u v and
+        p q + grad p . grad q.
     dirichlet
         Pairs of a marker, coordinates (3, points) -> booleans, and a value, (x, t) -> numbers.
     sensors
@@ -45,8 +45,6 @@ class DolfinxModel:
     omega
         Marker of the observed cells, by their midpoints, coordinates (3, cells) -> booleans; None:
         all of u is observed.
-    inner
-        Integrand (p, q) of the inner product of Q; default p q + grad p . grad q.
     M_op, N_op
         Integrands (u, v) of M_op and N_op of (MN1), (MN2); default u v + grad u . grad v.
     symmetric
@@ -81,12 +79,12 @@ class DolfinxModel:
         trial = ufl.TrialFunction(V)
         weigh: Callable[..., Any] = mass or ufl.inner
         pull, push = M_op or self._h1, N_op or self._h1
-        self.mass = self._matrix(weigh(trial, self.v) * ufl.dx)
-        self.mass_observed, self.pull = self.mass, self._matrix(pull(trial, self.v) * self.seen)
+        self.mass = api.matrix_of(weigh(trial, self.v) * ufl.dx)
+        self.mass_observed, self.pull = self.mass, api.matrix_of(pull(trial, self.v) * self.seen)
         self.push = None
         if omega is not None:
-            self.mass_observed = self._matrix(weigh(trial, self.v) * self.seen)
-            self.push = self._matrix(push(trial, self.v) * self.rest)
+            self.mass_observed = api.matrix_of(weigh(trial, self.v) * self.seen)
+            self.push = api.matrix_of(push(trial, self.v) * self.rest)
         self.gram, self.mass_q = self._inner_products(inner or self._h1)
         self._dirichlet = [(*api.located(V, marker), value) for marker, value in dirichlet]
         rows = [dofs for dofs, _, _ in self._dirichlet]
@@ -98,8 +96,6 @@ class DolfinxModel:
         self._matrices: dict[tuple[str, bool], Any] = {}
         slope = ufl.algorithms.expand_derivatives(self._form("u", False))
         self.linear = self.u not in slope.coefficients()
-
-    # --- vectors ----------------------------------------------------------------------------------
 
     def create_u(self) -> Any:
         """Return a zero vector of X."""
@@ -127,8 +123,6 @@ class DolfinxModel:
         vector = self.create_q()
         vector.getArray()[:] = np.asarray(value, dtype=float)[: vector.getLocalSize()]
         return vector
-
-    # --- the protocol -----------------------------------------------------------------------------
 
     def impose(self, u: Any, t: float) -> None:
         values = u.getArray()
@@ -162,8 +156,6 @@ class DolfinxModel:
         if self.numbers:
             return np.arange(self.create_q().getLocalSize())
         return self.api.numbering(self.Q)
-
-    # --- forms ------------------------------------------------------------------------------------
 
     def _h1(self, a: Any, b: Any) -> Any:
         ufl = self.api.ufl
@@ -215,11 +207,9 @@ class DolfinxModel:
             eye.setDiagonal(ones)
             eye.assemble()
             return eye, eye
-        ufl = self.api.ufl
+        api, ufl = self.api, self.api.ufl
         p, r = ufl.TestFunction(self.Q), ufl.TrialFunction(self.Q)
-        return self._matrix(inner(r, p) * ufl.dx), self._matrix(ufl.inner(r, p) * ufl.dx)
-
-    # --- assembly ---------------------------------------------------------------------------------
+        return api.matrix_of(inner(r, p) * ufl.dx), api.matrix_of(ufl.inner(r, p) * ufl.dx)
 
     def _at(self, u: Any, q: Any, t: float, w: Any) -> None:
         """Make forms see these values."""
@@ -232,9 +222,6 @@ class DolfinxModel:
             return
         for constant, value in zip(self.numbers, gathered(q), strict=True):
             constant.value = value
-
-    def _matrix(self, form: Any) -> Any:
-        return self.api.matrix(self.api.fem.form(form))
 
     def _form(self, name: str, split: bool) -> Any:
         """Return F, its derivative in "u", in "q" or in the number of an index, or "A" of w."""
@@ -285,22 +272,19 @@ class DolfinxModel:
 
     def _readings(self, points: Any) -> Any:
         """Return G: each point belongs to the lowest rank that has a cell with it."""
-        x = np.zeros((len(points), 3))
+        x, comm = np.zeros((len(points), 3)), self.mesh.comm
         x[:, : np.shape(points)[1]] = points
-        cells, owner = self.api.cells_at(self.mesh, x), self.mesh.comm.rank
-        nobody = self.mesh.comm.size
-        owners = self.mesh.comm.allgather([owner if c >= 0 else nobody for c in cells])
+        rows = self.api.readings(self.V, x)
+        owners = comm.allgather([comm.size if row is None else comm.rank for row in rows])
         first = np.min(owners, axis=0)
-        if (first == nobody).any():
-            lost = np.flatnonzero(first == nobody)[0]
+        if (first == comm.size).any():
+            lost = np.flatnonzero(first == comm.size)[0]
             raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside of the mesh.")
-        columns = self.create_u().getSizes()
-        G = petsc_module().Mat().createAIJ(((None, len(x)), columns), comm=self.mesh.comm)
+        G = petsc_module().Mat().createAIJ(((None, len(x)), self.create_u().getSizes()), comm=comm)
         G.setUp()
         G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
-        unit = self.api.fem.Function(self.V)  # making one takes all ranks
-        for k in np.flatnonzero(first == owner).tolist():
-            dofs, values = self.api.evaluation(unit, x[k], cells[k])
+        for k in np.flatnonzero(first == comm.rank).tolist():
+            dofs, values = rows[k] or ([], [])
             G.setValues([k], dofs, values)
         G.assemble()
         return G
@@ -311,13 +295,12 @@ class Interface:
 
     def __init__(self) -> None:
         petsc_module()
-        try:
-            modules = (import_module(name) for name in ("ufl", "dolfinx", "dolfinx.fem.petsc"))
-            self.ufl, self.dolfinx, self.petsc = modules
-            self.fem = self.dolfinx.fem
-        except ModuleNotFoundError as error:
-            message = f"DolfinxModel needs DOLFINx (Debian's python3-dolfinx). {MISSING}"
-            raise ConfigurationError(message) from error
+        self.ufl, self.dolfinx = petsc_module("ufl"), petsc_module("dolfinx")
+        self.fem, self.petsc = self.dolfinx.fem, petsc_module("dolfinx.fem.petsc")
+
+    def matrix_of(self, form: Any) -> Any:
+        """Return the matrix of a form."""
+        return self.matrix(self.fem.form(form))
 
     def matrix(self, form: Any, matrix: Any = None) -> Any:
         """Return the matrix of a compiled form, assembled in place where one is given."""
@@ -361,43 +344,34 @@ class Interface:
         values = np.where(marker(middle.T), OBSERVED, HIDDEN).astype(np.int32)
         return self.dolfinx.mesh.meshtags(mesh, dim, local, values)
 
-    def cells_at(self, mesh: Any, x: Array) -> IntArray:
-        """Return an owned cell with each point, shape (points,), -1 where this rank has none."""
-        geometry, dim = self.dolfinx.geometry, mesh.topology.dim
-        found = np.full(len(x), -1)
-        owned = mesh.topology.index_map(dim).size_local
+    def readings(self, V: Any, x: Array) -> list[tuple[IntArray, Array] | None]:
+        """Return global coefficients at each point and the values of their shape functions there.
+
+        None stands for a point without an owned cell.
+        """
+        geometry, dim = self.dolfinx.geometry, V.mesh.topology.dim
+        f, owned = self.fem.Function(V), V.mesh.topology.index_map(dim).size_local
         if not len(x) or not owned:
-            return found
-        tree = geometry.BoundingBoxTree(mesh, dim, padding=1e-10)
-        near = geometry.compute_collisions(tree, x)
-        hits = geometry.compute_colliding_cells(mesh, near, x)
-        for k in range(len(x)):
-            inside = [cell for cell in hits.links(k) if cell < owned]
-            found[k] = inside[0] if inside else -1
+            return [None] * len(x)
+        tree = geometry.BoundingBoxTree(V.mesh, dim, padding=1e-10)
+        hits = geometry.compute_colliding_cells(V.mesh, geometry.compute_collisions(tree, x), x)
+        found: list[tuple[IntArray, Array] | None] = []
+        for k, point in enumerate(x):
+            cell = min((cell for cell in hits.links(k) if cell < owned), default=None)
+            if cell is None:
+                found.append(None)
+                continue
+            dofs, values = V.dofmap.cell_dofs(cell), []
+            for dof in dofs:
+                f.x.array[:] = 0.0
+                f.x.array[dof] = 1.0
+                values.append(float(np.ravel(f.eval(point, cell))[0]))
+            numbers = V.dofmap.index_map.local_to_global(dofs).astype(petsc_module().IntType)
+            found.append((numbers, np.array(values)))
         return found
 
-    def evaluation(self, f: Any, x: Array, cell: int) -> tuple[IntArray, Array]:
-        """Return global coefficients, and the values of their shape functions at a point.
-
-        f is a function of their space, to be used here.
-        """
-        V = f.function_space
-        dofs = V.dofmap.cell_dofs(cell)
-        values = np.zeros(len(dofs))
-        for k, dof in enumerate(dofs):
-            f.x.array[:] = 0.0
-            f.x.array[dof] = 1.0
-            values[k] = np.ravel(f.eval(x, cell))[0]
-        return V.dofmap.index_map.local_to_global(dofs).astype(petsc_module().IntType), values
-
     def numbering(self, V: Any) -> IntArray:
-        """Return the numbers of owned coefficients in the mesh as it was given, for P1 or P0.
-
-        Raises
-        ------
-        ModelError
-            The element is another one.
-        """
+        """Return the numbers of owned coefficients in the mesh as it was given, for P1 or P0."""
         mesh, owned = V.mesh, self.owned(V)
         count = len(mesh.topology.original_cell_index)
         dofs = V.dofmap.list.array.reshape(count, -1)

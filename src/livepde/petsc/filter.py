@@ -26,7 +26,7 @@ from livepde.laws.filter import contraction
 from livepde.linalg import Array, IntArray, Mask
 from livepde.petsc.model import PetscModel
 from livepde.petsc.step import ImplicitStep, advance, require_order
-from livepde.petsc.vectors import combined, definite_solver, gathered, inner, random_vector, zeros
+from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
 
 __all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
 
@@ -225,7 +225,7 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
     with twice as many vectors. Their start is the same on every number of ranks. Modes of equal
     variance, as on a square, and signs may differ from run to run: a state carries its own.
     """
-    solver = definite_solver(model.gram, 1e-12)
+    solver = linear_solver(model.gram, 1e-12)
     like = model.gram.createVecRight()
     basis = [random_vector(like, model.numbers_q, seed) for seed in range(1, 2 * count + 3)]
     values = np.zeros(len(basis))

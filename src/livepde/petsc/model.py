@@ -8,24 +8,18 @@ from typing import Any, Protocol, runtime_checkable
 from livepde.errors import ConfigurationError
 from livepde.linalg import IntArray
 
-__all__ = ["MISSING", "PetscModel", "petsc_module"]
+__all__ = ["PetscModel", "petsc_module"]
 
 MISSING = (
-    "livepde.petsc needs petsc4py and mpi4py (the extra 'petsc'); deploy/petsc.sh sets up an "
+    "livepde.petsc needs petsc4py, mpi4py and, for UFL, DOLFINx; deploy/petsc.sh sets up an "
     "environment with Debian's, as docs/parallel.md says."
 )
 
 
-def petsc_module() -> Any:
-    """Return `petsc4py.PETSc`; the first call starts MPI.
-
-    Raises
-    ------
-    ConfigurationError
-        There is no petsc4py.
-    """
+def petsc_module(name: str = "petsc4py.PETSc") -> Any:
+    """Return a module, by default that of PETSc, which starts MPI; raises `ConfigurationError`."""
     try:
-        return import_module("petsc4py.PETSc")
+        return import_module(name)
     except ModuleNotFoundError as error:
         raise ConfigurationError(MISSING) from error
 
@@ -80,15 +74,12 @@ class PetscModel(Protocol):
 
     @property
     def numbers_u(self) -> IntArray:
-        """A number from 0 to n - 1 for each owned coefficient of u, on any number of ranks the same.
-
-        It gives the order in checkpoints.
-        """
+        """Number of each owned coefficient of u in an order that no number of ranks changes."""
         ...
 
     @property
     def numbers_q(self) -> IntArray:
-        """The same for q, from 0 to m - 1."""
+        """The same for q."""
         ...
 
     def impose(self, u: Any, t: float) -> None:

@@ -33,7 +33,7 @@ from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
 from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order
-from livepde.petsc.vectors import definite_solver, free_mask, multigrid, random_vector, zeros
+from livepde.petsc.vectors import free_mask, linear_solver, multigrid, random_vector, zeros
 from livepde.stepping import StepFailed
 
 __all__ = ["ObserverReport", "ObserverState", "PetscObserver"]
@@ -188,7 +188,7 @@ class CoupledSolver:
         self._tests: tuple[Any, Any] | None = None
 
     def begin(self, path: tuple[float, Any, float, Any], rates: Any, held: bool) -> None:
-        """Take up a sample: times and data at both ends, rates, and whether q is held."""
+        """Begin a sample: times and data at both ends, rates, and whether q is held."""
         self.path, self.rates, self.held = path, rates, held
         self.updates = self.iterations = 0
 
@@ -322,7 +322,7 @@ class CoupledSolver:
             rows = inside.getOwnershipRange()[0] + np.flatnonzero(inside.getArray() == 0.0)
             matrix = model.mass.copy()
             matrix.zeroRowsColumns(rows.astype(petsc_module().IntType), 1.0)
-            self._tests = inside, definite_solver(matrix, 1e-10)
+            self._tests = inside, linear_solver(matrix, 1e-10)
         inside, solver = self._tests
         x = zeros(functional)
         solver.solve(functional * inside, x)
@@ -449,7 +449,7 @@ def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
     stiff = model.pull.copy()
     stiff.axpy(1e-6, model.mass, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN)
     stiff.zeroRowsColumns(model.fixed, 1.0)
-    of_q, of_u = definite_solver(model.gram, 1e-8), definite_solver(stiff, 1e-8)
+    of_q, of_u = linear_solver(model.gram, 1e-8), linear_solver(stiff, 1e-8)
     q, u = model.gram.createVecRight(), model.mass.createVecRight()
     found = []
     for seed in range(101, 101 + PROBES):

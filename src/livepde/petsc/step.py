@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from livepde.errors import LawError
 from livepde.laws.base import Status
 from livepde.petsc.model import PetscModel, petsc_module
-from livepde.petsc.vectors import free_mask, multigrid
+from livepde.petsc.vectors import free_mask, linear_solver
 from livepde.stepping import StepFailed
 
 __all__ = ["ImplicitStep", "advance"]
@@ -73,7 +73,6 @@ class ImplicitStep:
         self.free = free_mask(mass.createVecRight(), self.model.fixed)
         self.weights = mass.getDiagonal()
         self.weights.reciprocal()
-        self.S: Any = None
         self.ksp: Any = None
         self._best, self._last, self._width = 0, 0, 0.0
 
@@ -114,19 +113,18 @@ class ImplicitStep:
 
     def linearise(self, u: Any, q: Any, t: float, h: float) -> None:
         """Assemble S = M/h + dF/du at a point, fixed coefficients eliminated."""
-        PETSc, model = petsc_module(), self.model
+        model, S = self.model, self.model.mass.copy()
+        S.scale(1.0 / h)
         slope = model.jacobian_u(u, q, t)
-        if self.S is None:
-            self.S = slope.copy()
-        else:
-            slope.copy(self.S, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self.S.axpy(1.0 / h, model.mass, PETSc.Mat.Structure.UNKNOWN_NONZERO_PATTERN)
-        self.S.zeroRowsColumns(model.fixed, 1.0)
+        if slope is not None:
+            S.axpy(1.0, slope, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN)
+        S.zeroRowsColumns(model.fixed, 1.0)
         if self.ksp is None:
-            self.ksp = self._solver()
+            kind = "cg" if model.symmetric else "gmres"
+            self.ksp = linear_solver(S, self.accuracy, kind, PREFIX)
         rebuild = abs(h - self._width) > SAME * h or self._last > REBUILD * self._best + 1
         self.ksp.getPC().setReusePreconditioner(not rebuild)
-        self.ksp.setOperators(self.S)
+        self.ksp.setOperators(S)
         if rebuild:
             self._best, self._width = 0, h
 
@@ -134,22 +132,8 @@ class ImplicitStep:
         """Return S^{-1} b, zero at fixed coefficients; raises `StepFailed`."""
         x = b.duplicate()
         self.ksp.solve(b * self.free, x)
-        if self.ksp.getConvergedReason() < 0:
-            raise StepFailed(
-                "singular",
-                f"PETSc's solver stopped after {self.ksp.getIterationNumber()} iterations "
-                f"(reason {self.ksp.getConvergedReason()})",
-            )
-        self._last = self.ksp.getIterationNumber()
+        reason, self._last = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
+        if reason < 0:
+            raise StepFailed("singular", f"PETSc's solver stopped with reason {reason}")
         self._best = self._best or self._last
         return x
-
-    def _solver(self) -> Any:
-        PETSc = petsc_module()
-        ksp = PETSc.KSP().create(self.model.mass.comm)
-        ksp.setOptionsPrefix(PREFIX)
-        ksp.setType("cg" if self.model.symmetric else "gmres")
-        ksp.setTolerances(rtol=self.accuracy, atol=0.0, max_it=500)
-        ksp.getPC().setType(multigrid())
-        ksp.setFromOptions()
-        return ksp

@@ -10,15 +10,7 @@ import numpy as np
 from livepde.linalg import Array, IntArray
 from livepde.petsc.model import petsc_module
 
-__all__ = [
-    "combined",
-    "definite_solver",
-    "gathered",
-    "inner",
-    "multigrid",
-    "random_vector",
-    "zeros",
-]
+__all__ = ["combined", "gathered", "inner", "linear_solver", "multigrid", "random_vector"]
 
 
 def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
@@ -53,17 +45,11 @@ def free_mask(x: Any, fixed: IntArray) -> Any:
 def random_vector(like: Any, numbers: IntArray, seed: int) -> Any:
     """Return a vector of values in (-1, 1) that depend on `numbers` and the seed alone.
 
-    The mixing function is SplitMix64 (Steele, Lea and Flood 2014): no generator has to run through
-    the values of other ranks.
+    No generator has to run through the values of other ranks.
     """
-    z = (np.asarray(numbers, dtype=np.uint64) + np.uint64(seed << 40)) * np.uint64(
-        0x9E3779B97F4A7C15
-    )
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    z = z ^ (z >> np.uint64(31))
     vector = like.duplicate()
-    vector.getArray()[:] = (z >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0
+    hashed = 43758.5453 * np.sin(12.9898 * (np.asarray(numbers) + 1.0) + 78.233 * seed)
+    vector.getArray()[:] = 2.0 * (hashed - np.floor(hashed)) - 1.0
     return vector
 
 
@@ -74,13 +60,17 @@ def zeros(like: Any) -> Any:
     return vector
 
 
-def definite_solver(matrix: Any, accuracy: float) -> Any:
-    """Return a solver for a symmetric positive definite matrix, to a relative accuracy."""
+def linear_solver(
+    matrix: Any, accuracy: float, kind: str = "cg", prefix: str = "livepde_riesz_"
+) -> Any:
+    """Return a solver with algebraic multigrid, which PETSc's options with the prefix change."""
     solver = petsc_module().KSP().create(matrix.comm)
+    solver.setOptionsPrefix(prefix)
     solver.setOperators(matrix)
-    solver.setType("cg")
+    solver.setType(kind)
     solver.getPC().setType(multigrid())
-    solver.setTolerances(rtol=accuracy)
+    solver.setTolerances(rtol=accuracy, atol=0.0, max_it=500)
+    solver.setFromOptions()
     return solver
 
 
