@@ -81,6 +81,7 @@ ELSEWHERE = {
     ],
     "test_petsc.py::test_examples_find_their_truth_on_two_ranks": [
         "mpirun -n 4 /opt/livepde/bin/python",
+        "mpirun -n 4 python -m mpi4py",
         "deploy/petsc.sh",
     ],
     "test_deploy.py::test_the_unit_is_one": [
