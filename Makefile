@@ -58,9 +58,9 @@ coverage: $(READY)  ## Run all and measure coverage, which takes longer
 	@$(BIN)/$(PYTEST) --cov
 
 mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment of its own
-	@.venv-petsc/bin/python -c 'import petsc4py, pytest, livepde; livepde.Model' 2>/dev/null || deploy/petsc.sh .venv-petsc
+	@.venv-petsc/bin/python -c 'import dolfinx, pytest, livepde; livepde.Model' 2>/dev/null || deploy/petsc.sh .venv-petsc
 	@.venv-petsc/bin/python -m pip --disable-pip-version-check --quiet install pytest
-	@.venv-petsc/bin/python -m pytest --quiet tests/test_parallel.py
+	@.venv-petsc/bin/python -m pytest --quiet tests/test_petsc.py
 
 lowest: $(READY)  ## Run the fast tests with the lowest versions of all dependencies
 	@$(UV) venv --quiet --clear --python 3.11 .venv-lowest

@@ -332,36 +332,34 @@ def auto(
     _report(context, benchmark(sizes, DATA_SETS.of(context, "seeds"), costs), as_json)
 
 
-NODES, TIMED, TURNS = Count(1_000_000, 10_000), Count(5, 2), Count(2, 1)
+NODES, TIMED = Count(100_000, 3000), Count(6, 2)
 
 
 @app.command()
-def mpi(
+def petsc(
     context: typer.Context,
     size: Annotated[int, NODES.option("Number of nodes.", least=2500)] = NODES.usual,
     ranks: Annotated[
         list[int] | None,
         typer.Option(min=1, help="Number of ranks, default 1 and 2. Repeat for more."),
     ] = None,
-    samples: Annotated[int, TIMED.option("Steps that are timed.")] = TIMED.usual,
-    rounds: Annotated[int, TURNS.option("Runs with each number of ranks.")] = TURNS.usual,
+    samples: Annotated[int, TIMED.option("Samples that are timed.")] = TIMED.usual,
     quick: Annotated[
         bool,
         typer.Option(
-            "--quick", help="Few nodes: q is compared, and too little is to do for a speed-up."
+            "--quick", help="Few nodes: q is compared, and costs are too small for their bounds."
         ),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Time the gradient law on several ranks of MPI, and count what crosses between them.
+    """Time both laws on PETSc vectors against a forward step, and their scaling on several ranks.
 
-    Example:  python -m benchmarks mpi --size 100000
+    Example:  python -m benchmarks petsc --size 100000
     """
-    from benchmarks.mpi import mpi as benchmark
+    from benchmarks.petsc import petsc as benchmark
 
     nodes, steps = NODES.of(context, "size"), TIMED.of(context, "samples")
-    outcome = benchmark(nodes, ranks or (1, 2), steps, TURNS.of(context, "rounds"))
-    _report(context, outcome, as_json)
+    _report(context, benchmark(nodes, ranks or (1, 2), steps), as_json)
 
 
 @app.command()

@@ -1,14 +1,16 @@
 #!/usr/bin/env bash
-# PETSc, MPI and livepde on a fresh Debian 12 (as root): deploy/petsc.sh [FOLDER [PACKAGE]]
+# PETSc, MPI, DOLFINx and livepde on a fresh Debian 12 (as root): deploy/petsc.sh [FOLDER [PACKAGE]]
 #
 # FOLDER is the environment to make, default .venv-petsc; PACKAGE is what pip is to install: a folder,
-# default this project, or a name. Then:  mpirun -n 4 FOLDER/bin/livepde run CASE.toml --engine petsc
+# default this project, or a name. Then:
+# mpirun -n 4 FOLDER/bin/python -m mpi4py examples/petsc_heat.py
 set -euo pipefail
 here="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
 folder="${1:-.venv-petsc}"
 package="${2:-$here}"
 
-needed=(python3-petsc4py python3-petsc4py-real python3-mpi4py python3-venv openmpi-bin)
+needed=(python3-petsc4py python3-petsc4py-real python3-dolfinx python3-dolfinx-real python3-mpi4py)
+needed+=(python3-venv openmpi-bin)
 missing=()
 for name in "${needed[@]}"; do
   dpkg-query --show --showformat='${db:Status-Abbrev}' "$name" 2>/dev/null | grep -q '^ii' \
@@ -30,4 +32,4 @@ found=(/usr/lib/petscdir/petsc*/*-real/lib/python3/dist-packages)
 [[ ${#found[@]} -gt 0 ]] || { echo "Found no petsc4py of Debian's." >&2; exit 1; }
 site="$("$folder/bin/python" -c 'import sysconfig; print(sysconfig.get_path("purelib"))')"
 echo "${found[-1]}" > "$site/debian-petsc.pth"
-"$folder/bin/python" -c 'from petsc4py import PETSc; print("PETSc", *PETSc.Sys.getVersion(), "in", "'"$folder"'")'
+"$folder/bin/python" -c 'from dolfinx import __version__ as dolfinx; from petsc4py import PETSc; print("DOLFINx", dolfinx, "PETSc", *PETSc.Sys.getVersion(), "in", "'"$folder"'")'

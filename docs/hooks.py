@@ -46,7 +46,7 @@ def command_line(module: str = "livepde.cli", name: str = "livepde") -> str:
     text = text.replace("* `--help`: Show this message and exit.\n", "")
     text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
     # Examples are words to Typer: a line for each, and as code.
-    example = r"^(.*?)(Example|Replay|Service|Parallel): +(\S.*)$"
+    example = r"^(.*?)(Example|Replay|Service): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
 
 

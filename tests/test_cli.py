@@ -22,7 +22,6 @@ from typer.testing import CliRunner
 import livepde
 from livepde import cli, runs
 from livepde.cases.template import write_template
-from livepde.linalg import using
 from livepde.runs import Check, Outcome, Table
 
 COMMANDS = (
@@ -331,25 +330,6 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     )
     assert call("run", rod, "--out", "begun", "--resume")[0] == 0  # there is none: it begins
     xr.testing.assert_identical(runs.open("begun").dataset, whole)
-
-
-@pytest.mark.long
-def test_a_run_resumed_with_an_engine_says_how_well_it_agrees(rod, here):
-    class Serves:
-        reason = "another program"
-
-        def build(self, function, *args, known):
-            return known
-
-        def solver(self, pattern, *, symmetric):
-            return None
-
-    with using(Serves()):
-        for resumed in (False, True):
-            assert call("run", rod, "--out", "run", "--resume")[0] == 0
-            notes = " ".join(runs.open("run").record["notes"])
-            assert "solved by another program" in notes
-            assert ("not to the last digit" in notes) == resumed
 
 
 @pytest.mark.long

@@ -45,6 +45,8 @@ def test_every_example_is_tested():
         "battery_charge",
         "live_shards",
         "live_shards_ray",
+        "petsc_heat",  # both by test_petsc.py
+        "petsc_reaction",
     }
 
 

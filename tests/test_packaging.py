@@ -153,7 +153,7 @@ def fish(line: str) -> list[str]:
         ("livepde equations ", list(EQUATIONS)),
         ("livepde reproduce seed-ex", ["seed-excited", "seed-excited-noise"]),
         ("livepde citation --format b", ["bibtex"]),
-        ("livepde run case.toml --engine ", ["own", "petsc"]),
+        ("livepde run case.toml --log ", ["text", "json"]),
     ],
 )
 def test_names_are_offered(shell, line, expected):

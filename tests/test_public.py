@@ -35,7 +35,7 @@ DOCUMENTED = (
     ".fem",
     ".linalg",
     ".spaces",
-    ".parallel",
+    ".petsc",
     ".errors",
     ".fleet",
     ".forecast",

@@ -13,11 +13,8 @@ from rich.markup import escape
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
-    EngineName,
-    EngineOption,
     SetOption,
     load_case,
-    with_engine,
 )
 from livepde.cli.printing import (
     CHECK_FAILED,
@@ -34,7 +31,6 @@ __all__ = ["check"]
 MOST_CHANNELS = 40  # rows of the table of channels
 
 
-@with_engine
 def check(
     case: CaseArgument,
     data: Annotated[
@@ -49,7 +45,6 @@ def check(
         bool,
         typer.Option("--advise", help="Tell also where one more point sensor would help most."),
     ] = False,
-    engine: EngineOption = EngineName.own,
 ) -> None:
     """Check a case and its data, and tell what its sensors can identify.
 

@@ -3,39 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import StrEnum
-from functools import wraps
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
-    from livepde.model import Model
     from livepde.runs import Run
 
 __all__ = [
     "CaseArgument",
     "CodeOption",
-    "EngineName",
-    "EngineOption",
     "JsonOption",
     "OutOption",
     "SetOption",
     "load_case",
     "names_in",
     "prepare_again",
-    "with_engine",
 ]
-
-
-class EngineName(StrEnum):
-    """Solvers of large systems."""
-
-    own = "own"
-    petsc = "petsc"
 
 
 JsonOption = Annotated[
@@ -61,13 +48,6 @@ SetOption = Annotated[
         show_default=False,
     ),
 ]
-EngineOption = Annotated[
-    EngineName,
-    typer.Option(
-        help="What solves large systems: one process by itself, or PETSc on all processes that "
-        "mpirun has started."
-    ),
-]
 CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
 
 
@@ -84,13 +64,11 @@ def names_in(place: str) -> Callable[[str], list[str]]:
 
 
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
-    """Read a case with the settings of the command line; other ranks may build its model, too."""
-    from livepde.linalg import in_use
+    """Read a case with the settings of the command line."""
+    from livepde import cases
+    from livepde.cases.settings import parse
 
-    loaded, engine = _load(case, allow_code, settings), in_use()
-    if engine is not None:
-        engine.build(_model, case, allow_code, settings, known=loaded.model)
-    return loaded
+    return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
 def prepare_again(
@@ -114,33 +92,3 @@ def prepare_again(
             raise
         moved = "The case is not where it was run, or has changed: add --data FILE with its data."
         raise RunError(f"{error} {moved}") from error
-
-
-def _load(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
-    from livepde import cases
-    from livepde.cases.settings import parse
-
-    return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
-
-
-def _model(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Model:
-    return _load(case, allow_code, settings).model
-
-
-def with_engine(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command have the engine that its option `engine` names.
-
-    A process that only lends a hand does so until the first one has ended its command.
-    """
-
-    @wraps(command)
-    def wrapped(**options: Any) -> None:
-        if options["engine"] is EngineName.own:
-            return command(**options)
-        from livepde.parallel import petsc
-
-        with petsc() as engine:
-            if engine is not None:
-                command(**options)
-
-    return wrapped

@@ -20,13 +20,10 @@ from livepde.cli.live import Beside, beside
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
-    EngineName,
-    EngineOption,
     JsonOption,
     OutOption,
     SetOption,
     load_case,
-    with_engine,
 )
 from livepde.cli.printing import (
     CHECK_FAILED,
@@ -56,7 +53,6 @@ class LogKind(StrEnum):
     json = "json"
 
 
-@with_engine
 def run(
     case: CaseArgument,
     data: Annotated[
@@ -124,7 +120,6 @@ def run(
         ),
     ] = False,
     log: Annotated[LogKind, typer.Option(help="How a live run writes its log.")] = LogKind.text,
-    engine: EngineOption = EngineName.own,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
@@ -136,7 +131,6 @@ def run(
     Example:  livepde run mycase/case.toml
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
-    Parallel: mpirun -n 4 livepde run mycase/case.toml --engine petsc
     """
     from livepde.runs import free_path
     from livepde.runs.logs import configure
@@ -275,7 +269,6 @@ def concluded(
     draw
         Whether to draw figures.
     """
-    from livepde.linalg import in_use
     from livepde.runs import arrivals, checks_of, input_findings, tables, verdict, verdict_table
     from livepde.runs.outcome import attempted
     from livepde.verdict import Verdict
@@ -300,13 +293,6 @@ def concluded(
     ]
     checks = attempted("The checks", lambda: checks_of(loaded.expected, dataset), nothing, notes)
     notes[:0] = [*loaded.notes, *found.sentences]
-    if (engine := in_use()) is not None:
-        notes.append(f"Large systems were solved by {engine.reason}.")
-        if "resumed" in writer.record:
-            notes.append(
-                "Resumed: the numbers are those of a run that never stopped to the tolerance of "
-                "these solvers, not to the last digit."
-            )
     if len(driven.result):
         notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
         if loaded.smoothed:

@@ -43,7 +43,7 @@ from livepde.stepping import (
 )
 from livepde.verdict import Judge
 
-__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update"]
+__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update", "contraction"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -304,7 +304,7 @@ class Filter:
             Observed square root, (members, r, sensors), and innovations, (members, sensors), in
             units of the noise; zero where no value is.
         """
-        W, half, misfit = _contraction(Y, d)
+        W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
         U, C = Wt @ x.U, Wt @ x.C
         new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
@@ -431,7 +431,7 @@ def _extended(rows: Array, count: int) -> Array:
     return np.concatenate([rows, np.zeros((len(rows), count, rows.shape[2]))], axis=1)
 
 
-def _contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
+def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
     """Return W with W W^T = (I + Y Y^T)^-1, (members, r, r), W^T Y d, and d^T (I + Y^T Y)^-1 d.
 
     R = W^-1, c = W^T Y d and the square root s of the last come as [R c; 0 s] from a QR

@@ -7,7 +7,6 @@ from livepde.linalg.banded import BandedSolver
 from livepde.linalg.blocks import BandedBlocks, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.engine import Engine, in_use, using
 from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.memo import Memo
@@ -26,7 +25,6 @@ __all__ = [
     "BlockFactor",
     "Choice",
     "CholmodSolver",
-    "Engine",
     "Factor",
     "IntArray",
     "Leading",
@@ -44,8 +42,6 @@ __all__ = [
     "compact",
     "conjugate_gradients",
     "gmres",
-    "in_use",
     "positive_definite",
     "sandwich",
-    "using",
 ]

@@ -12,8 +12,7 @@ this size in any dimension:
     beyond                                multigrid
 
 Multigrid serves symmetric positive definite matrices only; others are factorised at any size, by
-Pardiso if it is installed. An engine in use (`livepde.linalg.using`) takes precedence over all but
-banded LU.
+Pardiso if it is installed.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from importlib.util import find_spec
 
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.engine import in_use
 from livepde.linalg.multigrid import MultigridSolver
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern
@@ -70,10 +68,6 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
     wide = f"a band of {band}"
     if band <= WIDEST_BAND:
         return Choice(banded, f"{wide}, at most {WIDEST_BAND}")
-    engine = in_use()
-    solver = engine.solver(pattern, symmetric=symmetric) if engine else None
-    if engine is not None and solver is not None:
-        return Choice(solver, f"{wide}; {engine.reason}")
     superlu = SuperLUSolver(pattern, symmetric)
     if band <= SMALL:
         return Choice(superlu, f"{wide}, at most {SMALL}")

@@ -13,7 +13,6 @@ import scipy  # scipy.optimize is slow to load, and rarely needed
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.blocks import BlockSolver
-from livepde.laws.coupled.distributed import DistributedSolver
 from livepde.laws.coupled.equation import (
     StageData,
     StageIterate,
@@ -125,7 +124,7 @@ class CoupledStage:
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
-        large = DistributedSolver.of(terms) or BlockSolver.of(terms)
+        large = BlockSolver.of(terms)
         self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
         # The metric of the information learns from the residual of a stage, which therefore must
         # not be carried over to the next one.

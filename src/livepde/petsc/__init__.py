@@ -1,0 +1,29 @@
+"""Both laws on PETSc vectors, for one process on many ranks of MPI.
+
+The process comes from a finite-element package that shares its mesh out, by the protocol
+`PetscModel`; `DolfinxModel` is one from UFL. Nothing here loads PETSc when it is imported: that and
+MPI start with the first model.
+"""
+
+from __future__ import annotations
+
+from livepde.petsc.check import check_petsc_model
+from livepde.petsc.checkpoint import load_state, save_state
+from livepde.petsc.dolfinx import DolfinxModel
+from livepde.petsc.filter import PetscFilter, leading_modes, number_modes
+from livepde.petsc.model import PetscModel
+from livepde.petsc.observer import PetscObserver
+from livepde.petsc.step import ImplicitStep
+
+__all__ = [
+    "DolfinxModel",
+    "ImplicitStep",
+    "PetscFilter",
+    "PetscModel",
+    "PetscObserver",
+    "check_petsc_model",
+    "leading_modes",
+    "load_state",
+    "number_modes",
+    "save_state",
+]

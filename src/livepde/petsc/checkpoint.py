@@ -1,0 +1,130 @@
+"""Checkpoints of both laws by MPI-IO, in an order that does not depend on the number of ranks.
+
+A checkpoint is a small file PATH, JSON with the numbers of the state, and a file beside it with its
+vectors, in PETSc's binary format. Each rank writes and reads a contiguous part: nothing is
+gathered. PATH is replaced when the vectors are complete, so that a run that is killed meanwhile
+goes on from the checkpoint before.
+"""
+
+from __future__ import annotations
+
+import json
+import secrets
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.atomic_write import write_bytes
+from livepde.errors import RunError
+from livepde.laws.excitation import ExcitationLevel
+from livepde.linalg import IntArray
+from livepde.petsc.filter import FilterState
+from livepde.petsc.model import PetscModel, petsc_module
+from livepde.petsc.observer import ObserverState
+from livepde.petsc.vectors import zeros
+
+__all__ = ["load_state", "save_state"]
+
+OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
+OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X
+
+
+def save_state(path: Path | str, model: PetscModel, state: FilterState | ObserverState) -> None:
+    """Write a state of `PetscFilter` or `PetscObserver`; all ranks call it."""
+    path, comm = Path(path), state.u.comm.tompi4py()
+    beside = Path(f"{path}.{comm.bcast(secrets.token_hex(4))}.vectors")
+    numbers: dict[str, Any] = {"vectors": beside.name, "kind": type(state).__name__}
+    numbers["sizes"] = _sizes(model)
+    viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
+    for name, value in ((one.name, getattr(state, one.name)) for one in fields(state)):
+        if name in OF_Q + OF_U:
+            parts = value if isinstance(value, tuple) else [] if value is None else [value]
+            for vector in parts:
+                _ordered(vector, model.numbers_q if name in OF_Q else model.numbers_u).view(viewer)
+            numbers[name] = len(parts)
+        elif isinstance(value, ExcitationLevel):
+            numbers[name] = {k: np.asarray(v).tolist() for k, v in asdict(value).items()}
+        else:
+            numbers[name] = np.asarray(value).tolist()
+    viewer.destroy()
+    if comm.rank == 0:
+        old = _read(path)["vectors"] if path.exists() else None
+        write_bytes(path, json.dumps(numbers).encode(), sync=True)
+        for name in () if old is None else (old, f"{old}.info"):
+            (path.parent / name).unlink(missing_ok=True)
+    comm.barrier()
+
+
+def load_state(path: Path | str, model: PetscModel) -> Any:
+    """Return a state that `save_state` wrote, on any number of ranks; all ranks call it.
+
+    Raises
+    ------
+    RunError
+        There is no checkpoint, it is damaged, or it is that of a model of another size.
+    """
+    path = Path(path)
+    numbers = _read(path)
+    if numbers["sizes"] != _sizes(model):
+        raise RunError(
+            f"{path}: written for u and q with {numbers['sizes']} coefficients; this model has "
+            f"{_sizes(model)}: take the mesh of before."
+        )
+    kind: Any = FilterState if numbers["kind"] == "FilterState" else ObserverState
+    u, q = model.mass.createVecRight(), model.gram.createVecRight()
+    beside = str(path.parent / numbers["vectors"])
+    viewer, found = petsc_module().Viewer().createMPIIO(beside, "r", comm=u.comm), {}
+    for name, value in ((one.name, numbers[one.name]) for one in fields(kind)):
+        if name in OF_Q + OF_U:
+            given = (q, model.numbers_q) if name in OF_Q else (u, model.numbers_u)
+            parts = tuple(_loaded(*given, viewer) for _ in range(value))
+            found[name] = parts if name in ("U", "modes") else parts[0] if parts else None
+        else:
+            found[name] = _decoded(value)
+    viewer.destroy()
+    return kind(**found)
+
+
+def _sizes(model: PetscModel) -> list[int]:
+    return [model.mass.getSize()[0], model.gram.getSize()[0]]
+
+
+def _decoded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return ExcitationLevel(**{k: _decoded(v) for k, v in value.items()})
+    return np.array(value) if isinstance(value, list) else value
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found: dict[str, Any] = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RunError(f"{path}: no checkpoint that can be read: {error}") from error
+    return found
+
+
+def _scatter(vector: Any, order: IntArray, ordered: Any) -> Any:
+    PETSc = petsc_module()
+    to = PETSc.IS().createGeneral(order.astype(PETSc.IntType), comm=vector.comm)
+    start, end = vector.getOwnershipRange()
+    own = PETSc.IS().createStride(end - start, first=start, step=1, comm=vector.comm)
+    return PETSc.Scatter().create(vector, own, ordered, to)
+
+
+def _ordered(vector: Any, order: IntArray) -> Any:
+    """Return the values in the order of the numbers, shared out evenly."""
+    ordered = petsc_module().Vec().create(vector.comm)
+    ordered.setSizes(vector.getSize())
+    ordered.setType("standard")
+    _scatter(vector, order, ordered).scatter(vector, ordered)
+    return ordered
+
+
+def _loaded(like: Any, order: IntArray, viewer: Any) -> Any:
+    vector = zeros(like)
+    ordered = _ordered(vector, order)
+    ordered.load(viewer)
+    _scatter(vector, order, ordered).scatter(ordered, vector, mode=True)
+    return vector

@@ -1,0 +1,246 @@
+"""The reduced-order filter on PETSc vectors.
+
+Moireau, Chapelle and Le Tallec (2008), as `livepde.laws.filter` has it for one process. With
+q = q_prior + Phi a, a ~ N(0, I), S the Jacobian of a step, A = dF/dq and P = [U C]^T [U C] the
+joint covariance of u and a,
+
+    predict   one implicit step for u;   S U+_i = M U_i/h - A(u+) Phi C_i        for each row i
+    update    d = z - G u+,  Y = U G^T,  W W^T = (I + Y N^-1 Y^T)^-1
+              [u; a] += [U C]^T W W^T Y N^-1 d,   [U C] <- W^T [U C]
+
+u and the rows of U are PETSc vectors; C, W and Y are small, equal on every rank, and made of sums
+over all ranks alone. A row costs one solve with the operator of the step of u.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import LawError
+from livepde.laws.base import Status
+from livepde.laws.filter import contraction
+from livepde.linalg import Array, IntArray, Mask
+from livepde.petsc.model import PetscModel
+from livepde.petsc.step import ImplicitStep, advance, require_order
+from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
+
+__all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
+
+ACCURATE = 1e-14  # relative change of the variances of modes
+
+
+@dataclass(frozen=True, eq=False)
+class FilterState:
+    """Estimate and square root of the joint covariance after a sample; k unknowns a.
+
+    Attributes
+    ----------
+    u, U
+        State, and k rows of the square root, vectors of shape (n,).
+    a, C
+        Unknowns in prior standard deviations, shape (k,), and their square root, shape (k, k).
+    refused
+        Readings of each sensor that the gate has refused in a row, shape (sensors,).
+    modes
+        The columns of Phi, k vectors of shape (m,): a checkpoint has them.
+    """
+
+    t: float
+    u: Any
+    U: tuple[Any, ...]
+    a: Array
+    C: Array
+    refused: IntArray
+    modes: tuple[Any, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class FilterReport:
+    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used.
+
+    With a status other than "ok" the state is that of before.
+    """
+
+    status: Status
+    innovation: Array
+    expected: Array
+    used: Mask
+
+
+@dataclass(frozen=True, eq=False)
+class PetscFilter:
+    """State and parameter from point sensors or averages, with a covariance.
+
+    Parameters
+    ----------
+    model
+        The process; `sensors` is its observation.
+    prior
+        Prior mean of q, shape (m,).
+    modes
+        The k columns of Phi, vectors of shape (m,): `number_modes` or `leading_modes`.
+    noise
+        Standard deviation of a reading, one number or one for each sensor.
+    lower, upper
+        Bounds of each coefficient of q. An estimate beyond them is projected, and the state follows
+        by its sensitivity.
+    gate
+        Readings further from their prediction than this many expected standard deviations are not
+        used; infinity: all are.
+    patience
+        After so many refusals in a row a sensor is used again: the process has really changed.
+    """
+
+    model: PetscModel
+    prior: Any
+    modes: Sequence[Any]
+    noise: Any
+    lower: float = -np.inf
+    upper: float = np.inf
+    gate: float = 6.0
+    patience: int = 10
+    stepper: ImplicitStep = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        if not len(self.modes):
+            raise LawError("PetscFilter: needs at least one mode: see number_modes, leading_modes.")
+        noise = np.asarray(self.noise, dtype=float)
+        if not (np.isfinite(noise).all() and (noise > 0.0).all()):
+            raise LawError(f"PetscFilter: noise must be positive; got {self.noise}.")
+        require_order("PetscFilter", self.lower, self.upper)
+        object.__setattr__(self, "stepper", ImplicitStep(self.model))
+
+    def init(self, u0: Any, t0: float = 0.0) -> FilterState:
+        """Return the state at the start: u0 is exact, the unknowns have their prior."""
+        k, u = len(self.modes), u0.copy()
+        self.model.impose(u, t0)
+        rows = [zeros(u) for _ in range(k)]
+        none = np.zeros(self.model.sensors.getSize()[0], dtype=int)
+        return FilterState(t0, u, tuple(rows), np.zeros(k), np.eye(k), none, tuple(self.modes))
+
+    def step(self, state: FilterState, t: float, z: Any) -> tuple[FilterState, FilterReport]:
+        """Return the state after a sample z at t, shape (sensors,), NaN where a reading is missing.
+
+        Raises
+        ------
+        LawError
+            z has another shape, or t is not later than the sample before.
+        """
+        z = np.asarray(z, dtype=float)
+        if z.shape != state.refused.shape:
+            raise LawError(f"PetscFilter: z needs shape {state.refused.shape}; got {z.shape}.")
+        if not t > state.t:
+            raise LawError(f"PetscFilter: t must be later than {state.t}; got {t}.")
+        new, status = advance(self.predict, state, state.t, t)
+        if not status.ok:
+            nothing = np.full(z.shape, np.nan)
+            return state, FilterReport(status, nothing, nothing, np.zeros(z.shape, dtype=bool))
+        return self.update(new, z)
+
+    def parameter(self, state: FilterState) -> Any:
+        """Return the estimate of q within its bounds, a new vector."""
+        return self._bounded(combined(state.a, state.modes, self.prior))
+
+    def deviation(self, state: FilterState) -> Any:
+        """Return the standard deviation of each coefficient of q, a new vector."""
+        square = zeros(self.prior)
+        for row in state.C:
+            direction = combined(row, state.modes)
+            square.axpy(1.0, direction * direction)
+        square.sqrtabs()
+        return square
+
+    def predict(self, state: FilterState, t: float, h: float) -> FilterState:
+        """Return the state a step later; raises `StepFailed`."""
+        q = self.parameter(state)
+        u = self.stepper.solve(state.u, q, t, h)
+        A, rows = self.model.jacobian_q(u, q, t + h), []
+        for row, c in zip(state.U, state.C, strict=True):
+            b = self.model.mass * row
+            b.scale(1.0 / h)
+            b.axpy(-1.0, A * combined(c, state.modes))
+            rows.append(self.stepper.back(b))
+        return replace(state, t=t + h, u=u, U=tuple(rows))
+
+    def update(self, state: FilterState, z: Array) -> tuple[FilterState, FilterReport]:
+        """Return the state after the readings of its time."""
+        d = z - self.read(state.u)
+        noise = np.broadcast_to(np.asarray(self.noise, dtype=float), z.shape)
+        Y = np.array([self.read(row) for row in state.U]) / noise
+        expected = noise * np.sqrt(1.0 + (Y**2).sum(axis=0))
+        present = np.isfinite(d)
+        far = present & (np.abs(np.where(present, d, 0.0)) > self.gate * expected)
+        used = present & (~far | (state.refused >= self.patience))
+        (W,), (half,), _ = contraction((Y * used)[None], np.where(used, d / noise, 0.0)[None])
+        U = [combined(W[: i + 1, i], state.U[: i + 1]) for i in range(len(W))]
+        C = W.T @ state.C
+        u, a = combined(half, U, state.u), state.a + half @ C
+        refused = np.where(used, 0, state.refused + far)
+        new = replace(state, u=u, U=tuple(U), a=a, C=C, refused=refused)
+        return self._projected(new), FilterReport(Status(), d, expected, used)
+
+    def read(self, u: Any) -> Array:
+        """Return G u, shape (sensors,), on every rank."""
+        return gathered(self.model.sensors * u)
+
+    def _bounded(self, q: Any) -> Any:
+        values = q.getArray()
+        np.clip(values, self.lower, self.upper, out=values)
+        return q
+
+    def _projected(self, state: FilterState) -> FilterState:
+        """Return the state with an estimate beyond the bounds projected onto them."""
+        if np.isinf(self.lower) and np.isinf(self.upper):
+            return state
+        q = combined(state.a, state.modes, self.prior)
+        excess = self._bounded(q.copy()) - q
+        if excess.norm() == 0.0:
+            return state
+        square = np.array([inner(one, state.modes) for one in state.modes])
+        shift = np.linalg.solve(square, inner(excess, state.modes))
+        weights = np.asarray(np.linalg.solve(state.C.T, shift), dtype=float)
+        return replace(state, u=combined(weights, state.U, state.u), a=state.a + shift)
+
+
+def number_modes(like: Any, std: Any) -> list[Any]:
+    """Return the columns of Phi for numbers, from prior standard deviations, shape (m,)."""
+    start, end = like.getOwnershipRange()
+    found = []
+    for k, value in enumerate(np.broadcast_to(np.asarray(std, dtype=float), like.getSize())):
+        mode = zeros(like)
+        if start <= k < end:
+            mode.getArray()[k - start] = value
+        found.append(mode)
+    return found
+
+
+def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> list[Any]:
+    """Return the leading modes of the prior N(0, G_Q^-1) of a field, as columns of Phi.
+
+    Eigenvectors of M_Q x = lambda G_Q x, largest lambda first, x^T G_Q x = 1, by subspace iteration
+    with twice as many vectors. Their start is the same on every number of ranks. Modes of equal
+    variance, as on a square, and signs may differ from run to run: a state carries its own.
+    """
+    solver = linear_solver(model.gram, 1e-12)
+    like = model.gram.createVecRight()
+    basis = [random_vector(like, model.numbers_q, seed) for seed in range(1, 2 * count + 3)]
+    values = np.zeros(len(basis))
+    for _ in range(iterations):
+        for vector in basis:
+            solver.solve(model.mass_q * vector, vector)
+        G = np.array([inner(model.gram * x, basis) for x in basis])
+        M = np.array([inner(model.mass_q * x, basis) for x in basis])
+        root = np.linalg.cholesky((G + G.T) / 2.0)
+        half = np.linalg.solve(root, np.linalg.solve(root, (M + M.T) / 2.0).T)
+        found, axes = np.linalg.eigh((half + half.T) / 2.0)
+        weights = np.linalg.solve(root.T, axes[:, ::-1])
+        basis = [combined(column, basis) for column in weights.T]
+        settled = np.abs(found[::-1] - values)[:count].max() <= ACCURATE * found[-1]
+        values = found[::-1]
+        if settled:
+            break
+    return basis[:count]
