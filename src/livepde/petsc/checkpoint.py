@@ -60,10 +60,7 @@ def save_state(path: Path | str, model: PetscModel, state: FilterState | Observe
 def load_state(path: Path | str, model: PetscModel) -> Any:
     """Return a state that `save_state` wrote, on any number of ranks; all ranks call it.
 
-    Raises
-    ------
-    RunError
-        There is no checkpoint, it is damaged, or it is that of a model of another size.
+    Raises `RunError` without a checkpoint that can be read, and for a model of another size.
     """
     path = Path(path)
     numbers = _read(path)

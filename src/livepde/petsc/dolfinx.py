@@ -79,12 +79,12 @@ class DolfinxModel:
         trial = ufl.TrialFunction(V)
         weigh: Callable[..., Any] = mass or ufl.inner
         pull, push = M_op or self._h1, N_op or self._h1
-        self.mass = api.matrix_of(weigh(trial, self.v) * ufl.dx)
-        self.mass_observed, self.pull = self.mass, api.matrix_of(pull(trial, self.v) * self.seen)
+        self.mass = api.matrix(weigh(trial, self.v) * ufl.dx)
+        self.mass_observed, self.pull = self.mass, api.matrix(pull(trial, self.v) * self.seen)
         self.push = None
         if omega is not None:
-            self.mass_observed = api.matrix_of(weigh(trial, self.v) * self.seen)
-            self.push = api.matrix_of(push(trial, self.v) * self.rest)
+            self.mass_observed = api.matrix(weigh(trial, self.v) * self.seen)
+            self.push = api.matrix(push(trial, self.v) * self.rest)
         self.gram, self.mass_q = self._inner_products(inner or self._h1)
         self._dirichlet = [(*api.located(V, marker), value) for marker, value in dirichlet]
         rows = [dofs for dofs, _, _ in self._dirichlet]
@@ -209,7 +209,7 @@ class DolfinxModel:
             return eye, eye
         api, ufl = self.api, self.api.ufl
         p, r = ufl.TestFunction(self.Q), ufl.TrialFunction(self.Q)
-        return api.matrix_of(inner(r, p) * ufl.dx), api.matrix_of(ufl.inner(r, p) * ufl.dx)
+        return api.matrix(inner(r, p) * ufl.dx), api.matrix(ufl.inner(r, p) * ufl.dx)
 
     def _at(self, u: Any, q: Any, t: float, w: Any) -> None:
         """Make forms see these values."""
@@ -298,12 +298,9 @@ class Interface:
         self.ufl, self.dolfinx = petsc_module("ufl"), petsc_module("dolfinx")
         self.fem, self.petsc = self.dolfinx.fem, petsc_module("dolfinx.fem.petsc")
 
-    def matrix_of(self, form: Any) -> Any:
-        """Return the matrix of a form."""
-        return self.matrix(self.fem.form(form))
-
     def matrix(self, form: Any, matrix: Any = None) -> Any:
-        """Return the matrix of a compiled form, assembled in place where one is given."""
+        """Return the matrix of a form, assembled in place where one is given."""
+        form = self.fem.form(form)
         if matrix is None:
             matrix = self.petsc.assemble_matrix(form)
         else:
