@@ -21,8 +21,7 @@ def check_petsc_model(
 ) -> CheckReport:
     """Check what the laws rely on, at a point u, q, t, in random directions.
 
-    With data w on omega the model is checked as `PetscObserver` uses it, without as `PetscFilter`
-    does.
+    With data w on omega it is what `PetscObserver` relies on, without what `PetscFilter` does.
     """
     du = random_vector(u, model.numbers_u, seed) * free_mask(u, model.fixed)
     dq = random_vector(q, model.numbers_q, seed + 1)

@@ -61,10 +61,7 @@ class FilterState:
 
 @dataclass(frozen=True, eq=False)
 class FilterReport:
-    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used.
-
-    With a status other than "ok" the state is that of before.
-    """
+    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used."""
 
     status: Status
     innovation: Array
@@ -133,8 +130,8 @@ class PetscFilter:
             raise LawError(f"PetscFilter: t must be later than {state.t}; got {t}.")
         new, status = advance(self.predict, state, state.t, t)
         if not status.ok:
-            nothing = np.full(z.shape, np.nan)
-            return state, FilterReport(status, nothing, nothing, np.zeros(z.shape, dtype=bool))
+            lost = np.full(z.shape, np.nan)
+            return state, FilterReport(status, lost, lost, np.zeros(z.shape, dtype=bool))
         return self.update(new, z)
 
     def parameter(self, state: FilterState) -> Any:

@@ -29,7 +29,8 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
-from livepde.laws.coupled.stage import nearest_root
+from livepde.laws.coupled.equation import STIFFEST
+from livepde.laws.coupled.stage import SMALLEST, nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
@@ -49,10 +50,8 @@ fieldsplit_1_pc_type {multigrid}, fieldsplit_1_mat_schur_complement_ainv_type lu
 ITERATIONS = 120  # of GMRES for one update
 REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
 FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
-STIFFEST = 1e12  # times 1/h, of theta
 HOLD = 1e12  # times the weight of G_Q: then q is held
 SHORTEST = 1e-3  # part of an update that is tried
-SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +72,7 @@ class ObserverState:
 
 @dataclass(frozen=True, eq=False)
 class ObserverReport:
-    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES.
-
-    With a status other than "ok" the state is that of before.
-    """
+    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES."""
 
     status: Status
     held: bool
@@ -332,12 +328,12 @@ class Stage:
 
     def __init__(self, solver: CoupledSolver, y: Any, t: float, h: float, w: Any) -> None:
         self.solver, self.law, self.model = solver, solver.law, solver.model
-        self.begin_u, self.begin_q, self.t, self.h, self.w = *y, t, h, w
+        (self.begin_u, self.begin_q), self.t, self.h, self.w = y, t, h, w
         self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
         self.given: float | None = None  # theta, where it is not the rule's
         self.A_in = self.model.coupling(w, y[1], t)
         # F is then affine in q alone, and evaluated once.
-        self.known = self.model.push is None and self.model.jacobian_u(*y, t, w) is None
+        self.known = self.model.push is None and self.model.jacobian_u(y[0], y[1], t, w) is None
         self.least = RESTING * solver.dual(self.model.mass * y[0], 0) / h
         self.least_q = RESTING * solver.dual(self.model.gram * y[1], 1) * self.weight
         self._start: tuple[Any, Any] | None = None

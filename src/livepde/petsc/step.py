@@ -55,8 +55,7 @@ class ImplicitStep:
     The preconditioner is algebraic multigrid, kept until it needs `REBUILD` times the iterations
     that it took when new. PETSc's options with the prefix `livepde_state_` replace both.
 
-    `tolerance` bounds the residual, in the dual norm weighed by the diagonal of M, relative to the
-    terms of the equation; `accuracy` is that of the linear solver, `iterations` bounds the updates.
+    `tolerance` bounds the residual relative to its terms, in the dual norm by the diagonal of M.
     """
 
     model: PetscModel

@@ -32,8 +32,7 @@ def inner(x: Any, vectors: Sequence[Any]) -> Array:
 
 def gathered(small: Any) -> Array:
     """Return all values of a small vector, such as readings, on every rank."""
-    counts = small.comm.tompi4py().allgather(small.getArray(readonly=True).copy())
-    return np.concatenate(counts)
+    return np.concatenate(small.comm.tompi4py().allgather(small.getArray(readonly=True).copy()))
 
 
 def free_mask(x: Any, fixed: IntArray) -> Any:
