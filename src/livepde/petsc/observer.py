@@ -162,10 +162,8 @@ class CoupledSolver:
         self.weights = mass.getDiagonal(), gram.getDiagonal()
         for diagonal in self.weights:
             diagonal.reciprocal()
-        # A mask of owned coefficients of u without a part in omega.
         self.unseen = self.model.mass_observed.getDiagonal().getArray() <= 0.0
         self.ksp: Any = None
-        # Of a sample: times and data at both ends, rates, whether q is held, and work so far.
         self.path: tuple[float, Any, float, Any]
         self.rates: tuple[Any, Any]
         self.held, self.updates, self.iterations = False, 0, 0
@@ -188,6 +186,8 @@ class CoupledSolver:
             return self._newton(stage, u.copy(), q.copy())
         except StepFailed:
             return self._by_theta(stage, u, q)
+        finally:  # its norms refer to it: cycles would be collected at other times on other ranks
+            vars(stage).clear()
 
     def _newton(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
         """Return the solution, from a start that is overwritten; raises `StepFailed`."""
