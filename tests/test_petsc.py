@@ -192,7 +192,7 @@ def test_checks_pass_and_find_a_wrong_derivative(found):
         ("filter bounds", "LawError: PetscFilter: lower must be less than upper; got 1.0 and 0.0."),
         ("z", "LawError: PetscFilter: z needs shape (3,); got (1,)."),
         ("time", "LawError: PetscFilter: t must be later than 0.0; got 0.0."),
-        ("gain", "LawError: PetscObserver: gain must be a positive number; got 0.0."),
+        ("gain", "LawError: PetscObserver: gain must be a number > 0; got 0.0."),
         ("nu", "LawError: PetscObserver: nu must be a number >= 0; got -1.0."),
         ("bounds", "LawError: PetscObserver: lower must be less than upper; got 1.0 and 0.0."),
         ("sample time", "LawError: PetscObserver: t must be later than 0.0; got 0.0."),

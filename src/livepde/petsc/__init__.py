@@ -1,8 +1,7 @@
 """Both laws on PETSc vectors, for one process on many ranks of MPI.
 
 The process comes from a finite-element package that shares its mesh out, by the protocol
-`PetscModel`; `DolfinxModel` is one from UFL. Nothing here loads PETSc when it is imported: that and
-MPI start with the first model.
+`PetscModel`; `DolfinxModel` is one from UFL. PETSc and MPI start with the first model.
 """
 
 from __future__ import annotations

@@ -21,8 +21,7 @@ def check_petsc_model(
 ) -> CheckReport:
     """Check what the laws rely on, at a point u, q, t, in random directions.
 
-    With data w on omega the model is checked as `PetscObserver` uses it, without as `PetscFilter`
-    does.
+    With data w on omega it is what `PetscObserver` relies on, without what `PetscFilter` does.
     """
     du = random_vector(u, model.numbers_u, seed) * free_mask(u, model.fixed)
     dq = random_vector(q, model.numbers_q, seed + 1)
@@ -40,13 +39,10 @@ def check_petsc_model(
     found = [
         ("dF/du as differences", _apart(by_u / (2.0 * STEP), slope), CLOSE, wrong),
         ("dF/dq as differences", _apart(by_q / (2.0 * STEP), driven), CLOSE, wrong),
-        (
-            "(A q, v) = (q, A^T v)",
-            abs(driven.dot(v) - dq.dot(back)) / (size or 1.0),
-            ROUNDING,
-            "multTranspose has to be the transpose of mult.",
-        ),
     ]
+    odd = abs(driven.dot(v) - dq.dot(back)) / (size or 1.0)
+    transposed = "multTranspose has to be the transpose of mult."
+    found.append(("(A q, v) = (q, A^T v)", odd, ROUNDING, transposed))
     named = (("M", model.mass, du, v), ("M_op", model.pull, du, v), ("G_Q", model.gram, dq, back))
     for name, matrix, a, b in named:
         size = (matrix * a).norm() * b.norm() or 1.0

@@ -1,9 +1,8 @@
 """Checkpoints of both laws by MPI-IO, in an order that does not depend on the number of ranks.
 
 A checkpoint is a small file PATH, JSON with the numbers of the state, and a file beside it with its
-vectors, in PETSc's binary format. Each rank writes and reads a contiguous part: nothing is
-gathered. PATH is replaced when the vectors are complete, so that a run that is killed meanwhile
-goes on from the checkpoint before.
+vectors, in PETSc's binary format: each rank writes and reads a contiguous part. PATH is replaced
+when the vectors are complete: a run that is killed meanwhile goes on from the checkpoint before.
 """
 
 from __future__ import annotations
@@ -60,10 +59,7 @@ def save_state(path: Path | str, model: PetscModel, state: FilterState | Observe
 def load_state(path: Path | str, model: PetscModel) -> Any:
     """Return a state that `save_state` wrote, on any number of ranks; all ranks call it.
 
-    Raises
-    ------
-    RunError
-        There is no checkpoint, it is damaged, or it is that of a model of another size.
+    Raises `RunError` without a checkpoint that can be read, and for a model of another size.
     """
     path = Path(path)
     numbers = _read(path)

@@ -36,8 +36,7 @@ class DolfinxModel:
     boundary
         Integrand of F over the boundary, with the same arguments; it sees the estimate, never data.
     mass, inner
-        Integrands (u, v) of M and (p, q) of the inner product of Q; default u v and
-        p q + grad p . grad q.
+        Integrands (u, v) of M and (p, q) of G_Q; default u v and p q + grad p . grad q.
     dirichlet
         Pairs of a marker, coordinates (3, points) -> booleans, and a value, (x, t) -> numbers.
     sensors
@@ -79,18 +78,17 @@ class DolfinxModel:
         trial = ufl.TrialFunction(V)
         weigh: Callable[..., Any] = mass or ufl.inner
         pull, push = M_op or self._h1, N_op or self._h1
-        self.mass = api.matrix_of(weigh(trial, self.v) * ufl.dx)
-        self.mass_observed, self.pull = self.mass, api.matrix_of(pull(trial, self.v) * self.seen)
-        self.push = None
+        self.mass = api.matrix(weigh(trial, self.v) * ufl.dx)
+        self.mass_observed, self.push = self.mass, None
+        self.pull = api.matrix(pull(trial, self.v) * self.seen)
         if omega is not None:
-            self.mass_observed = api.matrix_of(weigh(trial, self.v) * self.seen)
-            self.push = api.matrix_of(push(trial, self.v) * self.rest)
+            self.mass_observed = api.matrix(weigh(trial, self.v) * self.seen)
+            self.push = api.matrix(push(trial, self.v) * self.rest)
         self.gram, self.mass_q = self._inner_products(inner or self._h1)
         self._dirichlet = [(*api.located(V, marker), value) for marker, value in dirichlet]
-        rows = [dofs for dofs, _, _ in self._dirichlet]
-        start = self.create_u().getOwnershipRange()[0]
-        owned = np.unique(np.concatenate([*rows, np.zeros(0, dtype=int)]))
-        self.fixed: IntArray = (start + owned).astype(petsc_module().IntType)
+        rows = [np.zeros(0, dtype=int), *(dofs for dofs, _, _ in self._dirichlet)]
+        owned = self.create_u().getOwnershipRange()[0] + np.unique(np.concatenate(rows))
+        self.fixed: IntArray = owned.astype(petsc_module().IntType)
         self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
         self._forms: dict[tuple[str, bool], Any] = {}
         self._matrices: dict[tuple[str, bool], Any] = {}
@@ -103,16 +101,14 @@ class DolfinxModel:
 
     def create_q(self) -> Any:
         """Return a zero vector of Q; numbers lie on rank 0."""
-        if self.numbers:
-            first = self.mesh.comm.rank == 0
-            return standard_vector(self.mesh.comm, len(self.numbers) if first else 0)
-        return standard_vector(self.mesh.comm, self.api.owned(self.Q))
+        comm, count = self.mesh.comm, len(self.numbers)
+        return standard_vector(comm, count * (comm.rank == 0) if count else self.api.owned(self.Q))
 
     def interpolate(self, function: Callable[[Array], Any], space: Any = None) -> Any:
         """Return the coefficients of a function of coordinates (3, points) in V, or in Q."""
         f = self.api.fem.Function(space or self.V)
         f.interpolate(lambda x: np.broadcast_to(function(x), x.shape[1]).astype(float))
-        vector = standard_vector(self.mesh.comm, self.api.owned(space or self.V))
+        vector = self.create_u() if space is None else self.create_q()
         vector.getArray()[:] = f.x.array[: vector.getLocalSize()]
         return vector
 
@@ -209,7 +205,7 @@ class DolfinxModel:
             return eye, eye
         api, ufl = self.api, self.api.ufl
         p, r = ufl.TestFunction(self.Q), ufl.TrialFunction(self.Q)
-        return api.matrix_of(inner(r, p) * ufl.dx), api.matrix_of(ufl.inner(r, p) * ufl.dx)
+        return api.matrix(inner(r, p) * ufl.dx), api.matrix(ufl.inner(r, p) * ufl.dx)
 
     def _at(self, u: Any, q: Any, t: float, w: Any) -> None:
         """Make forms see these values."""
@@ -298,12 +294,9 @@ class Interface:
         self.ufl, self.dolfinx = petsc_module("ufl"), petsc_module("dolfinx")
         self.fem, self.petsc = self.dolfinx.fem, petsc_module("dolfinx.fem.petsc")
 
-    def matrix_of(self, form: Any) -> Any:
-        """Return the matrix of a form."""
-        return self.matrix(self.fem.form(form))
-
     def matrix(self, form: Any, matrix: Any = None) -> Any:
-        """Return the matrix of a compiled form, assembled in place where one is given."""
+        """Return the matrix of a form, assembled in place where one is given."""
+        form = self.fem.form(form)
         if matrix is None:
             matrix = self.petsc.assemble_matrix(form)
         else:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import eigh
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
@@ -60,10 +61,7 @@ class FilterState:
 
 @dataclass(frozen=True, eq=False)
 class FilterReport:
-    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used.
-
-    With a status other than "ok" the state is that of before.
-    """
+    """Status of a sample, and of shape (sensors,) z - G u, its expected size, and what was used."""
 
     status: Status
     innovation: Array
@@ -88,11 +86,9 @@ class PetscFilter:
     lower, upper
         Bounds of each coefficient of q. An estimate beyond them is projected, and the state follows
         by its sensitivity.
-    gate
-        Readings further from their prediction than this many expected standard deviations are not
-        used; infinity: all are.
-    patience
-        After so many refusals in a row a sensor is used again: the process has really changed.
+    gate, patience
+        Readings further from their prediction than `gate` expected standard deviations are not
+        used, unless so many in a row were refused: then the process has really changed.
     """
 
     model: PetscModel
@@ -125,10 +121,7 @@ class PetscFilter:
     def step(self, state: FilterState, t: float, z: Any) -> tuple[FilterState, FilterReport]:
         """Return the state after a sample z at t, shape (sensors,), NaN where a reading is missing.
 
-        Raises
-        ------
-        LawError
-            z has another shape, or t is not later than the sample before.
+        Raises `LawError` if z has another shape, or t is not later than the sample before.
         """
         z = np.asarray(z, dtype=float)
         if z.shape != state.refused.shape:
@@ -137,8 +130,8 @@ class PetscFilter:
             raise LawError(f"PetscFilter: t must be later than {state.t}; got {t}.")
         new, status = advance(self.predict, state, state.t, t)
         if not status.ok:
-            nothing = np.full(z.shape, np.nan)
-            return state, FilterReport(status, nothing, nothing, np.zeros(z.shape, dtype=bool))
+            lost = np.full(z.shape, np.nan)
+            return state, FilterReport(status, lost, lost, np.zeros(z.shape, dtype=bool))
         return self.update(new, z)
 
     def parameter(self, state: FilterState) -> Any:
@@ -234,11 +227,8 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
             solver.solve(model.mass_q * vector, vector)
         G = np.array([inner(model.gram * x, basis) for x in basis])
         M = np.array([inner(model.mass_q * x, basis) for x in basis])
-        root = np.linalg.cholesky((G + G.T) / 2.0)
-        half = np.linalg.solve(root, np.linalg.solve(root, (M + M.T) / 2.0).T)
-        found, axes = np.linalg.eigh((half + half.T) / 2.0)
-        weights = np.linalg.solve(root.T, axes[:, ::-1])
-        basis = [combined(column, basis) for column in weights.T]
+        found, axes = eigh((M + M.T) / 2.0, (G + G.T) / 2.0)
+        basis = [combined(column, basis) for column in axes.T[::-1]]
         settled = np.abs(found[::-1] - values)[:count].max() <= ACCURATE * found[-1]
         values = found[::-1]
         if settled:

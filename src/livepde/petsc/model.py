@@ -43,10 +43,8 @@ class PetscModel(Protocol):
     ----------
     mass
         M, assembled, shape (n, n); symmetric positive definite.
-    gram
-        G_Q, the inner product of Q, assembled, shape (m, m).
-    mass_q
-        L2 inner product of Q, shape (m, m), for the modes of a field.
+    gram, mass_q
+        G_Q, the inner product of Q, assembled, and that of L2, for modes; shape (m, m).
     sensors
         G of point sensors or averages, shape (sensors, n).
     mass_observed, pull

@@ -22,13 +22,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
-from livepde.laws.coupled.stage import nearest_root
+from livepde.laws.coupled.equation import STIFFEST
+from livepde.laws.coupled.stage import SMALLEST, nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
 from livepde.petsc.model import PetscModel, petsc_module
@@ -48,10 +50,8 @@ fieldsplit_1_pc_type {multigrid}, fieldsplit_1_mat_schur_complement_ainv_type lu
 ITERATIONS = 120  # of GMRES for one update
 REBUILD = 2.0  # times the iterations with a new preconditioner: then it is built again
 FORCING = 1e-2  # relative accuracy of an update: Newton goes on from there
-STIFFEST = 1e12  # times 1/h, of theta
 HOLD = 1e12  # times the weight of G_Q: then q is held
 SHORTEST = 1e-3  # part of an update that is tried
-SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,10 +72,7 @@ class ObserverState:
 
 @dataclass(frozen=True, eq=False)
 class ObserverReport:
-    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES.
-
-    With a status other than "ok" the state is that of before.
-    """
+    """Status of a sample, whether the gate held q, Newton's updates and iterations of GMRES."""
 
     status: Status
     held: bool
@@ -91,21 +88,13 @@ class PetscObserver:
     ----------
     model
         The process; F has to be affine in q.
-    gain
-        Scale of the inner product of Q, > 0.
-    damping
-        Rule for theta = mu/||r||_V~.
-    nu, sigma
-        Weight of P N P u, and stabilising term of (noisy_q), >= 0.
+    gain, damping, nu, sigma, gate
+        As for `GradientLaw`.
     lower, upper
         Bounds of each coefficient of q.
-    gate
-        When q is held, because nothing excites it but noise; None: never.
-    tolerance
+    tolerance, iterations
         Bound on the residual of both lines, in dual norms weighed by the diagonals of M and G_Q,
-        relative to their terms.
-    iterations
-        Maximum number of Newton's updates in a step.
+        relative to their terms; maximum number of Newton's updates in a step.
     """
 
     model: PetscModel
@@ -121,12 +110,11 @@ class PetscObserver:
     solver: CoupledSolver = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.gain) and self.gain > 0):
-            raise LawError(f"PetscObserver: gain must be a positive number; got {self.gain}.")
-        for name in ("nu", "sigma"):
+        for name, low in (("gain", TINY), ("nu", 0.0), ("sigma", 0.0)):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
-                raise LawError(f"PetscObserver: {name} must be a number >= 0; got {value}.")
+            if not (np.isfinite(value) and value >= low):
+                kind = ">" if low else ">="
+                raise LawError(f"PetscObserver: {name} must be a number {kind} 0; got {value}.")
         require_order("PetscObserver", self.lower, self.upper)
         object.__setattr__(self, "solver", CoupledSolver(self))
 
@@ -140,13 +128,7 @@ class PetscObserver:
     def step(
         self, state: ObserverState, t: float, u_alpha: Any
     ) -> tuple[ObserverState, ObserverReport]:
-        """Return the state after a sample: u_alpha at t, its values outside of omega unused.
-
-        Raises
-        ------
-        LawError
-            t is not later than the sample before.
-        """
+        """Return the state after a sample: u_alpha at t, its values outside of omega unused."""
         if not t > state.t:
             raise LawError(f"PetscObserver: t must be later than {state.t}; got {t}.")
         solver, data = self.solver, u_alpha.copy()
@@ -154,7 +136,8 @@ class PetscObserver:
         self.model.impose(data, t)
         old = data if state.u_alpha is None else state.u_alpha
         held = self.gate is not None and self.gate.closed(state.excitation)
-        solver.begin((state.t, old, t, data), (state.rate_u, state.rate_q), held)
+        solver.path, solver.rates = (state.t, old, t, data), (state.rate_u, state.rate_q)
+        solver.held, solver.updates, solver.iterations = held, 0, 0
         (u, q), status = advance(solver.solve, (state.u, state.q), state.t, t)
         report = ObserverReport(status, held, solver.updates, solver.iterations)
         if not status.ok:
@@ -179,18 +162,14 @@ class CoupledSolver:
         self.weights = mass.getDiagonal(), gram.getDiagonal()
         for diagonal in self.weights:
             diagonal.reciprocal()
-        # A mask of owned coefficients of u without a part in omega.
         self.unseen = self.model.mass_observed.getDiagonal().getArray() <= 0.0
         self.ksp: Any = None
-        self.updates = self.iterations = 0
+        self.path: tuple[float, Any, float, Any]
+        self.rates: tuple[Any, Any]
+        self.held, self.updates, self.iterations = False, 0, 0
         self._best, self._slow, self._width = 0.0, False, 0.0  # iterations for a digit, and step
         self._pairs: list[tuple[Any, Any]] = []
         self._tests: tuple[Any, Any] | None = None
-
-    def begin(self, path: tuple[float, Any, float, Any], rates: Any, held: bool) -> None:
-        """Begin a sample: times and data at both ends, rates, and whether q is held."""
-        self.path, self.rates, self.held = path, rates, held
-        self.updates = self.iterations = 0
 
     def data(self, t: float) -> Any:
         """Return u_alpha at a time within the interval, interpolated."""
@@ -207,6 +186,8 @@ class CoupledSolver:
             return self._newton(stage, u.copy(), q.copy())
         except StepFailed:
             return self._by_theta(stage, u, q)
+        finally:  # its norms refer to it: cycles would be collected at other times on other ranks
+            vars(stage).clear()
 
     def _newton(self, stage: Stage, u: Any, q: Any) -> tuple[Any, Any]:
         """Return the solution, from a start that is overwritten; raises `StepFailed`."""
@@ -215,19 +196,19 @@ class CoupledSolver:
             if found <= self.law.tolerance:
                 return u, q
             du, dq = self._update(stage, found)
-            before, part = found, 1.0
+            before, sizes, part = found, stage.sizes, 1.0
             u.axpy(-1.0, du)
             q.axpy(-1.0, dq)
             found = stage.evaluate(u, q)
             # A sufficient decrease proportional to the step (Armijo), else half of the update.
-            while not found <= (1.0 - 0.1 * part) * before and part > SHORTEST:
+            while not stage.relative(sizes) <= (1.0 - 0.1 * part) * before and part > SHORTEST:
                 part *= 0.5
                 u.axpy(part, du)
                 q.axpy(part, dq)
                 found = stage.evaluate(u, q)
             if not math.isfinite(found):
                 raise StepFailed("not_finite", "the iteration left the range of finite numbers")
-            if found >= before:
+            if stage.relative(sizes) >= before:
                 break
         if found <= self.law.tolerance:
             return u, q
@@ -345,19 +326,16 @@ class Stage:
     weight; the border is (b, a).
     """
 
-    def __init__(
-        self, solver: CoupledSolver, y: tuple[Any, Any], t: float, h: float, w: Any
-    ) -> None:
+    def __init__(self, solver: CoupledSolver, y: Any, t: float, h: float, w: Any) -> None:
         self.solver, self.law, self.model = solver, solver.law, solver.model
-        self.begin_u, self.begin_q, self.t, self.h, self.w = *y, t, h, w
+        (self.begin_u, self.begin_q), self.t, self.h, self.w = y, t, h, w
         self.weight = (1.0 / h + self.law.sigma) / self.law.gain * (HOLD if solver.held else 1.0)
         self.given: float | None = None  # theta, where it is not the rule's
         self.A_in = self.model.coupling(w, y[1], t)
         # F is then affine in q alone, and evaluated once.
-        self.known = self.model.push is None and self.model.jacobian_u(*y, t, w) is None
+        self.known = self.model.push is None and self.model.jacobian_u(y[0], y[1], t, w) is None
         self.least = RESTING * solver.dual(self.model.mass * y[0], 0) / h
         self.least_q = RESTING * solver.dual(self.model.gram * y[1], 1) * self.weight
-        self._observed: Residual | None = None
         self._start: tuple[Any, Any] | None = None
 
     def evaluate(self, u: Any, q: Any) -> float:
@@ -366,7 +344,7 @@ class Stage:
         self.at = u, q
         r = (u - self.w) * free
         self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
-        self.norms = Residual(*self.squares(r, mass_r, Mr), self.seen)
+        self.norms = Residual(*self.squares(r, mass_r, Mr), lambda: self.seen)
         self.theta = self.rule() if self.given is None else self.given
         terms = model.mass * ((u - self.begin_u) / self.h), self.force(u, q), Mr * self.theta
         self.first = (terms[0] + terms[1] + terms[2]) * free
@@ -376,8 +354,13 @@ class Stage:
         drift = 0.0 if self.solver.held else law.sigma / law.gain
         change = model.gram * ((q - self.begin_q) * self.weight + self.begin_q * drift)
         self.second = change - back
-        size_q = max(self.least_q, TINY, dual(change, 1), dual(back, 1))
-        return max(dual(self.first, 0) / size, dual(self.second, 1) / size_q)
+        self.sizes = size, max(self.least_q, TINY, dual(change, 1), dual(back, 1))
+        return self.relative(self.sizes)
+
+    def relative(self, sizes: tuple[float, float]) -> float:
+        """Return the larger residual of both lines, relative to sizes of their terms."""
+        dual = self.solver.dual
+        return max(dual(self.first, 0) / sizes[0], dual(self.second, 1) / sizes[1])
 
     def rule(self) -> float:
         """Return theta of the damping rule at the last iterate."""
@@ -394,13 +377,11 @@ class Stage:
             force.axpy(self.law.nu, self.model.push * u)
         return force
 
+    @cached_property
     def seen(self) -> Residual:
-        """Return the norms of u_alpha."""
-        if self._observed is None:
-            z = self.w * self.solver.free
-            pulled, weighed = self.model.pull * z, self.model.mass_observed * z
-            self._observed = Residual(*self.squares(z, weighed, pulled))
-        return self._observed
+        """Norms of u_alpha."""
+        z = self.w * self.solver.free
+        return Residual(*self.squares(z, self.model.mass_observed * z, self.model.pull * z))
 
     def squares(self, r: Any, Mr: Any, pulled: Any) -> tuple[float, float, Callable[[], float]]:
         """Return the squared norms of r in X, VX~ and V~, the last as a function."""

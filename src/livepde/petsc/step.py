@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from livepde.errors import LawError
 from livepde.laws.base import Status
@@ -22,12 +22,8 @@ REBUILD = 1.5  # times the iterations with a new preconditioner: then it is buil
 PREFIX = "livepde_state_"
 SHORTEST = 64  # steps that an interval is divided into at the most
 
-State = TypeVar("State")
 
-
-def advance(
-    stage: Callable[[State, float, float], State], state: State, t0: float, t1: float
-) -> tuple[State, Status]:
+def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tuple[Any, Status]:
     """Return the state at t1 by stages over [t, t + h], halved where one fails, and a status.
 
     With a status other than "ok" the state is that of t0.
@@ -59,8 +55,7 @@ class ImplicitStep:
     The preconditioner is algebraic multigrid, kept until it needs `REBUILD` times the iterations
     that it took when new. PETSc's options with the prefix `livepde_state_` replace both.
 
-    `tolerance` bounds the residual, in the dual norm weighed by the diagonal of M, relative to the
-    terms of the equation; `accuracy` is that of the linear solver, `iterations` bounds the updates.
+    `tolerance` bounds the residual relative to its terms, in the dual norm by the diagonal of M.
     """
 
     model: PetscModel
@@ -95,9 +90,8 @@ class ImplicitStep:
             if count and found <= self.tolerance:
                 break
             if count == self.iterations:
-                raise StepFailed(
-                    "not_converged", f"{count} updates left a relative residual of {found:.1e}"
-                )
+                left = f"{count} updates left a relative residual of {found:.1e}"
+                raise StepFailed("not_converged", left)
             if stale:
                 self.linearise(u, q, t + h, h)
                 stale = not model.linear

@@ -12,6 +12,8 @@ from livepde.petsc.model import petsc_module
 
 __all__ = ["combined", "gathered", "inner", "linear_solver", "multigrid", "random_vector"]
 
+RIESZ = "livepde_riesz_"  # prefix of PETSc's options
+
 
 def combined(weights: Array, vectors: Sequence[Any], onto: Any = None) -> Any:
     """Return the weighted sum of vectors, plus `onto`, as a new vector."""
@@ -30,8 +32,7 @@ def inner(x: Any, vectors: Sequence[Any]) -> Array:
 
 def gathered(small: Any) -> Array:
     """Return all values of a small vector, such as readings, on every rank."""
-    counts = small.comm.tompi4py().allgather(small.getArray(readonly=True).copy())
-    return np.concatenate(counts)
+    return np.concatenate(small.comm.tompi4py().allgather(small.getArray(readonly=True).copy()))
 
 
 def free_mask(x: Any, fixed: IntArray) -> Any:
@@ -60,9 +61,7 @@ def zeros(like: Any) -> Any:
     return vector
 
 
-def linear_solver(
-    matrix: Any, accuracy: float, kind: str = "cg", prefix: str = "livepde_riesz_"
-) -> Any:
+def linear_solver(matrix: Any, accuracy: float, kind: str = "cg", prefix: str = RIESZ) -> Any:
     """Return a solver with algebraic multigrid, which PETSc's options with the prefix change."""
     solver = petsc_module().KSP().create(matrix.comm)
     solver.setOptionsPrefix(prefix)

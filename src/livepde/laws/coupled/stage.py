@@ -124,8 +124,7 @@ class CoupledStage:
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
         self.terms = terms
-        large = BlockSolver.of(terms)
-        self.solver = large or BilinearSolver.of(terms) or MonolithicSolver(terms)
+        self.solver = BlockSolver.of(terms) or BilinearSolver.of(terms) or MonolithicSolver(terms)
         # The metric of the information learns from the residual of a stage, which therefore must
         # not be carried over to the next one.
         learns = terms.memory is not None
