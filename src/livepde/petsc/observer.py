@@ -342,6 +342,7 @@ class Stage:
         """Evaluate the residual of both lines and return its relative size."""
         model, law, dual, free = self.model, self.law, self.solver.dual, self.solver.free
         self.at = u, q
+        petsc_module().garbage_cleanup(u.comm)  # vectors that all ranks have dropped
         r = (u - self.w) * free
         self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
         self.norms = Residual(*self.squares(r, mass_r, Mr), lambda: self.seen)
@@ -359,8 +360,8 @@ class Stage:
 
     def relative(self, sizes: tuple[float, float]) -> float:
         """Return the larger residual of both lines, relative to sizes of their terms."""
-        dual = self.solver.dual
-        return max(dual(self.first, 0) / sizes[0], dual(self.second, 1) / sizes[1])
+        pairs = zip((self.first, self.second), (0, 1), sizes, strict=True)
+        return max(self.solver.dual(line, k) / size for line, k, size in pairs)
 
     def rule(self) -> float:
         """Return theta of the damping rule at the last iterate."""

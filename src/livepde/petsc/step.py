@@ -66,9 +66,9 @@ class ImplicitStep:
     def __post_init__(self) -> None:
         mass = self.model.mass
         self.free = free_mask(mass.createVecRight(), self.model.fixed)
+        self.ksp: Any = None
         self.weights = mass.getDiagonal()
         self.weights.reciprocal()
-        self.ksp: Any = None
         self._best, self._last, self._width = 0, 0, 0.0
 
     def solve(self, u: Any, q: Any, t: float, h: float) -> Any:
@@ -124,6 +124,7 @@ class ImplicitStep:
 
     def back(self, b: Any) -> Any:
         """Return S^{-1} b, zero at fixed coefficients; raises `StepFailed`."""
+        petsc_module().garbage_cleanup(b.comm)  # vectors that all ranks have dropped
         x = b.duplicate()
         self.ksp.solve(b * self.free, x)
         reason, self._last = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
