@@ -13,6 +13,9 @@ from broker import MOSQUITTO, Server
 
 PROJECT = Path(__file__).resolve().parents[1]
 
+# A program of test_petsc.py, which imports DOLFINx: no module with doctests.
+collect_ignore = ["petsc_ranks.py"]
+
 if find_spec("hypothesis"):
     from hypothesis import HealthCheck, settings
 
