@@ -18,7 +18,8 @@ PYTHON ?= python3
 # The tiers of the tests, by the markers of pyproject.toml.
 PYTEST := pytest --numprocesses auto --maxprocesses 8 --dist worksteal
 USERS := -m "not (long or study or process or broker or browser or pages)"
-SYSTEM := -m "not study and (long or process or broker or browser or pages)"
+SYSTEM := -m "not (long or study) and (process or broker or browser or pages)"
+LONG := -m "long and not study"
 FAST := -m "not (slow or long or study or process or broker or browser or pages)"
 # With other versions: the fast ones, and those of what brokers are spoken to with.
 OTHERS := -m "not (slow or long or study or process or browser or pages)"
@@ -32,7 +33,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-fast test-system test-all coverage mpi lowest versions package check format docs bench lock clean
+.PHONY: help demo test test-fast test-system test-long test-all coverage mpi lowest versions package check format docs bench lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
@@ -48,8 +49,11 @@ test: $(READY)  ## Run the tests of what users rely on, and the doctests
 test-fast: $(READY)  ## Run those that take a fraction of a second each
 	@$(BIN)/$(PYTEST) $(FAST)
 
-test-system: $(READY)  ## Run the long ones, and those with programs of their own, brokers, browsers, pages
+test-system: $(READY)  ## Run those with programs of their own, brokers, browsers and pages
 	@$(BIN)/$(PYTEST) $(SYSTEM)
+
+test-long: $(READY)  ## Run those that take several seconds each
+	@$(BIN)/$(PYTEST) $(LONG)
 
 test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too
 	@$(BIN)/$(PYTEST)
