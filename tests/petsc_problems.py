@@ -45,8 +45,8 @@ def numbers():
     return lp.Model(
         state=lp.Field(mesh(), lp.linear(mesh()), dirichlet={"left": 2.0}),
         parameter={
-            name: lp.Scalar(prior, std=std)
-            for name, prior, std in zip(("k", "s"), PRIOR, STD, strict=True)
+            name: lp.Normal(mean, std)
+            for name, mean, std in zip(("k", "s"), PRIOR, STD, strict=True)
         },
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.s * u * v,
         B=[lp.On(side, lambda u, v, x: 0.5 * (u - 1.0) * v) for side in ("right", "bottom", "top")],
@@ -57,7 +57,7 @@ def numbers():
 def reaction():
     return lp.Model(
         state=lp.Field(mesh(), lp.linear(mesh()), dirichlet={"left": 2.0}),
-        parameter=lp.Field(mesh(), lp.linear(mesh()), inner="H1", prior=1.0),
+        parameter=lp.Field(mesh(), lp.linear(mesh()), inner="H1", prior=lp.Normal(1.0)),
         A=lambda q, u, v, x: q * u * v,
         B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
         f=lambda x, t: 10.0 * (1.0 + x[0]),
