@@ -259,7 +259,7 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
     alarms = []
     for k in range(1, count + 1):
         estimate = identifier.step(data.times[k], data.z[k])
-        if estimate.notes.get("jump"):
+        if estimate.diagnostics.jump > 0.0:
             alarms.append(k)
     late = [k - at for k in alarms if k > at]
     truth = ((1.0 + change) * data.q)[process.where]

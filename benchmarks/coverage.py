@@ -32,7 +32,7 @@ from livepde.fem import (
 )
 from livepde.fem import interval as line
 from livepde.identifier import Identifier
-from livepde.laws import Belief, Replay, SensitivityLaw
+from livepde.laws import Belief, Diagnostics, Replay, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
@@ -264,13 +264,13 @@ def twin(problem: Problem, seed: int) -> Twin:
         {level: _mean([one[level] for one in inside]) for level in LEVELS},
         _mean(errors),
         unexplained(result.to_xarray()),
-        _white(samples[-1].notes, problem.samples * len(problem.sensors)),
+        _white(samples[-1].diagnostics, problem.samples * len(problem.sensors)),
     )
 
 
-def _white(notes: Mapping[str, float], values: int) -> tuple[bool, bool]:
+def _white(found: Diagnostics[float], values: int) -> tuple[bool, bool]:
     """Return whether statistics of so many normalised innovations are those of white noise."""
-    square, correlation = notes["innovation_ratio"] - 1.0, notes["innovation_correlation"]
+    square, correlation = found.innovation_ratio - 1.0, found.innovation_correlation
     return (
         abs(square) <= NORMAL_95 * np.sqrt(2.0 / values),
         abs(correlation) <= NORMAL_95 * np.sqrt(1.0 / values),

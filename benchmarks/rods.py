@@ -152,7 +152,7 @@ def _law(given: Rod, law: AnyLaw, samples: Sequence[Any]) -> tuple[list[float], 
         begun = process_time()
         estimate = identifier.step(*sample)
         spent.append(process_time() - begun)
-        awake = estimate.notes.get("awake", np.nan)
+        awake = estimate.diagnostics.awake
     return spent, awake
 
 

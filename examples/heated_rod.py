@@ -59,7 +59,7 @@ def main() -> dict[str, tuple[float, float]]:
     loop = ct.Loop(identifier, controller)
     for k in range(150):
         action = loop.step(plant.t, plant.measure(), reference={"tip": 45.0 if k < 90 else 60.0})
-        if k % 10 == 0 or action.estimate.notes.get("jump"):
+        if k % 10 == 0 or action.estimate.diagnostics.jump > 0.0:
             k_now, std = action.estimate.parameters["k"]
             print(
                 f"{plant.t / 60:4.0f} min: tip {plant.u[-1]:5.1f}, heater "

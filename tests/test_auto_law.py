@@ -106,7 +106,7 @@ def test_an_unknown_that_moves_is_followed_as_with_the_best_drift_in_hindsight()
     ]
     assert missed(auto, wandering) <= 1.3 * min(hand)
     assert hand[0] > 4 * min(hand)
-    assert auto[-1].notes["drift"] > 1e-3
+    assert auto[-1].diagnostics.drift > 1e-3
 
 
 @pytest.mark.long
@@ -116,11 +116,11 @@ def test_an_unknown_that_stays_is_found_as_by_a_law_that_knows_it():
     (value, std), (expected, deviation) = (e[-1].parameters["a"] for e in (auto, known))
     assert abs(value - expected) <= 0.3 * deviation
     assert deviation <= 1.05 * std <= 3.0 * deviation
-    assert auto[-1].notes["drift"] < 1e-3
+    assert auto[-1].diagnostics.drift < 1e-3
 
 
 def test_members_that_are_not_needed_sleep():
-    awake = [estimate.notes["awake"] for estimate in bank_still()]
+    awake = [estimate.diagnostics.awake for estimate in bank_still()]
     assert awake[0] == 6
     assert np.mean(awake[150:]) <= 3.5
     assert min(awake) <= 2
@@ -131,15 +131,15 @@ def test_a_prior_that_is_too_narrow_is_widened():
     narrow = rod(std=0.01)  # the truth is ten deviations away
     auto, plain = run(build(model=narrow), still()[:120]), lp.SensitivityLaw(replay=lp.Replay())
     known = run(build(plain, narrow), still()[:120])
-    assert auto[-1].notes["prior_scale"] > 2.5
+    assert auto[-1].diagnostics.prior_scale > 2.5
     assert abs(auto[-1].parameters["a"][0] - 0.3) < 0.7 * abs(known[-1].parameters["a"][0] - 0.3)
 
 
 @pytest.mark.long
 def test_the_stated_noise_is_raised_but_not_lowered():
     low, told, high = (bank_still(n)[-1] for n in (0.1 * NOISE, NOISE, 5 * NOISE))
-    assert low.notes["noise_level"] == pytest.approx(10.0, rel=0.1)
-    assert high.notes["noise_level"] == pytest.approx(1.0)
+    assert low.diagnostics.noise_level == pytest.approx(10.0, rel=0.1)
+    assert high.diagnostics.noise_level == pytest.approx(1.0)
     (value, std), (expected, deviation) = low.parameters["a"], told.parameters["a"]
     assert abs(value - expected) <= deviation
     assert 0.5 * deviation <= std <= 2.0 * deviation
@@ -167,7 +167,7 @@ def test_a_jump_is_learned():
         return 0.3 if t < 15.0 else 0.24
 
     found = run(build(lp.AutoLaw(shadows=None)), samples(a, 600))
-    drifts = [estimate.notes["drift"] for estimate in found]
+    drifts = [estimate.diagnostics.drift for estimate in found]
     assert max(drifts[290:299]) < 3e-3 < max(drifts[299:329])
     value, std = found[340].parameters["a"]
     assert abs(value - 0.24) <= 3 * std <= 0.06
@@ -207,8 +207,8 @@ def test_units_scale_out(unit: dict[str, float], noise: float | None):
         for k in range(2):
             ours, its = mine.parameters["a"][k], theirs.parameters["a"][k] * t / x**2
             assert its == pytest.approx(ours, rel=1e-6)
-        assert theirs.notes.get("drift", 0.0) * t == pytest.approx(
-            mine.notes.get("drift", 0.0), rel=1e-6, abs=1e-9
+        assert np.nan_to_num(theirs.diagnostics.drift) * t == pytest.approx(
+            np.nan_to_num(mine.diagnostics.drift), rel=1e-6, abs=1e-9
         )
 
 
@@ -288,7 +288,7 @@ def test_a_member_that_fails_leaves_the_others_to_go_on(monkeypatch: pytest.Monk
 
     monkeypatch.setattr(lp.SensitivityLaw, "step_members", fails)
     found = run(build(), still()[:100])
-    assert found[-1].notes["awake"] <= 2
+    assert found[-1].diagnostics.awake <= 2
     assert abs(found[-1].parameters["a"][0] - 0.3) < 0.01
 
 
@@ -312,7 +312,7 @@ def test_a_step_that_fails_for_all_changes_nothing(monkeypatch: pytest.MonkeyPat
 @pytest.mark.long
 def test_an_unknown_with_an_evolution_of_its_own_keeps_it():
     found = run(build(model=rod(evolution=lp.RandomWalk(0.05))), moving())
-    assert found[0].notes["awake"] == 2
+    assert found[0].diagnostics.awake == 2
     assert missed(found, wandering) < 0.02
 
 
@@ -354,13 +354,13 @@ def test_readings_of_a_coarse_resolution_tell_their_noise(resolution: float):
     last = run(build(noise=None), coarse)[-1]
     value, std = last.parameters["a"]
     assert abs(value - stays(0.0)) <= 3.0 * std <= 0.1
-    assert 0.1 <= last.notes["noise_level"] <= 10.0
+    assert 0.1 <= last.diagnostics.noise_level <= 10.0
 
 
 @pytest.mark.long
 def test_a_slow_signal_of_coarse_resolution_starts_the_bank():
     steps = [(t, np.round(0.1 * t * np.ones(len(POINTS)), 1)) for t, _ in still()[: PATIENCE + 40]]
-    assert "noise_level" in run(build(noise=None), steps)[-1].notes
+    assert run(build(noise=None), steps)[-1].diagnostics.noise_level > 0.0
 
 
 @pytest.mark.long

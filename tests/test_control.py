@@ -550,7 +550,7 @@ def told(**changes: Any) -> Any:
     """Return an estimate as trust looks at it."""
     given = {
         "status": lp.laws.Status(),
-        "notes": {"innovation_ratio": 1.2},
+        "diagnostics": lp.laws.Diagnostics(innovation_ratio=1.2),
         "q": np.array([26.0]),
         "q_std": np.array([1.0]),
         **changes,
@@ -564,7 +564,7 @@ def told(**changes: Any) -> Any:
         ({}, ""),
         ({"status": lp.laws.Status("singular", "no way")}, "the step failed"),
         (
-            {"notes": {"innovation_ratio": 9.0}},
+            {"diagnostics": lp.laws.Diagnostics(innovation_ratio=9.0)},
             "innovations are 3.0 times as large as expected; look at dt_max",
         ),
         ({"q_std": np.array([20.0])}, "known to 20 only"),

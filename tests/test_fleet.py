@@ -145,7 +145,8 @@ def assert_equal(estimate, others, tolerance=1e-8):
             np.testing.assert_allclose(mine, separate, rtol=tolerance, atol=tolerance)
         assert one.status.code == other.status.code
         assert (one.steps, one.held) == (other.steps, other.held)
-        assert one.notes == pytest.approx(dict(other.notes), rel=1e-6, abs=1e-8)
+        mine, theirs = one.diagnostics.named(), other.diagnostics.named()
+        assert mine == pytest.approx(theirs, rel=1e-6, abs=1e-8)
 
 
 def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):

@@ -70,7 +70,7 @@ def test_a_noise_that_is_stated_too_small_does_not_close_the_gate():
 def test_what_lasts_is_believed():
     identifier = rod(lp.SensitivityLaw(gate_patience=5))
     found = [identifier.step(t, z) for t, z in spoiled(readings(), set(range(100, 120)), 40.0)]
-    refused = [estimate.notes["refused"] for estimate in found]
+    refused = [estimate.diagnostics.refused for estimate in found]
     assert refused[100:105] == [1.0] * 5
     assert refused[105] == 0.0
 

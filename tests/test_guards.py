@@ -54,7 +54,7 @@ def run(
 
 
 def counts(found: list[lp.Estimate]) -> dict[str, int]:
-    noted = {name: sum(e.notes.get(name, 0.0) == 1.0 for e in found) for name in GUARDED}
+    noted = {name: sum(getattr(e.diagnostics, name) == 1.0 for e in found) for name in GUARDED}
     return {name: count for name, count in noted.items() if count}
 
 
@@ -108,7 +108,7 @@ def test_guards_do_nothing_where_all_is_well(replay: Any):
     for one, other in zip(with_guards, without, strict=True):
         assert np.array_equal(one.q, other.q)
         assert np.array_equal(one.u, other.u)
-        assert one.notes == other.notes
+        assert one.diagnostics.named() == other.diagnostics.named()
 
 
 @pytest.mark.long
@@ -391,7 +391,7 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(1.0))
     identifier = lp.Identifier(model, sensors, law, u0=0.0)
     for t, z in stream:
-        assert "at_rest" not in identifier.step(t, z).notes
+        assert np.isnan(identifier.step(t, z).diagnostics.at_rest)
     last = identifier._state.excitation
     assert last.energy < 0.01 * last.largest  # by this alone, and by
     assert last.correlation < 0.5  # this, it would be held
@@ -404,7 +404,10 @@ def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
     model = reaction(lambda t: 1.0 * (t < 50.0))
     law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
     identifier = lp.Identifier(model, lp.Full(), law, u0=0.0)
-    held = ["at_rest" in identifier.step(*sample).notes for sample in full(model, 400, h=0.5)]
+    held = [
+        not np.isnan(identifier.step(*sample).diagnostics.at_rest)
+        for sample in full(model, 400, h=0.5)
+    ]
     first = held.index(True)
     assert 100 < first < 300
     assert all(held[first:])
@@ -435,8 +438,8 @@ def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
     again = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
     again.load(tmp_path / "rest.bin")
     pairs = [(identifier.step(t, z), again.step(t, z)) for t, z in stream[150:]]
-    assert any(one.notes.get("at_rest") for one, _ in pairs)
-    assert all(one.notes == other.notes for one, other in pairs)
+    assert any(one.diagnostics.at_rest == 1.0 for one, _ in pairs)
+    assert all(one.diagnostics.named() == other.diagnostics.named() for one, other in pairs)
 
 
 @pytest.mark.parametrize(

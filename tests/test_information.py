@@ -66,7 +66,7 @@ def rod(
 def run(
     model: lp.Model, twin: Twin, noise: float = 0.0, own: bool = True, told: float = 0.0
 ) -> tuple[float, np.ndarray, dict]:
-    """Return the error at the end, the estimate, and the last notes.
+    """Return the error at the end, the estimate, and the last diagnostics.
 
     Noise is smoothed by the law's own choice, `told` times the noise level if that is not zero, or
     by the discrepancy principle.
@@ -85,7 +85,7 @@ def run(
         z = sample.z + size * rng.standard_normal(len(sample.z))
         estimate = identifier.step(sample.t, z)
         assert estimate.status.ok
-    return twin.error(estimate.q), np.asarray(estimate.q), estimate.notes
+    return twin.error(estimate.q), np.asarray(estimate.q), estimate.diagnostics
 
 
 @pytest.mark.slow
@@ -103,7 +103,7 @@ def test_seed_reaches_its_floor_without_a_gain() -> None:
     estimates = [identifier.step(s.t, s.z) for s in twin]
     errors = [twin.error(estimate.q) for estimate in estimates]
     assert errors[-1] <= 0.06  # what is left lies outside of omega
-    assert estimates[-1].notes["departure"] < 0.1
+    assert estimates[-1].diagnostics.departure < 0.1
     assert errors[20] <= 0.06  # and it was there at t = 12: kept while the excitation dies
 
 
@@ -122,7 +122,9 @@ def test_excited_twin_with_exact_data() -> None:
     for s in twin:
         estimate = identifier.step(s.t, s.z)
     assert twin.error(estimate.q) <= 0.005
-    assert 0.1 < estimate.notes["departure"] < 0.6  # H1 is rough, and its q is smooth: as expected
+    assert (
+        0.1 < estimate.diagnostics.departure < 0.6
+    )  # H1 is rough, and its q is smooth: as expected
 
 
 @cache
@@ -139,12 +141,12 @@ def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[s
 )
 def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
     plain, before = unscaled(tuple(options.items()))
-    _, scaled, notes = run(*rod(**units), **options)
+    _, scaled, found = run(*rod(**units), **options)
     size = units.get("q", 1.0)
     assert np.abs(scaled / size - plain).max() <= 1e-6 * np.abs(plain).max()
-    assert notes["information"] > 1.0
-    assert 0.0 < notes["departure"] < 0.2
-    assert notes["departure"] == pytest.approx(before["departure"], rel=1e-5)
+    assert found.information > 1.0
+    assert 0.0 < found.departure < 0.2
+    assert found.departure == pytest.approx(before.departure, rel=1e-5)
 
 
 @pytest.mark.long
@@ -186,19 +188,19 @@ def test_what_has_faded_was_told_all_the_same() -> None:
     law, seen = AUTO, twin.observation
     identifier = lp.Identifier(model, seen, law, q0=0.0, u0=0.0)
     for sample in twin:
-        notes = identifier.step(sample.t, sample.z).notes
+        found = identifier.step(sample.t, sample.z).diagnostics
     learned = identifier._state.metric
     assert learned.given == pytest.approx(2.0 * learned.total.sum(), rel=0.2)  # J weighs by t/T
-    assert notes["information"] == learned.total.sum() / learned.spread
+    assert found.information == learned.total.sum() / learned.spread
 
 
 @pytest.mark.long
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
     # Noise of one spectral density: a deviation that grows with the root of the rate.
-    notes = [
+    found = [
         run(*rod(dt=dt), noise=0.02 * np.sqrt(0.1 / dt), own=False)[2] for dt in (0.1, 0.05, 0.025)
     ]
-    information = [one["information"] for one in notes]
+    information = [one.information for one in found]
     assert max(information) <= 2 * min(information)
 
 
@@ -206,7 +208,7 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None
 def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     # Noise of each node by itself: twice the nodes are twice the data.
     information = [
-        run(*rod(cells=n), noise=0.02, own=False)[2]["information"] / n for n in (20, 40, 80)
+        run(*rod(cells=n), noise=0.02, own=False)[2].information / n for n in (20, 40, 80)
     ]
     assert max(information) <= 1.5 * min(information)
 
@@ -218,7 +220,7 @@ def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
     found = [run(*rod(dt=dt), noise=0.01 * np.sqrt(0.1 / dt), told=1.0) for dt in rates]
     found += [run(*rod(cells=n), noise=0.01 * np.sqrt(n / 20), told=1.0) for n in meshes]
     assert max(error for error, _, _ in found) <= 0.15
-    alphas = [notes["alpha"] for _, _, notes in found[len(rates) :]]
+    alphas = [last.alpha for _, _, last in found[len(rates) :]]
     assert max(alphas) <= 1.2 * min(alphas)
 
 
@@ -238,7 +240,7 @@ def test_exact_data_are_not_smoothed() -> None:
         model, twin = rod()
         sensors = lp.Full(noise=told) if told else lp.Full()
         identifier = lp.Identifier(model, sensors, AUTO, q0=0.0, u0=0.0)
-        alphas = [identifier.step(s.t, s.z).notes.get("alpha", 0.0) for s in twin]
+        alphas = [np.nan_to_num(identifier.step(s.t, s.z).diagnostics.alpha) for s in twin]
         assert max(alphas) == 0.0
 
 
@@ -389,7 +391,7 @@ def test_missing_sensors_are_no_noise_that_turns_back():
         z[rng.random(len(points)) < 0.2] = np.nan
         estimate = identifier.step(sample.t, z)
         assert estimate.status.ok
-        assert "held" not in estimate.notes
+        assert np.isnan(estimate.diagnostics.held)
         assert np.abs(estimate.q).max() < 5.0
 
 
@@ -419,7 +421,7 @@ def test_a_square_seen_in_a_part(size: int, best: float, noise: float) -> None:
         estimate = identifier.step(t, z)
         assert estimate.status.ok
         errors.append(error(estimate.q))
-        departures.append(estimate.notes.get("departure", 0.0))
+        departures.append(np.nan_to_num(estimate.diagnostics.departure))
     assert max(errors) <= 1.05
     assert max(departures) <= 0.5
     assert errors[-1] <= (1.3 * best if noise < 0.01 else 0.3)
@@ -436,7 +438,7 @@ def test_an_unknown_far_from_its_prior_is_a_failed_step() -> None:
     assert {estimate.status.code for estimate in failed} == {"departed"}
     assert "a std that allows" in str(failed[0].status)
     good = [estimate for estimate in found if estimate.status.ok]
-    assert max(estimate.notes.get("departure", 0.0) for estimate in good) <= 1.0
+    assert max(np.nan_to_num(estimate.diagnostics.departure) for estimate in good) <= 1.0
     # A failed step leaves the unknowns where they were, and takes the sample.
     first = found.index(failed[0])
     np.testing.assert_allclose(found[first].q, found[first - 1].q, rtol=1e-4)

@@ -57,7 +57,7 @@ def test_nothing_changes_where_all_is_linear(evolution):
     samples = list(readings(model, [1.5]))
     plain = ends(model, lp.SensitivityLaw(start_window=0, shadows=None), samples)
     iterated = ends(model, lp.SensitivityLaw(shadows=None), samples)
-    assert any("smoother_moved" in estimate.notes for estimate in iterated)
+    assert any(not np.isnan(estimate.diagnostics.smoother_moved) for estimate in iterated)
     for one, other in zip(plain, iterated, strict=True):
         np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(other.q_std, one.q_std, rtol=1e-8)
@@ -175,7 +175,7 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
     samples = list(readings(model, [1.5]))
     plain = ends(model, lp.SensitivityLaw(start_window=0), samples)[-1]
     found = ends(model, lp.SensitivityLaw(), samples)
-    assert found[0].notes["smoother_moved"] == np.inf
+    assert found[0].diagnostics.smoother_moved == np.inf
     np.testing.assert_array_equal(found[-1].q, plain.q)
 
 
@@ -183,7 +183,7 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
 def test_a_settled_run_iterates_no_more():
     model = sourced()
     found = ends(model, lp.SensitivityLaw(start_window=8), readings(model, [1.5]))
-    moved = ["smoother_moved" in estimate.notes for estimate in found]
+    moved = [not np.isnan(estimate.diagnostics.smoother_moved) for estimate in found]
     assert any(moved[:16])
     assert not any(moved[32:])
 
@@ -209,7 +209,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
         f=10.0,
     )
     found = ends(model, lp.SensitivityLaw(), readings(model, [1.2, 0.8], seed=seed))
-    moved = [estimate.notes.get("smoother_moved", 0.0) for estimate in found]
+    moved = [np.nan_to_num(estimate.diagnostics.smoother_moved) for estimate in found]
     assert max(moved[:16]) > 0.0
     assert not any(moved[32:])
     assert len(taken) <= 2 * len(found)

@@ -55,7 +55,7 @@ def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, se
 
     law = lp.SensitivityLaw(jumps=Jumps(), replay=replay)
     found = run(law, samples(a, 500, seed))
-    alarms = [k for k, estimate in enumerate(found) if estimate.notes["jump"]]
+    alarms = [k for k, estimate in enumerate(found) if estimate.diagnostics.jump > 0.0]
     late = [k for k in alarms if k >= 299]
     assert late
     assert late[0] - 299 <= 30
@@ -86,7 +86,7 @@ def test_a_sample_without_a_measurement_is_no_evidence():
     t, z = stream[500]
     mixed[500] = (t, z + 2.5 * NOISE)  # by chance: once is no alarm
     found = run(lp.SensitivityLaw(jumps=Jumps()), mixed)
-    assert not any(estimate.notes["jump"] for estimate in found)
+    assert not any(estimate.diagnostics.jump > 0.0 for estimate in found)
 
 
 def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
@@ -136,7 +136,7 @@ def test_settings_that_cannot_be_meant_are_refused(options: Any):
 def test_the_noise_is_found_from_any_first_guess(guess: float):
     law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16))
     found = run(law, samples(lambda t: 0.3, 400, 0), guess)
-    assert found[-1].notes["noise_level"] * guess == pytest.approx(NOISE, rel=0.2)
+    assert found[-1].diagnostics.noise_level * guess == pytest.approx(NOISE, rel=0.2)
     value, std = found[-1].parameters["a"]
     assert abs(value - 0.3) < 4 * std < 0.01
 

@@ -49,7 +49,7 @@ def run(levels: tuple[float, ...], noise: float, jumps: lp.Jumps, replay: Any = 
     law = lp.SensitivityLaw(jumps=jumps, replay=replay)
     identifier = lp.Identifier(rod(16), lp.Points(POINTS, noise=noise), law, u0=0.0)
     found = [identifier.step(t, z) for t, z in samples(levels, noise)]
-    return found, [k for k, estimate in enumerate(found) if estimate.notes["jump"]]
+    return found, [k for k, estimate in enumerate(found) if estimate.diagnostics.jump > 0.0]
 
 
 FLUX = lp.Jumps(unknowns=("v",))

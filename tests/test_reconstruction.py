@@ -304,10 +304,10 @@ def samples(count=8):
 def test_the_gradient_law_uses_and_reports_it():
     found = [identifier(how).run(samples()) for how in (Pseudoinverse(), Tikhonov("V", 0.0))]
     np.testing.assert_allclose(found[0].last.q, found[1].last.q, rtol=1e-6)
-    assert "alpha" not in found[0].last.notes
+    assert np.isnan(found[0].last.diagnostics.alpha)
     result = identifier(Tikhonov("V")).run(samples())
-    assert result.last.notes["alpha"] > 0
-    assert result.last.notes["misfit"] > 0
+    assert result.last.diagnostics.alpha > 0
+    assert result.last.diagnostics.misfit > 0
     assert set(result.to_xarray()) >= {"alpha", "misfit", "residual"}
 
 

@@ -60,7 +60,7 @@ def test_where_a_replay_ends_does_not_depend_on_the_slices():
         identifier, estimates = rod(slice=size, iterations=2), []
         for sample in readings(200):
             estimates.append(identifier.step(*sample))
-        done = [k + 1 for k, e in enumerate(estimates) if "replay_left" in e.notes]
+        done = [k + 1 for k, e in enumerate(estimates) if not np.isnan(e.diagnostics.replay_left)]
         assert len(done) == 5  # due at 8, 16, 32, 64 and 128
         ends[size] = done[-1], estimates[-1]
     assert ends[3][0] > ends[16][0] > ends[1000][0] == 128

@@ -71,7 +71,7 @@ def ran(given: lp.Identifier, rows: Any) -> Any:
 
 
 def shifts(estimate: Any, kind: str) -> np.ndarray[Any, Any]:
-    return np.array([estimate.notes[f"{name}_{kind}_shift"] for name in ("k", "h")])
+    return np.array([estimate.diagnostics.shifts.by(kind)[name] for name in ("k", "h")])
 
 
 def assert_predicts(predicted: Any, actual: Any, std: Any, band: float) -> None:
@@ -123,7 +123,7 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
         ends.append([given.step(sample.t, sample.z) for sample in rows][-1])
     coarse, fine = ends
     (label,) = coarse.parameters
-    predicted, actual = coarse.notes[f"{label}_step_shift"], (coarse.q - fine.q)[0]
+    predicted, actual = coarse.diagnostics.shifts.by("step")[label], (coarse.q - fine.q)[0]
     assert abs(actual) > 2.0 * fine.q_std[0]
     assert predicted == pytest.approx(actual, rel=0.4)
 
@@ -162,7 +162,7 @@ def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
         ends[cells] = [given.step(t, z) for t, z in rows][-1]
     coarse, fine = ends[16], ends[64]
     assert abs(coarse.q - fine.q)[0] < 0.01 * fine.q_std[0]
-    assert abs(coarse.notes["a_mesh_shift"]) < 0.1 * fine.q_std[0]
+    assert abs(coarse.diagnostics.shifts.by("mesh")["a"]) < 0.1 * fine.q_std[0]
 
 
 @pytest.mark.slow
@@ -216,7 +216,7 @@ def test_where_nothing_is_wrong_intervals_grow_little() -> None:
     widened = ran(identifier(), rows)
     plain = ran(identifier(law=PLAIN), rows)
     assert (widened.q_std / plain.q_std < 1.1).all()
-    assert widened.notes["discretisation_shift"] < 2.0
+    assert widened.diagnostics.shifts.largest < 2.0
 
 
 def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
@@ -237,7 +237,7 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> No
     again.load(tmp_path / "state.bin")
     one, other = ran(whole, rows[50:]), ran(again, rows[50:])
     np.testing.assert_array_equal(one.q_std, other.q_std)
-    assert dict(one.notes) == dict(other.notes)
+    assert one.diagnostics.named() == other.diagnostics.named()
 
 
 @pytest.mark.slow
@@ -256,9 +256,9 @@ def test_holds_with_gaps_and_for_the_bank() -> None:
     rows = samples()
     gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
     estimate = ran(identifier(8), gappy)
-    assert abs(estimate.notes["k_mesh_shift"]) > 0.0
+    assert abs(estimate.diagnostics.shifts.by("mesh")["k"]) > 0.0
     bank = ran(identifier(8, lp.AutoLaw()), rows[:60])
-    assert bank.notes["discretisation_shift"] > 0.0
+    assert bank.diagnostics.shifts.largest > 0.0
 
 
 @pytest.mark.slow
@@ -273,8 +273,8 @@ def test_a_field_is_prolonged() -> None:
     law = lp.SensitivityLaw(modes=4)
     given = lp.Identifier(model, SENSORS, law, u0=0.0)
     estimate = ran(given, samples()[:60])
-    assert "mesh_unfollowed" not in estimate.notes
-    assert abs(estimate.notes["mesh_shift"]) > 0.0
+    assert np.isnan(estimate.diagnostics.mesh_unfollowed)
+    assert abs(estimate.diagnostics.shifts.sizes["mesh"]) > 0.0
 
 
 def test_says_where_the_mesh_is_not_followed() -> None:
@@ -285,9 +285,9 @@ def test_says_where_the_mesh_is_not_followed() -> None:
         A=lambda q, u, v, x: 0.1 * q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     given = lp.Identifier(model, SENSORS, lp.SensitivityLaw(), u0=0.0)
-    assert ran(given, samples()[:10]).notes["mesh_unfollowed"] == 1.0
+    assert ran(given, samples()[:10]).diagnostics.mesh_unfollowed == 1.0
     few = lp.SensitivityLaw(shadows=lp.laws.Shadows(largest=10))
-    assert ran(identifier(8, few), samples()[:10]).notes["mesh_unfollowed"] == 1.0
+    assert ran(identifier(8, few), samples()[:10]).diagnostics.mesh_unfollowed == 1.0
 
 
 @pytest.mark.long

@@ -223,7 +223,7 @@ def taken(identifier: lp.Identifier, samples: list[tuple[Any, ...]]) -> Numbers:
         belief = identifier.latent_belief()
         arrays = (estimate.q, estimate.u, estimate.innovation, belief.q_factor, belief.u_factor)
         seen = tuple(None if array is None else array.tobytes() for array in arrays)
-        notes = {name: float(value).hex() for name, value in estimate.notes.items()}
+        notes = {name: float(value).hex() for name, value in estimate.diagnostics.named().items()}
         found.append((estimate.status.code, estimate.steps, notes, *seen))
     return found
 

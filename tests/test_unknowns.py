@@ -366,13 +366,13 @@ def test_the_gate_refuses_outliers_and_believes_what_lasts():
     plain = estimates(model, open_gate, samples)[-1].parameters["a"][0]
     found = estimates(model, lp.SensitivityLaw(gate=5.0), samples)
     assert abs(found[-1].parameters["a"][0] - 0.3) < 0.002 < abs(plain - 0.3)
-    assert [e.t for e in found if e.notes.get("refused")] == [
+    assert [e.t for e in found if e.diagnostics.refused > 0.0] == [
         pytest.approx(times[k]) for k in (50, 80, 81, 110)
     ]
     for t, z in samples[60:]:
         z[1] += 0.5 if t else 0.0
     lasting = estimates(model, lp.SensitivityLaw(gate=5.0, gate_patience=7), samples)
-    refused = [bool(e.notes.get("refused")) for e in lasting]
+    refused = [e.diagnostics.refused > 0.0 for e in lasting]
     assert sum(refused[60:67]) == 7
     assert not refused[67]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 import livepde as lp
 from livepde.errors import LawError
 from livepde.runs import doubts, verdict
-from livepde.verdict import LEVELS, Finding, Verdict, WithheldLedger, discretised
+from livepde.verdict import LEVELS, Finding, Shifts, Verdict, WithheldLedger, discretised
 from livepde.verdict.findings import flat
 
 TIMES = np.linspace(0.0, 8.0, 161)
@@ -203,18 +204,13 @@ def test_readings_that_the_gate_refuses_are_a_finding():
 
 
 def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
-    notes = {
-        "discretisation_shift": 2.5,
-        "step_shift": -0.5,
-        "mesh_shift": 3.0,
-        "k_mesh_shift": 0.2,
-    }
-    (found,) = discretised(notes, ["k"])
+    shifts = Shifts(2.5, {"step": -0.5, "mesh": 3.0}, {("k", "mesh"): 0.2})
+    (found,) = discretised(shifts)
     assert "2.5 standard deviations" in found.text
     assert "the mesh (k by +0.2)" in found.text
     assert "more elements" in found.sentence
-    assert list(discretised({**notes, "discretisation_shift": 1.9}, ["k"])) == []
-    assert list(discretised({}, ["k"])) == []
+    assert list(discretised(replace(shifts, largest=1.9))) == []
+    assert list(discretised(Shifts())) == []
 
 
 @pytest.mark.slow
@@ -284,11 +280,11 @@ def test_readings_that_are_held_as_settings_are_told():
     (found,) = [f for f in held.verdict.findings if f.what == "hold"]
     assert found.severity == "caution"
     shift = held.q[0] - straight.q[0]
-    assert held.notes["k_hold_shift"] == pytest.approx(shift, rel=0.3)
+    assert held.diagnostics.shifts.by("hold")["k"] == pytest.approx(shift, rel=0.3)
     assert found.evidence == pytest.approx(abs(shift) / held.q_std[0], rel=0.4)
-    assert "hold_shift" not in straight.notes
+    assert "hold" not in straight.diagnostics.shifts.sizes
     steps = np.repeat(driven(TIMES[::10]), 10)[: len(TIMES)]  # what an actuator does
-    assert fed(steps, hold=True).notes["hold_shift"] == 0.0
+    assert fed(steps, hold=True).diagnostics.shifts.sizes["hold"] == 0.0
 
 
 @pytest.mark.long
@@ -302,7 +298,7 @@ def test_gaps_of_a_channel_are_told_and_in_the_interval():
         assert (found.severity, found.subject) == ("caution", "T_left")
         assert found.evidence == pytest.approx(np.isnan(values).mean())
         off.append(gaps.q[0] - whole.q[0])
-        shifts.append(gaps.notes["k_input_shift"])
+        shifts.append(gaps.diagnostics.shifts.by("input")["k"])
         assert abs(off[-1]) > 3.0 * whole.q_std[0]
         assert abs(off[-1]) < 3.0 * gaps.q_std[0]
     assert abs(np.mean(off) - np.mean(shifts)) < 0.5 * abs(np.mean(off))

@@ -198,7 +198,7 @@ def closed_loop(problem: Problem, estimator: Estimator, controller: Controller, 
         inputs = dict(action.inputs)
         failed += action.status != "ok"
         estimate = getattr(estimator, "estimate", None)
-        alarm = bool(estimate is not None and estimate.notes.get("jump", 0.0))
+        alarm = bool(estimate is not None and estimate.diagnostics.jump > 0.0)
         reference = problem.reference(now)
         rows.append(
             (

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from livepde.laws import Belief, FixedInterval, Problem, Status
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.records import SMOOTHED, Record, bare
 from livepde.result import Estimate, Result
@@ -56,8 +57,9 @@ class Hindsight:
         elif taken:
             self._intervals.append(interval)
             self._q.append(q)
-        if onset := int(estimate.notes.get("jump_samples", 0)):
-            self._jumps.add(len(self._intervals) - onset)
+        onset = estimate.diagnostics.jump_samples
+        if onset > 0:
+            self._jumps.add(len(self._intervals) - int(onset))
         self._estimates.append((len(self._intervals), estimate.t, estimate.status))
 
     def fixed_interval(self, fields_every: int) -> FixedInterval | None:
@@ -89,10 +91,10 @@ class Hindsight:
 
     @staticmethod
     def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:
-        nothing: dict[str, Any] = {}
         withheld = 0 if result.withheld is None else result.withheld.size
         unseen = np.full(result.observed.size, np.nan), np.full(withheld, np.nan)
-        return Estimate(t, belief, *unseen, status, 0, nothing, (), result.model.parameter_space)
+        space = result.model.parameter_space
+        return Estimate(t, belief, *unseen, status, 0, Diagnostics, (), space)
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:

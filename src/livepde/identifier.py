@@ -28,6 +28,7 @@ from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
 from livepde.laws import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status, numerical
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -413,10 +414,10 @@ class Identifier:
             withheld_error=error,
             status=report.status,
             steps=report.steps,
-            notes=report.notes,
+            diagnose=lambda: report.diagnostics,
             held=held,
             space=self.model.parameter_space,
-            judge=self._judge(self._state, report.notes),
+            judge=self._judge(self._state, lambda: report.diagnostics),
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
@@ -430,16 +431,18 @@ class Identifier:
         found: Array = (rows * rows).sum(axis=1)
         return found
 
-    def _judge(self, state: Any, notes: Mapping[str, float]) -> Callable[[], Verdict]:
-        """Return a function that gives the verdict on the run so far, which has these notes."""
+    def _judge(
+        self, state: Any, diagnose: Callable[[], Diagnostics[float]]
+    ) -> Callable[[], Verdict]:
+        """Return a function that gives the verdict on the run so far."""
         judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
-        inputs, labels = self.inputs, tuple(self.model.parameter_space.labels)
+        inputs = self.inputs
         if not names and not gaps.counts[1:].any():
             return judge
 
         def found() -> Verdict:
-            held = gaps.findings(inputs, notes, labels)
+            held = gaps.findings(inputs, diagnose().shifts)
             return judge().with_findings([*withheld.findings(names), *held])
 
         return found
@@ -473,7 +476,7 @@ class Identifier:
         if state is self._state:
             return estimate
         belief = self.problem.physical(self.law.belief(self._work, state))
-        return replace(estimate, belief=belief, judge=self._judge(state, estimate.notes))
+        return replace(estimate, belief=belief, judge=self._judge(state, estimate.diagnose))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return predicted readings if nothing more is measured; nothing is learned.
@@ -589,8 +592,8 @@ class Identifier:
         Returns
         -------
         smoothed
-            As `Result.to_xarray` of the run, without innovations and notes. A constant unknown has
-            one value at all times: the last one.
+            As `Result.to_xarray` of the run, without innovations. A constant unknown
+            has one value at all times: the last one.
 
         Raises
         ------

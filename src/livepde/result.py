@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, cells
 from livepde.laws import Belief, Status
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
@@ -54,8 +55,8 @@ class Estimate:
         Status of the step; unless ok, q and u are those of the last successful step.
     steps
         Substeps taken.
-    notes
-        Numbers of the law: norm of the residual, theta, innovation statistics.
+    diagnose
+        Function that returns the diagnostics of the law; see `diagnostics`.
     held
         Input channels whose last value was held because the sample had none.
     space
@@ -70,7 +71,7 @@ class Estimate:
     withheld_error: Array
     status: Status
     steps: int
-    notes: Mapping[str, float]
+    diagnose: Callable[[], Diagnostics[float]]
     held: tuple[str, ...]
     space: FunctionSpace
     judge: Callable[[], Verdict] = Verdict.unjudged
@@ -85,7 +86,7 @@ class Estimate:
         withheld_error: Array,
         status: Status,
         steps: int,
-        notes: Mapping[str, float],
+        diagnose: Callable[[], Diagnostics[float]],
         held: tuple[str, ...],
         space: FunctionSpace,
         judge: Callable[[], Verdict],
@@ -105,7 +106,7 @@ class Estimate:
             withheld_error=withheld_error,
             status=status,
             steps=steps,
-            notes=notes,
+            diagnose=diagnose,
             held=held,
             space=space,
             judge=judge,
@@ -127,7 +128,13 @@ class Estimate:
     def __getstate__(self) -> dict[str, Any]:
         """Return the belief itself, for a copy."""
         own = {"belief": self.belief, "verdict": self.verdict}
+        own["diagnose"] = partial(_same, self.diagnostics)
         return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics[float]:
+        """Innovation statistics, safeguards, and other numbers of the law."""
+        return self.diagnose()
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -135,8 +142,8 @@ class Estimate:
 
         It is computed on first access, which takes about a millisecond.
         """
-        labels = self.space.labels
-        shifted = [*discretised(self.notes, labels), *held_inputs(self.notes, labels)]
+        shifts = self.diagnostics.shifts
+        shifted = [*discretised(shifts), *held_inputs(shifts)]
         return self.judge().with_findings([*known_badly(self.belief, self.space), *shifted])
 
     @property
@@ -324,7 +331,7 @@ class Result:
             estimate.withheld_error,
             STATUS_CODES.index(estimate.status.code),
             estimate.steps,
-            dict(estimate.notes),
+            estimate.diagnostics.named(),
             self.snapshot(estimate) if keeps else None,
         )
 
@@ -523,3 +530,7 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
                 "count": float(len(errors)),
             }
     return rows
+
+
+def _same(diagnostics: Diagnostics[float]) -> Diagnostics[float]:
+    return diagnostics

@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import tee
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadow
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
-from livepde.verdict import REFINE, discretised
+from livepde.verdict import REFINE, Shifts, discretised
 
 __all__ = ["Identified", "Preview", "linearised", "preview"]
 
@@ -147,23 +146,26 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     told = tuple(_compare(prepared, before, after))
     sentences = (
         *identifiability(model, belief).sentences,
-        *_shifted(estimate.notes, {item.name: item.posterior for item in told}),
+        *_shifted(estimate.diagnostics.shifts, {item.name: item.posterior for item in told}),
         *estimate.verdict.unseen,
     )
     return Preview(told, count, sentences)
 
 
-def _shifted(notes: Mapping[str, Any], std: Mapping[str, float]) -> list[str]:
+def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
     """Return the shifts of numbers by the discretisation, in posterior standard deviations."""
-    labels = [label for label in std if std[label] > 0.0]
-    each = {
-        kind: [float(notes.get(f"{label}_{kind}_shift", 0.0)) / std[label] for label in labels]
-        for kind in REFINE
+    known = {
+        (label, kind): shift
+        for (label, kind), shift in shifts.unknowns.items()
+        if kind in REFINE and std.get(label, 0.0) > 0.0
     }
-    total = np.abs(np.sum(list(each.values()), axis=0)).max(initial=0.0)
-    sizes = {f"{kind}_shift": max(map(abs, sizes), default=0.0) for kind, sizes in each.items()}
-    found = discretised({**notes, **sizes, "discretisation_shift": float(total)}, labels)
-    return [finding.sentence for finding in found]
+    sizes, totals = dict.fromkeys(REFINE, 0.0), dict.fromkeys(std, 0.0)
+    for (label, kind), shift in known.items():
+        size = shift / std[label]
+        sizes[kind] = max(sizes[kind], abs(size))
+        totals[label] += size
+    total = max(map(abs, totals.values()), default=0.0)
+    return [finding.sentence for finding in discretised(Shifts(total, sizes, known))]
 
 
 def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identified]:

@@ -59,8 +59,8 @@ class Trust:
         """Return the reason why an estimate is not trusted; empty if it is."""
         if not estimate.status.ok:
             return f"the step failed ({estimate.status})"
-        misfit = estimate.notes.get("innovation_ratio", 1.0)
-        if not misfit <= self.misfit:
+        misfit = estimate.diagnostics.innovation_ratio  # NaN: a law without innovations
+        if misfit > self.misfit:
             return (
                 f"the model does not explain the data: innovations are {math.sqrt(misfit):.1f} "
                 "times as large as expected; look at dt_max, the noise, and what it lacks"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
 from livepde.fleet.engine import Beliefs
 from livepde.laws import Belief, Status
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import NOTE, STATUS_CODES, Layout
 from livepde.result import Estimate
@@ -42,8 +44,8 @@ class FleetEstimate:
         Status of the step of each member; unless ok, its q and u are those of its last good step.
     steps
         Substeps taken, shape (members,).
-    notes
-        Numbers of the law, each of shape (members,); NaN for members without.
+    diagnose
+        Function that returns the diagnostics of the law, numbers of shape (members,).
     held
         Input channels whose last value was held -> which members had none, shape (members,).
     space
@@ -59,7 +61,7 @@ class FleetEstimate:
     withheld_error: Array
     statuses: tuple[Status, ...]
     steps: Array
-    notes: Mapping[str, Array]
+    diagnose: Callable[[], Diagnostics[Array]]
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
@@ -79,6 +81,11 @@ class FleetEstimate:
         """Standard deviations of q, or None if the law has none."""
         return self.beliefs.q_std
 
+    @cached_property
+    def diagnostics(self) -> Diagnostics[Array]:
+        """Innovation statistics, safeguards, and other numbers of the law."""
+        return self.diagnose()
+
     @property
     def ok(self) -> Mask:
         """Members whose step was taken, shape (members,)."""
@@ -93,7 +100,6 @@ class FleetEstimate:
     def member(self, name: str | int) -> Estimate:
         """Return the estimate of one member, by name or number, as `Identifier.step` does."""
         k = name if isinstance(name, int) else self.members.index(name)
-        notes = {key: float(values[k]) for key, values in self.notes.items()}
         return Estimate(
             t=self.t,
             belief=self.belief(k),
@@ -101,7 +107,7 @@ class FleetEstimate:
             withheld_error=self.withheld_error[k],
             status=self.statuses[k],
             steps=int(self.steps[k]),
-            notes={key: value for key, value in notes.items() if np.isfinite(value)},
+            diagnose=lambda: self.diagnostics.member(k),
             held=tuple(channel for channel, members in self.held.items() if members[k]),
             space=self.space,
         )
@@ -117,7 +123,7 @@ class _Row:
     withheld_error: Array
     status: IntArray
     steps: Array
-    notes: Mapping[str, Array]
+    diagnostics: Mapping[str, Array]
 
 
 class FleetResult:
@@ -148,7 +154,7 @@ class FleetResult:
                 estimate.withheld_error,
                 np.array(codes, dtype=np.int32),
                 estimate.steps,
-                estimate.notes,
+                estimate.diagnostics.named(),
             )
         )
         self.last = estimate
@@ -161,7 +167,7 @@ class FleetResult:
     def to_xarray(self) -> xr.Dataset:
         """Return a dataset with dimensions member, time, sensor and withheld.
 
-        Scalar unknowns, with `_std` variables beside them, status, steps and notes are over
+        Scalar unknowns, with `_std` variables beside them, status, steps and diagnostics are over
         (`member`, `time`); innovations over (`member`, `time`, `sensor`).
         """
         import xarray as xr
@@ -199,8 +205,8 @@ class FleetResult:
         steps = table([row.steps for row in rows])
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         nothing = np.full(len(self.members), np.nan)
-        for name in dict.fromkeys(name for row in rows for name in row.notes):
+        for name in dict.fromkeys(name for row in rows for name in row.diagnostics):
             key = f"{NOTE}{name}" if name in data else name
-            data[key] = (both, table([row.notes.get(name, nothing) for row in rows]))
+            data[key] = (both, table([row.diagnostics.get(name, nothing) for row in rows]))
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data

@@ -304,7 +304,7 @@ class Fleet:
             withheld_error=error,
             statuses=report.statuses,
             steps=report.steps,
-            notes=report.notes,
+            diagnose=lambda: report.diagnostics,
             held=held,
             space=self.model.parameter_space,
             belief=lambda k: self._believed(state, k),

@@ -28,7 +28,7 @@ class _MemberRow:
     withheld_error: Array
     status: Sequence[int]
     steps: Sequence[int]
-    notes: Mapping[str, Sequence[float]]
+    diagnostics: Mapping[str, Sequence[float]]
     profiles: Mapping[str, Array] | None
     correlation: Array | None
 
@@ -39,7 +39,7 @@ class _MemberRow:
             profiles = {name: values[k] for name, values in self.profiles.items()}
             correlation = None if self.correlation is None else self.correlation[k]
             snapshot = Snapshot(profiles, {}, correlation)
-        notes = {name: values[k] for name, values in self.notes.items()}
+        diagnostics = {name: values[k] for name, values in self.diagnostics.items()}
         return Record(
             self.t,
             self.numbers[k],
@@ -47,7 +47,7 @@ class _MemberRow:
             self.withheld_error[k],
             self.status[k],
             self.steps[k],
-            {name: value for name, value in notes.items() if np.isfinite(value)},
+            {name: value for name, value in diagnostics.items() if np.isfinite(value)},
             snapshot,
         )
 
@@ -91,7 +91,7 @@ class FleetRecords:
             estimate.withheld_error,
             [STATUS_CODES.index(status.code) for status in estimate.statuses],
             estimate.steps.tolist(),
-            {name: values.tolist() for name, values in estimate.notes.items()},
+            {name: values.tolist() for name, values in estimate.diagnostics.named().items()},
             profiles,
             correlation,
         )

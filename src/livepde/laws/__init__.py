@@ -33,6 +33,7 @@ from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows
+from livepde.laws.step_diagnostics import Diagnostics
 
 __all__ = [
     "AnyLaw",
@@ -42,6 +43,7 @@ __all__ = [
     "ConstantDamping",
     "Constants",
     "Damping",
+    "Diagnostics",
     "ExactBound",
     "ExcitationGate",
     "FixedInterval",

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
-from livepde.laws.base import Notes, Report, Status
+from livepde.laws.base import Report, Status
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
 from livepde.laws.members import changed
+from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, Seen
@@ -36,41 +38,43 @@ class MemberReports:
         Predicted value of each sensor, shape (members, sensors).
     steps
         Substeps taken, shape (members,).
-    notes
-        Numbers worth keeping, each of shape (members,); NaN for members without.
+    diagnose
+        Function that returns the diagnostics, numbers of shape (members,); called when read.
     """
 
     statuses: tuple[Status, ...]
     predicted: Array
     steps: Array
-    notes: Mapping[str, Array] = field(default_factory=dict)
+    diagnose: Callable[[], Diagnostics[Array]] = Diagnostics
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics[Array]:
+        """Innovation statistics, safeguards, and other numbers of the law."""
+        return self.diagnose()
 
     def member(self, k: int) -> Report:
         """Return the report of one member."""
-        notes = Notes(lambda: self._notes_of(k))
-        return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), notes)
+        steps = int(self.steps[k])
+        found = cache(lambda: self.diagnostics.member(k))
+        return Report(self.statuses[k], self.predicted[k], steps, found)
 
-    def with_notes(self, notes: Mapping[str, Array]) -> MemberReports:
-        """Return the reports with more notes."""
-        return replace(self, notes={**self.notes, **notes}) if notes else self
-
-    def _notes_of(self, k: int) -> dict[str, float]:
-        notes = {name: float(values[k]) for name, values in self.notes.items()}
-        return {name: value for name, value in notes.items() if not math.isnan(value)}
+    def updated(self, more: Diagnostics[Array]) -> MemberReports:
+        """Return the reports with all that other diagnostics know among their own."""
+        return replace(self, diagnose=cache(lambda: self.diagnostics.updated(more)))
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
         """Return the reports with those of some members exchanged."""
         if not reports:
             return self
         statuses, predicted, steps = list(self.statuses), self.predicted.copy(), self.steps.copy()
-        notes = {name: values.copy() for name, values in self.notes.items()}
-        for name in dict.fromkeys(name for one in reports.values() for name in one.notes):
-            notes.setdefault(name, np.full(len(statuses), np.nan))
         for k, one in reports.items():
             statuses[k], predicted[k], steps[k] = one.status, one.predicted, one.steps
-            for name, values in notes.items():
-                values[k] = one.notes.get(name, np.nan)
-        return MemberReports(tuple(statuses), predicted, steps, notes)
+
+        def diagnosed() -> Diagnostics[Array]:
+            each = (reports.get(k, self.member(k)) for k in range(len(statuses)))
+            return stacked([one.diagnostics for one in each])
+
+        return MemberReports(tuple(statuses), predicted, steps, cache(diagnosed))
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.base import Belief, FixedInterval, Law, Notes, Problem, Report
+from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
@@ -45,6 +46,7 @@ from livepde.laws.sensitivity_state import (
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.verdict import judged
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
@@ -225,7 +227,7 @@ class AutoLaw(Law[Bank, AutoState]):
         if noise is None:
             return changed(state, waiting=waiting, members=free), report
         begun = self._initial(work, state.start, noise)
-        notes: Mapping[str, float] = {}
+        diagnose: Callable[[], Diagnostics[float]] = Diagnostics
         first = first_interval(waiting, work.channels)
         if first.present.any():
             begun = self.begin(work, begun, first)
@@ -233,8 +235,8 @@ class AutoLaw(Law[Bank, AutoState]):
             begun, taken = self._assimilated(work, begun, part)
             if not taken.status.ok:
                 return state, taken
-            notes = taken.notes
-        return begun, replace(report, notes=notes)
+            diagnose = taken.diagnose
+        return begun, replace(report, diagnose=diagnose)
 
     def _assimilated(
         self, work: Bank, state: AutoState, interval: Interval
@@ -374,20 +376,20 @@ class AutoLaw(Law[Bank, AutoState]):
         logs, tick, now = state.weights, state.tick, state.members.now
         awake, level = now.member, now.level  # not all of the members
 
-        def notes() -> dict[str, float]:
+        def diagnosed() -> Diagnostics[float]:
             weights, drifts = np.exp(logs), work.drifts / tick
-            return {
-                **leading.notes,
-                "noise_level": float(weights[awake] @ np.sqrt(level)),
-                "drift": float(weights @ drifts),
-                "drifting": float(weights @ (drifts > 0.0)),
-                "prior_scale": float(np.exp(weights @ work.scales)),
-                "jump": float(onset > 0),
-                **({"jump_samples": float(onset)} if onset else {}),
-                "awake": float(len(awake)),
-            }
+            return replace(
+                leading.diagnostics,
+                noise_level=float(weights[awake] @ np.sqrt(level)),
+                drift=float(weights @ drifts),
+                drifting=float(weights @ (drifts > 0.0)),
+                prior_scale=float(np.exp(weights @ work.scales)),
+                jump=float(onset > 0),
+                jump_samples=float(onset) if onset else np.nan,
+                awake=float(len(awake)),
+            )
 
-        return Report(OK, predicted, leading.steps, Notes(notes))
+        return Report(OK, predicted, leading.steps, cache(diagnosed))
 
     def settled(self, work: Bank, state: AutoState) -> AutoState:
         noise = state.noise if state.known else np.ones_like(state.noise)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 
 from livepde.errors import LawError, LinearAlgebraError
 from livepde.fem import Moment
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
@@ -23,7 +24,6 @@ __all__ = [
     "FixedInterval",
     "InitialReading",
     "Law",
-    "Notes",
     "Problem",
     "Report",
     "Status",
@@ -248,38 +248,6 @@ def _deviation(factor: Array) -> Array:
     return std
 
 
-Value = TypeVar("Value")
-
-
-class Notes(Mapping[str, Value]):
-    """Numbers worth keeping, which are computed when they are first looked at.
-
-    >>> notes = Notes(lambda: {"alpha": 2.0, "residual": 3.0})
-    >>> dict(notes)
-    {'alpha': 2.0, 'residual': 3.0}
-    """
-
-    def __init__(self, read: Callable[[], Mapping[str, Value]]) -> None:
-        self._read = read
-
-    @cached_property
-    def _values(self) -> Mapping[str, Value]:
-        return self._read()
-
-    def __getitem__(self, name: str) -> Value:
-        return self._values[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Return the numbers themselves, for a copy."""
-        return dict, (dict(self._values),)
-
-
 @dataclass(frozen=True, eq=False)
 class Report:
     """Report of a step, beside the new state.
@@ -293,14 +261,23 @@ class Report:
         without such a prediction, the output of its estimate.
     steps
         Substeps taken.
-    notes
-        Numbers worth keeping, such as the norm of r, theta, or the inflation.
+    diagnose
+        Function that returns the diagnostics; it is called when they are first read.
     """
 
     status: Status
     predicted: Array
     steps: int = 0
-    notes: Mapping[str, float] = field(default_factory=dict)
+    diagnose: Callable[[], Diagnostics[float]] = Diagnostics
+
+    @cached_property
+    def diagnostics(self) -> Diagnostics[float]:
+        """Innovation statistics, safeguards, and other numbers of the law."""
+        return self.diagnose()
+
+    def updated(self, more: Diagnostics[float]) -> Report:
+        """Return the report with all that other diagnostics know among its own."""
+        return replace(self, diagnose=cache(lambda: self.diagnostics.updated(more)))
 
 
 def finite(*arrays: Array | None) -> bool:

@@ -31,6 +31,7 @@ from livepde.laws.members import changed
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensors import MemberSensors
 from livepde.laws.shadow_state import ShadowState
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
@@ -104,8 +105,8 @@ class FollowedErrors(Protocol):
         """Return the filter state after a sample; weights: one over noise, (members, sensors)."""
         ...
 
-    def notes(self, x: FilterState) -> dict[str, Array]:
-        """Return notes on the errors, each of shape (members,)."""
+    def diagnostics(self, x: FilterState) -> Diagnostics[Array]:
+        """Return the shifts of the unknowns by the errors, numbers of shape (members,)."""
         ...
 
     def widening(self, x: FilterState) -> tuple[Array, Array]:

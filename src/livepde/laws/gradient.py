@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Notes, Problem, Report, Status
+from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.excitation import ExcitationGate, ExcitationLevel
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
 from livepde.laws.metrics import StepBegin, Transition
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
@@ -66,7 +68,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         M u' + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
 
     u_alpha = G^+ z, or G_alpha z if the observation has a `reconstruction` that regularises: then
-    these are (noisy_q) and (noisy_u), and the notes of each report hold alpha and the misfit
+    these are (noisy_q) and (noisy_u), and the diagnostics of each report hold alpha and the misfit
     ||G u_alpha - z||_Z. For a `Subdomain` the integrals are split as the paper splits them: over
     omega the forms see the data, M_op and r are integrated there, and N_op over the rest.
 
@@ -231,11 +233,14 @@ class GradientLaw(Law[GradientParts, GradientState]):
             metric=learned,
             excitation=work.excited(state.excitation, u - r, u, q, moment),
         )
-        made = {**path.notes(), **work.metric.notes(learned, q, length)}
-        if frozen:
-            made["at_rest"] = 1.0
-        notes = Notes(lambda: {"residual": model.X.norm(r), **made})
-        return new, Report(Status(), work.problem.predict(u, q, moment), steps, notes)
+        found = path.diagnostics().updated(work.metric.diagnostics(learned, q, length))
+        at_rest = 1.0 if frozen else np.nan
+
+        def diagnosed() -> Diagnostics[float]:
+            return replace(found, residual=model.X.norm(r), at_rest=at_rest)
+
+        predicted = work.problem.predict(u, q, moment)
+        return new, Report(Status(), predicted, steps, cache(diagnosed))
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:
         return Belief(state.q, state.u)

@@ -72,9 +72,8 @@ without this bias (`livepde.laws.smoothing`).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -90,6 +89,7 @@ from livepde.laws.normal_equations import (
     SelectedRows,
     diagonal_bound,
 )
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Memo, Pattern
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
@@ -382,10 +382,10 @@ class InformationMetric(MetricRule[Information]):
             "and data allow, so the model or the noise is not as the law must take it"
         )
 
-    def notes(self, state: Information, q: Array, length: float) -> Mapping[str, Any]:
+    def diagnostics(self, state: Information, q: Array, length: float) -> Diagnostics[float]:
         spread = state.spread or 1.0
-        return {
-            "gain": PULL / (spread * length),
-            "information": float(state.total.sum()) / spread,
-            "departure": self.departure(state, q),
-        }
+        return Diagnostics(
+            gain=PULL / (spread * length),
+            information=float(state.total.sum()) / spread,
+            departure=self.departure(state, q),
+        )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 
 __all__ = ["Innovations"]
@@ -95,9 +96,10 @@ class Innovations:
         return np.minimum(np.maximum(correlation, -LARGEST_CORRELATION), LARGEST_CORRELATION)
 
     @property
-    def notes(self) -> dict[str, Array]:
-        """Notes on the innovations, each of shape (members,)."""
-        return {"innovation_ratio": self.ratio, "innovation_correlation": self.correlation}
+    def diagnostics(self) -> Diagnostics[Array]:
+        """Ratio and correlation, each of shape (members,)."""
+        ratio, correlation = self.ratio, self.correlation
+        return Diagnostics(innovation_ratio=ratio, innovation_correlation=correlation)
 
     @property
     def persistence(self) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -23,6 +23,7 @@ from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.members import changed, put, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.stepping import Interval
 
@@ -62,15 +63,15 @@ class _Pass:
 
 def iterate_starts(
     work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityState, dict[str, Array]]:
-    """Return all members after the iteration of those that are due, and notes on these."""
+) -> tuple[SensitivityState, Diagnostics[Array]]:
+    """Return all members after the iteration of those that are due, and diagnostics of these."""
     due, moved = state.assimilated >= state.start_due, np.full(len(state), np.nan)
     for k in np.flatnonzero(due).tolist() if due.any() else ():
         one, moved[k] = _iterated(work, take(state, k))
         state = put(state, k, one) if len(state) > 1 else one
     if np.isnan(moved).all():
-        return state, {}
-    return state, {"smoother_moved": moved} | state.now.innovations.notes
+        return state, Diagnostics()
+    return state, replace(state.now.innovations.diagnostics, smoother_moved=moved)
 
 
 def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[SensitivityState, float]:

@@ -7,15 +7,16 @@ operator in the place of G_Q/gain for each stage, and carries its statistics fro
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from livepde.fem import Moment
 from livepde.laws.coupled import Metric
 from livepde.laws.coupled.forms import StageForms
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 
@@ -104,9 +105,9 @@ class MetricRule(ABC, Generic[State]):
         """Return why an estimate is not to be believed; empty if it may be."""
         return ""
 
-    def notes(self, state: State, q: Array, length: float) -> Mapping[str, Any]:
-        """Return numbers worth keeping after a step."""
-        return {}
+    def diagnostics(self, state: State, q: Array, length: float) -> Diagnostics[float]:
+        """Return gain, information and departure after a step, as far as known."""
+        return Diagnostics()
 
 
 @dataclass(frozen=True, eq=False)

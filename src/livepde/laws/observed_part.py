@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
@@ -13,6 +12,7 @@ import numpy as np
 from livepde.laws.base import Problem
 from livepde.laws.metrics import NoState
 from livepde.laws.smoothing import Balance, NoiseDetector, SmoothingOperator
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Memo
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval
@@ -55,9 +55,9 @@ class ObservedPath(ABC):
     def find(self, z: Array, boundary: Array | None) -> Reconstructed:
         """Return u_alpha from measurements."""
 
-    def notes(self) -> Mapping[str, float]:
-        """Return numbers worth keeping, at the end of the interval."""
-        return {}
+    def diagnostics(self) -> Diagnostics[float]:
+        """Return smoothing and misfit at the end of the interval, as far as known."""
+        return Diagnostics()
 
 
 class ObservedPart(ABC, Generic[State]):
@@ -116,9 +116,9 @@ class _RegularizedPath(ObservedPath):
         present = self.interval.present
         return self.problem.observed.reconstruct(z, boundary=boundary, present=present)
 
-    def notes(self) -> Mapping[str, float]:
+    def diagnostics(self) -> Diagnostics[float]:
         found = self.at(self.interval.t1)
-        return {"alpha": found.alpha, "misfit": found.misfit}
+        return Diagnostics(alpha=found.alpha, misfit=found.misfit)
 
 
 class SelfChosenSmoothing(ObservedPart[Balance]):
@@ -175,5 +175,5 @@ class _SmoothedPath(_InversePath):
         known = np.zeros(self.problem.model.X.dim) if boundary is None else boundary
         return Reconstructed(self.smoother(self.alpha, z, known), self.alpha, 0.0, None)
 
-    def notes(self) -> Mapping[str, float]:
-        return {"alpha": self.alpha}
+    def diagnostics(self) -> Diagnostics[float]:
+        return Diagnostics(alpha=self.alpha)

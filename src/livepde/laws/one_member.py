@@ -35,6 +35,7 @@ from livepde.laws.sensitivity_state import (
     stored,
     without_past,
 )
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.stepping import Interval
 
 __all__ = ["step_alone"]
@@ -81,10 +82,9 @@ def _assimilated(
     one = np.ones(1, dtype=bool)
     if not state.replays[0]:
         if (guards := work.guards) is not None:
-            x, notes = _iterated(work, guards, state, interval, x)
-            if notes:
-                told = {name: float(value[0]) for name, value in x.innovations.notes.items()}
-                report = replace(report, notes={**report.notes, **told, **notes})
+            x, done = _iterated(work, guards, state, interval, x)
+            if done is not None:
+                report = report.updated(x.innovations.diagnostics.member(0).updated(done))
         state = stored(work, state, work.filter.relinearised(x), span, one)
         return state, report
     state = stored(work, state, x, span, one)
@@ -99,15 +99,15 @@ def _iterated(
     state: SensitivityState,
     interval: Interval,
     x: FilterState,
-) -> tuple[FilterState, dict[str, float]]:
-    """Return the filter after a sample that may have moved it too far, and notes.
+) -> tuple[FilterState, Diagnostics[float] | None]:
+    """Return the filter after a sample that may have moved it too far, and what was done, or None.
 
     The cure of an excessive move is a replay of this one sample from the start of its interval. The
     search follows neither ledger nor discretisation errors, which cost as much again.
     """
     before = state.now
     if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
-        return x, {}
+        return x, None
     filter_, kept = work.filter, x.kept
 
     def levelled(x: FilterState, tempered: int) -> FilterState:
@@ -116,7 +116,7 @@ def _iterated(
         return changed(x, level=before.level, samples=before.samples)
 
     for temper in range(guards.temperings + 1):
-        tempered = {"tempered": 1.0} if temper else {}
+        tempered = Diagnostics(tempered=1.0) if temper else None
         begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
         if temper:
             x, _ = _filtered(work, begin, interval)
@@ -138,8 +138,8 @@ def _iterated(
                 x, report = _filtered(work, placed(filter_, last, q), interval)
                 if not report.status.ok:
                     break
-                return levelled(x, temper), {"iterated": 1.0, **tempered}
-    return _filtered(work, before, interval.silent)[0], {"held": 1.0}
+                return levelled(x, temper), replace(tempered or Diagnostics(), iterated=1.0)
+    return _filtered(work, before, interval.silent)[0], Diagnostics(held=1.0)
 
 
 def _rescued(
@@ -170,11 +170,11 @@ def _rescued(
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
         again, found = _retaken(work, state, start, row, silent)
         if not astray(found):
-            notes = {**found.notes, "restarted": 1.0}
-            return changed(without_past(again), scale=scale), replace(found, notes=notes)
+            found = found.updated(Diagnostics(restarted=1.0))
+            return changed(without_past(again), scale=scale), found
     if not report.status.ok:
         return state, report
-    return changed(new, scale=scale), replace(report, notes={**report.notes, "runaway": 1.0})
+    return changed(new, scale=scale), report.updated(Diagnostics(runaway=1.0))
 
 
 def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
@@ -212,7 +212,7 @@ def _watched(
     astray with them, and earlier measurements do not belong to the present values of the unknowns.
     """
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
-        return new, replace(report, notes={**report.notes, "jump": 0.0})
+        return new, report
     e = new.now.innovations.newest
     watch, alarms = jumps.add(state.watch, e)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
@@ -237,5 +237,6 @@ def _watched(
         else:
             now = work.filter.relinearised(new.now)
             new = new_window(work, work.filter.inflated(now, jumps.size, work.jumping), new)
-        report = replace(report, notes={**report.notes, "jump_samples": float(len(known) - before)})
-    return new, replace(report, notes={**report.notes, "jump": float(alarm)})
+        since = float(len(known) - before)
+        report = report.updated(Diagnostics(jump=1.0, jump_samples=since))
+    return new, report

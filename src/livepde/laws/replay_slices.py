@@ -14,6 +14,7 @@ from livepde.laws.history import first_interval, following, span_between
 from livepde.laws.members import changed, join, put, take
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 
 __all__ = ["finish_replays", "replay_slice"]
@@ -23,11 +24,11 @@ AT_ONCE = 32  # samples: a replay of so few is not divided
 
 def replay_slice(
     work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityState, dict[str, Array]]:
-    """Return all members after a slice of their replays, and notes on those that have ended."""
+) -> tuple[SensitivityState, Diagnostics[Array]]:
+    """Return all members after a slice of their replays, and diagnostics where they ended."""
     replay = work.replay
     if replay is None:
-        return state, {}
+        return state, Diagnostics()
     due = (state.assimilated >= state.due) & ~state.replay.active
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
@@ -45,11 +46,11 @@ def _with(state: SensitivityState, k: int, replay: ReplayState) -> SensitivitySt
 
 def _advanced(
     work: SensitivityWork, state: SensitivityState, most: float
-) -> tuple[SensitivityState, dict[str, Array]]:
-    """Return all members after at most so many stored samples of each, and notes."""
+) -> tuple[SensitivityState, Diagnostics[Array]]:
+    """Return all members after at most so many stored samples of each, and diagnostics."""
     which = np.flatnonzero(state.replay.active)
     if not len(which):
-        return state, {}
+        return state, Diagnostics()
     # Those that replay are apart, so that no stored sample copies the others, or the log.
     part = take(state, which) if len(which) < len(state) else state
     ended, taken = np.zeros(len(which), dtype=bool), 0
@@ -62,17 +63,16 @@ def _advanced(
             part, ended[k] = _turned(work, part, k, k in failed)
             failures[k] = ended[k] and k in failed
         taken += 1
-    told = {"replay_left": (ended, part.replay.distance), "replay_failed": (failures, 1.0 * ended)}
-    notes = {}
-    for name, (some, values) in told.items():
-        if some.any():
-            notes[name] = np.full(len(state), np.nan)
-            notes[name][which[some]] = values[some]
+    told: Diagnostics[Array] = Diagnostics()
+    if ended.any():
+        left, wrong = np.full((2, len(state)), np.nan)
+        left[which[ended]], wrong[which[failures]] = part.replay.distance[ended], 1.0
+        told = Diagnostics(replay_left=left, replay_failed=wrong)
     if len(which) == len(state):
-        return part, notes
+        return part, told
     log = state.log
     part, state = (changed(one, log=one.log[:, :0]) for one in (part, state))
-    return changed(put(state, which, part), log=log), notes
+    return changed(put(state, which, part), log=log), told
 
 
 def _window(work: SensitivityWork, state: SensitivityState, now: FilterState) -> Window:

@@ -389,10 +389,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         taken = np.array([status.ok for status in reports.statuses])
         if not taken.any():
             return new, reports
-        new, notes = replay_slice(work, new)
+        new, replayed = replay_slice(work, new)
         new, started = iterate_starts(work, new)
-        told = {name: np.where(taken, values, np.nan) for name, values in started.items()}
-        return shortened(work, new), reports.with_notes({**notes, **told})
+        started = started.each(lambda number: np.where(taken, number, np.nan))
+        return shortened(work, new), reports.updated(replayed).updated(started)
 
     def _after(
         self, work: SensitivityWork, state: SensitivityState, span: Span

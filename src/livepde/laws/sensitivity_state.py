@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.base import InitialReading, Notes
+from livepde.laws.base import InitialReading
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.guards import Guards, Scale
@@ -18,6 +18,7 @@ from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.members import changed, where, zeros
 from livepde.laws.replay import Replay, ReplayState
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 
@@ -218,25 +219,25 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
     if shadows is not None:
         now = changed(now, kept=now.kept.forgotten())
 
-    def notes() -> dict[str, Array]:
-        found = innovations.notes
+    def diagnosed() -> Diagnostics[Array]:
+        found = innovations.diagnostics
         if work.options.adaptive:
-            found["noise_level"] = np.sqrt(level)
+            found = replace(found, noise_level=np.sqrt(level))
         if work.options.gate < np.inf:
-            found["refused"] = told.refused
+            found = replace(found, refused=told.refused)
         if work.jumps is not None:
-            found["jump"] = np.zeros(members)
+            found = replace(found, jump=np.zeros(members))
         if shadows is not None:
-            found |= shadows.notes(now)
+            found = found.updated(shadows.diagnostics(now))
         estimate = q + da @ reduction.Phi.T
         if reduction.bounded(estimate) is not estimate:
             held = reduction.held(estimate)
             if held.any():  # not only by bounds that a user has set
-                found["bounded"] = np.where(held > 0, held, np.nan)
+                found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
     steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, Notes(notes))
+    return MemberReports((OK,) * members, told.predicted, steps, cache(diagnosed))
 
 
 def new_window(

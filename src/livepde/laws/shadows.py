@@ -30,8 +30,10 @@ from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.members import changed, put, take
 from livepde.laws.shadow_state import ShadowState
+from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import TINY, KeptFactors, Moments, Span
+from livepde.verdict import Shifts
 
 __all__ = ["KINDS", "ShadowSet", "Shadows"]
 
@@ -581,17 +583,14 @@ class ShadowSet:
                 u[:, row] += more
         return u, s.a
 
-    def notes(self, x: FilterState) -> dict[str, Array]:
-        """Return notes on the shifts of the unknowns, each of shape (members,).
+    def diagnostics(self, x: FilterState) -> Diagnostics[Array]:
+        """Return the shifts of the unknowns, numbers of shape (members,).
 
-        For each number, the shift by each kind of error in the unit of the number (`k_step_shift`).
-        In standard deviations as reported without the shifts: the largest shift by all kinds
-        together (`discretisation_shift`), and those by each kind at the same unknown
-        (`step_shift`).
+        Standard deviations are as reported without the shifts.
         """
         reduction, latent = self.filter.reduction, self.filter.problem.model.latent
         C = robust_factors(self.filter, x)[1]
-        found: dict[str, list[float]] = {}
+        found = []
         for k, a in enumerate(x.shadows.a):
             q = reduction.bounded(x.q[k] + reduction.Phi @ x.da[k])
             each = latent.tangent(q, reduction.Phi @ a.T)  # (m, shadows)
@@ -599,21 +598,18 @@ class ShadowSet:
             shift = each / np.where(std > 0.0, std, np.inf)[:, None]
             total = np.abs(shift[:, self.counted].sum(axis=1))
             worst = int(np.argmax(np.where(np.isfinite(total), total, -1.0)))
-            numbers = {"discretisation_shift": float(total[worst])}
+            sizes, unknowns = {}, {}
             for row, kind in enumerate(self.kinds):
                 # Held inputs have no part in the total, and so their own worst unknown.
                 at_worst = worst if kind != HELD else int(np.argmax(np.abs(shift[:, row])))
-                numbers[f"{kind}_shift"] = float(shift[at_worst, row])
+                sizes[kind] = float(shift[at_worst, row])
                 for label, at in latent.space.labels.items():
-                    numbers[f"{label}_{kind}_shift"] = float(each[at, row])
-            for name, value in numbers.items():
-                found.setdefault(name, []).append(value)
-        told = {name: np.array(values) for name, values in found.items()}
-        if x.shadows.failed.any():
-            told["shadow_failed"] = x.shadows.failed.astype(float)
-        if self.refused:
-            told["mesh_unfollowed"] = np.ones(len(x))
-        return told
+                    unknowns[label, kind] = float(each[at, row])
+            shifts = Shifts(float(total[worst]), sizes, unknowns)
+            failed = float(x.shadows.failed[k]) if x.shadows.failed.any() else np.nan
+            refused = 1.0 if self.refused else np.nan
+            found.append(Diagnostics(shadow_failed=failed, mesh_unfollowed=refused, shifts=shifts))
+        return stacked(found)
 
     def widening(self, x: FilterState) -> tuple[Array, Array]:
         """Return the row of the square root [U C] that is reported for all shifts together.

@@ -11,7 +11,7 @@ import numpy as np
 from livepde.dates import when
 from livepde.plots.dataset import note, scalars
 from livepde.runs.summary import digits, jumps
-from livepde.verdict import FLAT, REFINE, Finding, Severity, at_bound, discretised, flat
+from livepde.verdict import FLAT, REFINE, Finding, Severity, Shifts, at_bound, discretised, flat
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -317,12 +317,18 @@ def _departure(data: xr.Dataset) -> list[str]:
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
     """Return findings on shifts of the final unknowns by discretisation errors."""
-    labels = scalars(data)
-    kinds = [f"{kind}_shift" for kind in ("discretisation", *REFINE)]
-    names = [*kinds, *(f"{label}_{kind}" for label in labels for kind in kinds[1:])]
-    noted = {name: note(data, name) for name in names}
-    last = {name: float(values[-1]) for name, values in noted.items() if values is not None}
-    return list(discretised(last, labels))
+    largest = _last(data, "discretisation_shift")
+    sizes = {kind: _last(data, f"{kind}_shift") for kind in REFINE}
+    pairs = [(label, kind) for label in scalars(data) for kind in REFINE]
+    shifts = {(label, kind): _last(data, f"{label}_{kind}_shift") for label, kind in pairs}
+    known = {kind: size for kind, size in sizes.items() if math.isfinite(size)}
+    return list(discretised(Shifts(largest, known, shifts)))
+
+
+def _last(data: xr.Dataset, name: str) -> float:
+    """Return the last value of a diagnostic, NaN without."""
+    values = note(data, name)
+    return math.nan if values is None else float(values[-1])
 
 
 def _gain(data: xr.Dataset) -> list[str]:

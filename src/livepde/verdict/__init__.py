@@ -6,20 +6,18 @@ from livepde.verdict.findings import (
     FLAT,
     LEVELS,
     MOST,
-    REFINE,
     TELLING,
     Cause,
     Finding,
     Severity,
     Verdict,
     at_bound,
-    discretised,
     flat,
-    held_inputs,
 )
 from livepde.verdict.inputs import InputLedger
 from livepde.verdict.judge import Judge, Seen
 from livepde.verdict.ledger import WINDOWS, Ledger
+from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
 from livepde.verdict.withheld import WithheldLedger
 
 __all__ = [
@@ -39,6 +37,7 @@ __all__ = [
     "ScoreDirection",
     "Seen",
     "Severity",
+    "Shifts",
     "Verdict",
     "WithheldLedger",
     "assess",

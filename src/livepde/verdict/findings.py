@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
@@ -13,7 +13,6 @@ __all__ = [
     "FLAT",
     "LEVELS",
     "MOST",
-    "REFINE",
     "TELLING",
     "Cause",
     "Finding",
@@ -22,9 +21,7 @@ __all__ = [
     "Verdict",
     "at_bound",
     "channel_setting",
-    "discretised",
     "flat",
-    "held_inputs",
 ]
 
 Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
@@ -36,21 +33,6 @@ RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
 FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
-SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
-DECIDES = 5.0  # the same, from which the interval is little else
-SETTING = 1.0  # the same if inputs are readings: no interval holds that
-REFINE = {
-    "step": (
-        "the time step",
-        "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
-    ),
-    "mesh": ("the mesh", "Take more elements, where the state bends most."),
-    "input": (
-        "the straight lines between readings of the input channels",
-        "Read these channels more often.",
-    ),
-}
-"""Kind of a discretisation error -> its name, and the remedy."""
 LARGEST = 1e99  # evidence beyond is written as that
 
 
@@ -196,56 +178,6 @@ def flat(label: str, left: float) -> Finding:
         "is left."
     )
     return Finding("flat", "caution", text, label, left, remedy=TELLING)
-
-
-def discretised(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
-    """Return the finding that the discretisation has shifted the unknowns, if it has.
-
-    Parameters
-    ----------
-    notes
-        Of an estimate: `discretisation_shift`, and for each kind `step_shift` and `k_step_shift`.
-    labels
-        Of the unknown numbers.
-    """
-    total = notes.get("discretisation_shift", math.nan)
-    sizes = {kind: abs(notes[f"{kind}_shift"]) for kind in REFINE if f"{kind}_shift" in notes}
-    if not total > SHIFTED or not sizes:
-        return
-    kind = max(sizes, key=lambda kind: sizes[kind])
-    what, remedy = REFINE[kind]
-    moved = {label: notes.get(f"{label}_{kind}_shift", math.nan) for label in labels}
-    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
-    by = f" ({', '.join(parts[:MOST])})" if parts else ""
-    text = (
-        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
-        f"of it is {what}{by}. The intervals were widened by that."
-    )
-    severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
-    yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
-
-
-def held_inputs(notes: Mapping[str, float], labels: Iterable[str]) -> Iterator[Finding]:
-    """Return whether inputs that are held as settings would matter if they were readings.
-
-    Parameters
-    ----------
-    notes
-        Of an estimate: `hold_shift`, and `k_hold_shift`.
-    """
-    total = abs(notes.get("hold_shift", math.nan))
-    if not total > SETTING:
-        return
-    moved = {label: -notes.get(f"{label}_hold_shift", math.nan) for label in labels}
-    parts = [f"{label} by {size:+.2g}" for label, size in moved.items() if math.isfinite(size)]
-    by = f" ({', '.join(parts[:MOST])})" if parts else ""
-    text = (
-        "Inputs are held from sample to sample (hold), but change as smoothly as readings do: as "
-        f"straight lines they would move the unknowns by {total:.1f} standard deviations{by}. The "
-        "intervals do not hold that."
-    )
-    remedy = "Leave out hold, unless these inputs are settings that change in steps."
-    yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from livepde.linalg import Array, IntArray
 from livepde.verdict.findings import Finding
+from livepde.verdict.shifts import Shifts
 
 __all__ = ["InputLedger"]
 
@@ -48,25 +49,17 @@ class InputLedger:
         each = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
         return {name: (held, again) for name, held, again in each if held or again}
 
-    def findings(
-        self, names: Sequence[str], notes: Mapping[str, float], labels: Sequence[str]
-    ) -> Iterator[Finding]:
+    def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
         """Return which channels were held in more than 2 % of the samples.
 
         Parameters
         ----------
-        notes
-            Of the estimate, with the shift of each unknown by its inputs: `k_input_shift`.
-        labels
-            Of the unknown numbers.
+        shifts
+            Of the estimate, with the shift of each unknown by its inputs.
         """
         samples = max(int(self.counts[0]), 1)
-        shifts = {
-            label: notes[f"{label}_input_shift"]
-            for label in labels
-            if f"{label}_input_shift" in notes
-        }
-        by = ", ".join(f"{label} by {-size:+.2g}" for label, size in shifts.items())
+        each = shifts.by("input").items()
+        by = ", ".join(f"{label} by {-shift:+.2g}" for label, shift in each)
         moved = (
             f" Straight lines across the gaps would move the estimates roughly so: {by}."
             if by

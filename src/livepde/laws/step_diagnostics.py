@@ -1,0 +1,153 @@
+"""Diagnostics of a step: innovation statistics, safeguards, jumps, shifts, numbers of a law."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from livepde.linalg import Array
+from livepde.verdict import Shifts
+from livepde.verdict.shifts import NOT_KNOWN, known
+
+__all__ = ["Diagnostics", "stacked"]
+
+Number = TypeVar("Number")
+Other = TypeVar("Other")
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnostics(Generic[Number]):
+    """Diagnostics of a step; NaN where a law has no such number.
+
+    A number is a float, or an array over members. In tables and files it has the name of its
+    attribute.
+
+    >>> found = Diagnostics(alpha=2.0, extra={"damping": 3.0})
+    >>> found.alpha, found.jump, found.named()
+    (2.0, nan, {'alpha': 2.0, 'damping': 3.0})
+
+    Attributes
+    ----------
+    innovation_ratio
+        Mean normalised innovation squared (NIS) for each reading; 1 if the noise is as stated.
+    innovation_correlation
+        Correlation of successive innovations; 0 if the model explains the data.
+    noise_level
+        Noise found, over that stated.
+    refused
+        Readings that the gate refused.
+    bounded
+        Coefficients that a bound holds.
+    iterated, tempered, held, restarted, runaway
+        1 if a safeguard has done so with the sample: see `Guards`.
+    smoother_moved
+        Distance by which the iterated smoother of the start has moved the unknowns, in standard
+        deviations.
+    replay_left, replay_failed
+        When a replay ends: distance between the last two trajectories, and 1 if it has failed.
+    jump, jump_samples
+        1 if the test for sudden changes has raised an alarm, and samples since the change.
+    drift, drifting, prior_scale, awake
+        Means over the members of `AutoLaw`: drift of the unknowns per unit of time, share of
+        those that drift, factor of the prior; and the number of members that step.
+    residual
+        Norm of r in X for `GradientLaw` and its relatives.
+    alpha, misfit
+        Smoothing of the observed part, and the distance of u_alpha from the sample.
+    gain, information, departure
+        Gain, information about q and departure from the prior for `gain="auto"`.
+    at_rest
+        1 if q was held because nothing excites it.
+    shadow_failed, mesh_unfollowed
+        Steps in which a discretisation error could not be followed; 1 if that of the mesh is not.
+    shifts
+        Shifts of the unknowns by errors of the discretisation.
+    extra
+        Name -> number: diagnostics of a law of one's own.
+    """
+
+    innovation_ratio: Number = NOT_KNOWN
+    innovation_correlation: Number = NOT_KNOWN
+    noise_level: Number = NOT_KNOWN
+    refused: Number = NOT_KNOWN
+    bounded: Number = NOT_KNOWN
+    iterated: Number = NOT_KNOWN
+    tempered: Number = NOT_KNOWN
+    held: Number = NOT_KNOWN
+    restarted: Number = NOT_KNOWN
+    runaway: Number = NOT_KNOWN
+    smoother_moved: Number = NOT_KNOWN
+    replay_left: Number = NOT_KNOWN
+    replay_failed: Number = NOT_KNOWN
+    jump: Number = NOT_KNOWN
+    jump_samples: Number = NOT_KNOWN
+    drift: Number = NOT_KNOWN
+    drifting: Number = NOT_KNOWN
+    prior_scale: Number = NOT_KNOWN
+    awake: Number = NOT_KNOWN
+    residual: Number = NOT_KNOWN
+    alpha: Number = NOT_KNOWN
+    misfit: Number = NOT_KNOWN
+    gain: Number = NOT_KNOWN
+    information: Number = NOT_KNOWN
+    departure: Number = NOT_KNOWN
+    at_rest: Number = NOT_KNOWN
+    shadow_failed: Number = NOT_KNOWN
+    mesh_unfollowed: Number = NOT_KNOWN
+    shifts: Shifts[Number] = field(default_factory=Shifts)
+    extra: Mapping[str, Number] = field(default_factory=dict)
+
+    def named(self) -> dict[str, Number]:
+        """Return the numbers that are known, by their names in tables and files."""
+        found = self._own() | self.shifts.named() | dict(self.extra)
+        return {name: number for name, number in found.items() if known(number)}
+
+    def each(self, change: Callable[[Number], Other]) -> Diagnostics[Other]:
+        """Return the diagnostics with a function of each number that is known."""
+        extra = {name: change(number) for name, number in self.extra.items()}
+        own = {name: change(number) for name, number in self._own().items() if known(number)}
+        return Diagnostics(**own, shifts=self.shifts.each(change), extra=extra)
+
+    def updated(self, more: Diagnostics[Number]) -> Diagnostics[Number]:
+        """Return the diagnostics with all that others know instead."""
+        found = {name: number for name, number in more._own().items() if known(number)}
+        if more.shifts.sizes:
+            found["shifts"] = more.shifts
+        return replace(self, **found, extra={**self.extra, **more.extra})
+
+    def member(self: Diagnostics[Array], k: int) -> Diagnostics[float]:
+        """Return those of one member."""
+        return self.each(lambda number: float(number[k]))
+
+    def _own(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in OWN}
+
+
+OWN = tuple(item.name for item in fields(Diagnostics) if item.name not in ("shifts", "extra"))
+
+
+def stacked(members: Sequence[Diagnostics[float]]) -> Diagnostics[Array]:
+    """Return diagnostics of members as arrays, with NaN for members without."""
+
+    def column(numbers: Sequence[float]) -> Any:
+        values = np.array(numbers)
+        return NOT_KNOWN if np.isnan(values).all() else values
+
+    def columns(tables: Sequence[Mapping[Any, float]]) -> dict[Any, Any]:
+        names = dict.fromkeys(name for table in tables for name in table)
+        return {name: column([table.get(name, math.nan) for table in tables]) for name in names}
+
+    shifts = [one.shifts for one in members]
+    return Diagnostics(
+        **columns([one._own() for one in members]),
+        shifts=Shifts(
+            column([one.largest for one in shifts]),
+            columns([one.sizes for one in shifts]),
+            columns([one.unknowns for one in shifts]),
+        ),
+        extra=columns([one.extra for one in members]),
+    )

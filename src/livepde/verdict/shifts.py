@@ -1,0 +1,118 @@
+"""Shifts of the unknowns by errors of the discretisation, and the findings on them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+
+from livepde.verdict.findings import Finding, Severity
+
+__all__ = ["NOT_KNOWN", "REFINE", "Shifts", "discretised", "held_inputs", "known"]
+
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+DECIDES = 5.0  # the same, from which the interval is little else
+SETTING = 1.0  # the same if inputs are readings: no interval holds that
+HOLD = "hold"
+SAID = 5  # unknowns in a sentence
+REFINE = {
+    "step": (
+        "the time step",
+        "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
+    ),
+    "mesh": ("the mesh", "Take more elements, where the state bends most."),
+    "input": (
+        "the straight lines between readings of the input channels",
+        "Read these channels more often.",
+    ),
+}
+"""Kind of a discretisation error -> its name, and the remedy."""
+
+NOT_KNOWN: Any = math.nan
+Number = TypeVar("Number")
+Other = TypeVar("Other")
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts(Generic[Number]):
+    """Shifts of the unknown numbers by errors that are followed beside the filter.
+
+    Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
+    members.
+
+    Attributes
+    ----------
+    largest
+        Largest shift of an unknown by all kinds together, in standard deviations; NaN: not known.
+    sizes
+        Kind -> shift of that unknown, in standard deviations.
+    unknowns
+        (Label of an unknown, kind) -> its shift, in the unit of the unknown.
+    """
+
+    largest: Number = NOT_KNOWN
+    sizes: Mapping[str, Number] = field(default_factory=dict)
+    unknowns: Mapping[tuple[str, str], Number] = field(default_factory=dict)
+
+    def by(self, kind: str) -> dict[str, Number]:
+        """Return label -> shift by one kind of error."""
+        return {label: shift for (label, of), shift in self.unknowns.items() if of == kind}
+
+    def named(self) -> dict[str, Number]:
+        """Return the numbers by their names in tables and files, NaN among them."""
+        sizes = {f"{kind}_shift": size for kind, size in self.sizes.items()}
+        shifts = {f"{label}_{kind}_shift": shift for (label, kind), shift in self.unknowns.items()}
+        return {"discretisation_shift": self.largest, **sizes, **shifts}
+
+    def each(self, change: Callable[[Number], Other]) -> Shifts[Other]:
+        """Return the shifts with a function of each number that is known."""
+        return Shifts(
+            change(self.largest) if known(self.largest) else NOT_KNOWN,
+            {kind: change(size) for kind, size in self.sizes.items()},
+            {pair: change(shift) for pair, shift in self.unknowns.items()},
+        )
+
+
+def known(number: Any) -> bool:
+    """Return whether a number, or an array over members, is known: that is not NaN alone."""
+    return bool(np.ndim(number)) or not math.isnan(number)
+
+
+def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
+    """Return the finding that the discretisation has shifted the unknowns, if it has."""
+    total = shifts.largest
+    sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
+    if not total > SHIFTED or not sizes:
+        return
+    kind = max(sizes, key=lambda kind: sizes[kind])
+    what, remedy = REFINE[kind]
+    text = (
+        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
+        f"of it is {what}{_listed(shifts.by(kind))}. The intervals were widened by that."
+    )
+    severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
+    yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
+
+
+def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
+    """Return whether inputs that are held as settings would matter if they were readings."""
+    total = abs(shifts.sizes.get(HOLD, math.nan))
+    if not total > SETTING:
+        return
+    moved = {label: -shift for label, shift in shifts.by(HOLD).items()}
+    text = (
+        "Inputs are held from sample to sample (hold), but change as smoothly as readings do: as "
+        f"straight lines they would move the unknowns by {total:.1f} standard "
+        f"deviations{_listed(moved)}. The intervals do not hold that."
+    )
+    remedy = "Leave out hold, unless these inputs are settings that change in steps."
+    yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
+
+
+def _listed(shifts: Mapping[str, float]) -> str:
+    """Return the shifts of the first unknowns in parentheses."""
+    parts = [f"{label} by {shift:+.2g}" for label, shift in shifts.items() if math.isfinite(shift)]
+    return f" ({', '.join(parts[:SAID])})" if parts else ""
