@@ -21,7 +21,7 @@ from livepde.cases import Case, load
 from livepde.cases.template import write_template
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange import export_fmu
-from livepde.exchange.process import UnitProcess, of_case
+from livepde.exchange.unit_process import UnitProcess, of_case
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched

@@ -19,7 +19,7 @@ from livepde.cases import load
 from livepde.errors import ConfigurationError
 from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import SampleFeed
-from livepde.runs.live import Live
+from livepde.runs.live_loop import Live
 
 __all__ = ["journal"]
 

@@ -39,7 +39,7 @@ from livepde.result import Estimate
 from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.database import log_of
 from livepde.runs.feeds import SampleFeed
-from livepde.runs.live import Live, Retention
+from livepde.runs.live_loop import Live, Retention
 from livepde.stepping import Advance, simulate
 
 __all__ = ["soak"]

@@ -15,7 +15,14 @@ import numpy as np
 
 import livepde as lp
 from livepde.diagnostics import Errors, Spaces, TwinTracker, bounds, conditions, constants
-from livepde.laws.bounds import Constants, ExactBound, Norms, nu_exact, theta_exact, theta_noisy
+from livepde.laws.damping_bounds import (
+    Constants,
+    ExactBound,
+    Norms,
+    nu_exact,
+    theta_exact,
+    theta_noisy,
+)
 from livepde.reproduce import seed
 from livepde.streams import RelativeNoise, Twin
 

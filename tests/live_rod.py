@@ -11,7 +11,7 @@ import livepde as lp
 from livepde.result import layout_of
 from livepde.runs.feeds import Gathered
 from livepde.runs.journal import Journal
-from livepde.runs.live import Live
+from livepde.runs.live_loop import Live
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow

@@ -19,7 +19,7 @@ from commands import call, estimates, until
 from patience import PATIENCE
 
 from livepde import Fleet, cases, runs
-from livepde.cases import together
+from livepde.cases import members_together
 from livepde.cases.template import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
@@ -159,7 +159,7 @@ def test_an_interruption_ends_all(here, monkeypatch):
         begun.append(member.name)
         return module.Ended(begun[-1], "interrupted" if len(begun) == 2 else "finished")
 
-    module = sys.modules["livepde.cli.fleet"]
+    module = sys.modules["livepde.cli.fleet_command"]
     monkeypatch.setattr(module.Runs, "_alone", alone)
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\nlast,\n")
     code, _ = call(
@@ -348,7 +348,7 @@ def test_the_summary_is_written_also_if_the_command_fails(here, monkeypatch):
             raise ZeroDivisionError
         return alone(self, member, prepared)
 
-    module = sys.modules["livepde.cli.fleet"]
+    module = sys.modules["livepde.cli.fleet_command"]
     alone = module.Runs._alone
     monkeypatch.setattr(module.Runs, "_alone", defect)
     with pytest.raises(ZeroDivisionError):
@@ -434,7 +434,7 @@ def test_what_it_leaves_serves_other_commands(alike):
 def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
     """A journal that is written piece by piece is the same as one that is written at once."""
     call(*FIRST, "rods")
-    monkeypatch.setattr(together, "WAITING", 500)
+    monkeypatch.setattr(members_together, "WAITING", 500)
     extend, pieces = Journal.extend, []
 
     def told(journal, rows, state):
@@ -458,7 +458,7 @@ def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
 def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
     """Separately from what was written, or together where nothing was."""
     call(*FIRST, "rods")
-    monkeypatch.setattr(together, "WAITING", waiting)
+    monkeypatch.setattr(members_together, "WAITING", waiting)
     stepped = Fleet.step
 
     def step(self, t, z, inputs=None):

@@ -11,7 +11,7 @@ import pytest
 from live_rod import COLUMNS, OPENED, live, rows
 
 from livepde.runs.feeds import Gathered, shifted
-from livepde.runs.live import Live
+from livepde.runs.live_loop import Live
 from livepde.streams.clock import Clock
 from livepde.streams.intake import AGREE, INSIST, Intake, Policy
 from livepde.streams.sources import Follow, Rows

@@ -6,7 +6,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws.covariance import robust_factors
-from livepde.laws.members import changed
+from livepde.laws.member_arrays import changed
 
 
 def learned(evolution=None, readings=60, size=1.0, noise=0.05):

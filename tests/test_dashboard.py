@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import cards, cuts, fields, figures, panels, serve, times
+from livepde.dashboard import cards, cuts, field_views, figures, panels, serve, times
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
 from livepde.models import heat
@@ -132,7 +132,9 @@ def test_looking_back_shows_the_fields_of_then():
 
     def profile(at):
         (estimate,) = (
-            trace for trace in fields.field_profile(data, "u", at).data if trace.name == "estimate"
+            trace
+            for trace in field_views.field_profile(data, "u", at).data
+            if trace.name == "estimate"
         )
         return estimate.y
 
@@ -203,7 +205,7 @@ def test_a_map_is_exact_for_what_is_linear(kind):
 
 def test_sensors_are_on_the_map():
     data = dataset("triangle", count=1)
-    sensor, withheld = fields.field_map(data, "u").data[1:]
+    sensor, withheld = field_views.field_map(data, "u").data[1:]
     assert [*sensor.text, *sensor.x, *sensor.y] == ["a", 0.6, 0.4]
     assert [*withheld.text, *withheld.x, *withheld.y] == ["b", 0.3, 0.4]
 

@@ -33,8 +33,8 @@ from livepde.exchange import (
     river_regressor,
 )
 from livepde.exchange.component import Component
-from livepde.exchange.process import REFUSED, WAITING, of_code
 from livepde.exchange.recipe import recipe_of
+from livepde.exchange.unit_process import REFUSED, WAITING, of_code
 from livepde.models import heat
 
 fmpy = pytest.importorskip("fmpy")

@@ -24,14 +24,14 @@ from skfem import MeshHex, MeshTri
 
 import livepde as lp
 from livepde import runs
-from livepde.dashboard.report import write_report
+from livepde.dashboard.html_report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
 from livepde.models import heat
 from livepde.plots import interval_95
 from livepde.result import layout_of
 from livepde.runs import Check, RunWriter, drive, tables
 from livepde.runs.conventions import udunits
-from livepde.runs.export import cf, export
+from livepde.runs.exported import cf, export
 from livepde.runs.journal import Event, Journal
 
 ORIGIN = "2025-04-01 06:00:00"

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.data_sources import source_of
 from livepde.cases.measured import measured
-from livepde.cases.sources import source_of
 from livepde.cases.template import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS

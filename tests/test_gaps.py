@@ -13,7 +13,7 @@ from live_rod import CLOCK
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.live import Wiring
+from livepde.cases.live_case import Wiring
 from livepde.cli.run import batch, concluded, writer_of
 from livepde.streams import FillGaps, Table
 from livepde.streams.gaps import bridged, fill_table, filled_column, find_spikes

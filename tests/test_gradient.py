@@ -24,7 +24,7 @@ from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
 import livepde as lp
 from livepde.fem import Moment
 from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
-from livepde.laws.coupled import stage as stage_module
+from livepde.laws.coupled import coupled_stage as stage_module
 from livepde.laws.metrics import ConstantMetric
 from livepde.model import h1_form
 from livepde.stepping import ForwardStage, Near, StepFailed

@@ -11,7 +11,7 @@ from factories import driven_rod, readings
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.excitation import ExcitationLevel, Probes, pairs
+from livepde.laws.excitation_gate import ExcitationLevel, Probes, pairs
 from livepde.laws.guards import Scale
 from livepde.laws.history import added, empty_log, opened
 from livepde.reproduce import seed_excited

@@ -29,7 +29,7 @@ from livepde.runs import RunWriter, database
 from livepde.runs.database import in_use, log_of, written
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import KEPT_EVENTS, Event, Journal
-from livepde.runs.live import Live, Retention
+from livepde.runs.live_loop import Live, Retention
 from livepde.runs.salvage import Salvage
 from livepde.streams.intake import Intake
 from livepde.streams.sources import Follow, Rows, json_row
@@ -40,7 +40,7 @@ CHECKPOINT = 40  # samples between two checkpoints here: a run has several in le
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch):
-    monkeypatch.setattr("livepde.runs.live.CHECKPOINT", CHECKPOINT)
+    monkeypatch.setattr("livepde.runs.live_loop.CHECKPOINT", CHECKPOINT)
 
 
 def samples(count: int, after: float = -np.inf) -> SampleFeed:
@@ -261,7 +261,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
     calm.journal.close()
     writes, seen = itertools.count(1), []
     bad = {first, first + 1, first + 9, first + 80}  # also while it is mended
-    monkeypatch.setattr("livepde.runs.live.LOOK", 0.0)
+    monkeypatch.setattr("livepde.runs.live_loop.LOOK", 0.0)
     monkeypatch.setattr(
         "livepde.runs.journal.writer", lambda path: Failing(path, lambda: next(writes) in bad)
     )

@@ -24,7 +24,7 @@ import livepde as lp
 from livepde.diagnostics import Spaces, stopping
 from livepde.fem import Form, FunctionSpace, Moment, forms, measure
 from livepde.laws import information
-from livepde.observation import base, reconstruction
+from livepde.observation import operator, reconstruction
 
 SLOTS = [("v", "u"), ("v", "q"), ("q", "u"), ("q", "v"), ("u", "q"), ("u", "v")]
 
@@ -296,7 +296,7 @@ def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
     with pytest.raises(lp.errors.LawError, match="169 are too many, up to 100"):
         lp.Identifier(model, averages, lp.GradientLaw("auto"))
     lp.Identifier(model, lp.Full(), lp.GradientLaw("auto"))
-    monkeypatch.setattr(base, "LARGEST_PROJECTION", 10_000)
+    monkeypatch.setattr(operator, "LARGEST_PROJECTION", 10_000)
     with pytest.raises(lp.errors.ObservationError, match="169 rows with 121 entries each"):
         lp.Identifier(model, averages, lp.GradientLaw(1.0))
     lp.Identifier(model, averages, lp.SensitivityLaw(noise=0.1, modes=3))

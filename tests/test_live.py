@@ -24,7 +24,7 @@ from patience import PATIENCE
 import livepde as lp
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Event, Journal
-from livepde.runs.live import Backlog, Live
+from livepde.runs.live_loop import Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler

@@ -11,11 +11,11 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.fem import Inputs, Moment
-from livepde.laws.members import changed, join, put, take, where
+from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.linalg import Array
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, StageOfMembers
 from livepde.stepping.driven import DrivenVector
-from livepde.stepping.members import SeparateStages
+from livepde.stepping.member_stage import SeparateStages
 
 MESH = lp.interval(0.0, 1.0, 14)
 

@@ -14,8 +14,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.live import Wiring
-from livepde.cases.together import blocks
+from livepde.cases.live_case import Wiring
+from livepde.cases.members_together import blocks
 from livepde.errors import CaseError, ConfigurationError, SampleError
 from livepde.models import heat
 from livepde.runs.drive import drive, journal_of

@@ -12,8 +12,8 @@ from factories import CASES, line, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.coupled.forms import StageForms
-from livepde.laws.operators import diffusion_operator
+from livepde.laws.coupled.split_forms import StageForms
+from livepde.laws.diffusion_operators import diffusion_operator
 from livepde.reproduce import EXPERIMENTS, degenerate
 from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler

@@ -12,7 +12,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
 from livepde.laws.metrics import ConstantMetric
-from livepde.laws.relatives import _Linear
+from livepde.laws.related_laws import _Linear
 from livepde.model import mass_form
 from livepde.reproduce.relatives import EXPECTED, LAWS, law
 from livepde.stepping import Newton

@@ -18,16 +18,22 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import diagnostics as dg
 from livepde.errors import ConfigurationError
-from livepde.laws.bounds import Constants, ExactBound, Norms, SmoothedBound, unobserved_damping
-from livepde.laws.coupled.forms import StageForms
-from livepde.laws.operators import diffusion_operator
+from livepde.laws.coupled.split_forms import StageForms
+from livepde.laws.damping_bounds import (
+    Constants,
+    ExactBound,
+    Norms,
+    SmoothedBound,
+    unobserved_damping,
+)
+from livepde.laws.diffusion_operators import diffusion_operator
 from livepde.observation import Tikhonov
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise, Twin
 
 # The functions of the same names hide these modules in their package.
 constants_module = sys.modules["livepde.diagnostics.constants"]
-parts_module = sys.modules["livepde.diagnostics.parts"]
+parts_module = sys.modules["livepde.diagnostics.state_parts"]
 excitation_module = sys.modules["livepde.diagnostics.excitation"]
 
 ROOT = Path(__file__).parents[1]

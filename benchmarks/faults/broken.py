@@ -23,13 +23,13 @@ from benchmarks.faults.rod import Row, case_text, rod_rows
 from benchmarks.faults.run import hearing, undisturbed
 from livepde.cases import Case, load
 from livepde.cases.data import data_file
-from livepde.cases.sources import policy_of, source_of
+from livepde.cases.data_sources import policy_of, source_of
 from livepde.errors import LivepdeError
 from livepde.identifier import Sample
 from livepde.records import Record
 from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import Gathered
-from livepde.runs.live import Live
+from livepde.runs.live_loop import Live
 from livepde.streams.intake import Intake, IntakeOutcome, Ready
 from livepde.streams.sources import Source
 

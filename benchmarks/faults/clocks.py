@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.faults.plan import Plan
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from livepde.cases import load
-from livepde.cases.live import Wiring
+from livepde.cases.live_case import Wiring
 from livepde.runs import Check, Outcome, Table
 from livepde.streams.sources import Rows
 

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from livepde.cases.case import Case, Prepared, load
-from livepde.cases.live import Wiring
+from livepde.cases.live_case import Wiring
 
 __all__ = ["Case", "Prepared", "Wiring", "load"]

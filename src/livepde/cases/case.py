@@ -13,16 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.conditions import conditioned
-from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
-from livepde.cases.equations import resolve
-from livepde.cases.frame import Frame
-from livepde.cases.instruments import expanded
-from livepde.cases.laws import law_of
-from livepde.cases.process import drive_notes, mesh_of, model_of, options_of, process_notes
-from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import VariantSpec
-from livepde.cases.sensors import (
+from livepde.cases.case_channels import (
     columns_of,
     initial_of,
     initial_weights,
@@ -30,6 +21,15 @@ from livepde.cases.sensors import (
     observation_of,
     sensor_notes,
 )
+from livepde.cases.case_frame import Frame
+from livepde.cases.case_model import drive_notes, mesh_of, model_of, options_of, process_notes
+from livepde.cases.conditions import conditioned
+from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
+from livepde.cases.equations import resolve
+from livepde.cases.instruments import expanded
+from livepde.cases.laws import law_of
+from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
+from livepde.cases.schema import VariantSpec
 from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.frame import Frame
+from livepde.cases.case_frame import Frame
 from livepde.cases.read import did_you_mean
 from livepde.cases.regions import inside
 from livepde.cases.schema import BoundarySpec
@@ -16,7 +16,7 @@ from livepde.errors import ModelError
 from livepde.fem import Channel
 from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
-from livepde.models.conditions import Amount
+from livepde.models.boundary_conditions import Amount
 
 __all__ = ["conditioned", "held"]
 

@@ -13,8 +13,8 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from livepde.cases.case_frame import Frame
 from livepde.cases.code import check_options, load_code
-from livepde.cases.frame import Frame
 from livepde.cases.schema import CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from livepde.cases.frame import Frame
+from livepde.cases.case_frame import Frame
 from livepde.cases.limits import MEMBERS
 from livepde.cases.read import is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec

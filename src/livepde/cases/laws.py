@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.frame import Frame
+from livepde.cases.case_channels import noise_of
+from livepde.cases.case_frame import Frame
 from livepde.cases.instruments import unknowns_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
-from livepde.cases.sensors import noise_of
 from livepde.errors import LawError
 from livepde.laws import (
     AnyLaw,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.frame import Frame
+from livepde.cases.case_frame import Frame
 
 __all__ = ["inside", "sides_of"]
 

@@ -53,8 +53,8 @@ def export(
     ParaView: livepde export runs/mycase mycase.xdmf
     """
     from livepde import runs
-    from livepde.runs.export import FORMATS, NEEDS, need, refuse_file
-    from livepde.runs.export import export as write
+    from livepde.runs.exported import FORMATS, NEEDS, need, refuse_file
+    from livepde.runs.exported import export as write
 
     opened = runs.open(folder)
     known = [*FORMATS, REPORT]
@@ -77,7 +77,7 @@ def export(
     moment = None if at is None else _moment(at, opened.dataset)
     for target in targets:
         if target.suffix.lower() == REPORT:
-            from livepde.dashboard.report import write_report
+            from livepde.dashboard.html_report import write_report
 
             write_report(opened, target, force=force)
         else:

@@ -52,7 +52,7 @@ def fmu(
 
     Example:  livepde fmu mycase/case.toml --out rod.fmu
     """
-    from livepde.exchange.export import is_code, write_unit
+    from livepde.exchange.fmu_export import is_code, write_unit
     from livepde.exchange.recipe import recipe_of
 
     code = is_code(source)

@@ -19,10 +19,10 @@ from livepde.errors import DataError
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
-    from livepde.cases.live import Wiring
+    from livepde.cases.live_case import Wiring
     from livepde.result import Estimate
     from livepde.runs import Driven, RunWriter
-    from livepde.runs.live import Live, Sink
+    from livepde.runs.live_loop import Live, Sink
 
 __all__ = ["Beside", "beside"]
 
@@ -75,7 +75,7 @@ def beside(
         Writer of the run directory; the case with its result, None if the run ended before the
         first sample.
     """
-    from livepde.cases.live import Wiring
+    from livepde.cases.live_case import Wiring
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
     wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.speed))

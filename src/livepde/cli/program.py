@@ -16,7 +16,7 @@ from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.explain import explain
 from livepde.cli.export import export
-from livepde.cli.fleet import fleet
+from livepde.cli.fleet_command import fleet
 from livepde.cli.fmu import fmu
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report

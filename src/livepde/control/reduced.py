@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from livepde.control.affine import Discrete, Output
 from livepde.control.basis import basis
-from livepde.control.frame import GalerkinReduction, likely
+from livepde.control.galerkin import GalerkinReduction, likely
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array

@@ -12,7 +12,7 @@ import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard.fields import drawn_by, field_profile
+from livepde.dashboard.field_views import drawn_by, field_profile
 from livepde.dashboard.figures import (
     correlation,
     open_shares,

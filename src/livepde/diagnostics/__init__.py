@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from livepde.diagnostics.bounds import Errors, TwinTracker, bounds, conditions
+from livepde.diagnostics.check_report import CheckLine, CheckReport
 from livepde.diagnostics.constants import Part, Spaces, constants
+from livepde.diagnostics.error_bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
+from livepde.diagnostics.form_checks import check_model
 from livepde.diagnostics.identifiability import (
     Direction,
     Identifiability,
     InformationGain,
     identifiability,
 )
-from livepde.diagnostics.law import check_law
+from livepde.diagnostics.law_checks import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
-from livepde.diagnostics.model import check_model
 from livepde.diagnostics.observation import check_observation
-from livepde.diagnostics.report import CheckLine, CheckReport
-from livepde.diagnostics.space import check_space
+from livepde.diagnostics.space_checks import check_space
 from livepde.diagnostics.stopping import (
     OnlineStopping,
     StoppingState,

@@ -12,10 +12,10 @@ import scipy.sparse as sp
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from livepde.diagnostics.parts import DENSE, Border, Images, Part
+from livepde.diagnostics.state_parts import DENSE, Border, Images, Part
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
-from livepde.laws.bounds import Constants
+from livepde.laws.damping_bounds import Constants
 from livepde.linalg import Array, IntArray
 from livepde.model import Model, h1_form
 from livepde.observation import Observed, Split

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.errors import ConfigurationError
-from livepde.laws.bounds import Norms
+from livepde.laws.damping_bounds import Norms
 from livepde.linalg import Array
 
 __all__ = ["Interpolation", "Link", "interpolation", "link"]

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.report import CheckLine, CheckReport
-from livepde.diagnostics.space import largest, relative
+from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.space_checks import largest, relative
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Latent, Moment
 from livepde.linalg import Array

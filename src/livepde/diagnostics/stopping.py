@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.bounds import Errors
 from livepde.diagnostics.constants import Spaces
+from livepde.diagnostics.error_bounds import Errors
 from livepde.errors import ConfigurationError
-from livepde.laws.bounds import Constants, Norms
+from livepde.laws.damping_bounds import Constants, Norms
 from livepde.linalg import Array
 from livepde.observation import Observed, Tikhonov
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.bounds import TwinTracker, bounds, conditions
+from livepde.diagnostics.check_report import CheckReport
 from livepde.diagnostics.constants import Spaces, constants
+from livepde.diagnostics.error_bounds import TwinTracker, bounds, conditions
 from livepde.diagnostics.excitation import Excitation, Spectrum
 from livepde.diagnostics.links import interpolation, link
-from livepde.diagnostics.report import CheckReport
 from livepde.diagnostics.stopping import (
     OnlineStopping,
     StoppingState,
@@ -24,8 +24,8 @@ from livepde.diagnostics.stopping import (
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
-from livepde.laws.bounds import Constants, Norms
 from livepde.laws.damping import Damping
+from livepde.laws.damping_bounds import Constants, Norms
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed

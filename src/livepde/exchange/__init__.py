@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.exchange.export import export_fmu
+from livepde.exchange.fmu_export import export_fmu
 from livepde.exchange.regressor import OnlineRegressor, river_regressor
 
 __all__ = ["OnlineRegressor", "export_fmu", "river_regressor"]

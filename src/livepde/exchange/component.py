@@ -8,7 +8,7 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.errors import LivepdeError
-from livepde.exchange.process import REFUSED, WAITING, UnitProcess
+from livepde.exchange.unit_process import REFUSED, WAITING, UnitProcess
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.records import STATUS_CODES

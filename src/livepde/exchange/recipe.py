@@ -14,7 +14,7 @@ import numpy as np
 from livepde.cases import Case, load
 from livepde.cases.code import load_code
 from livepde.errors import ConfigurationError
-from livepde.exchange.process import DataTimes, UnitProcess, of_case, of_code
+from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
 from livepde.streams import Table
 
 __all__ = ["Recipe", "opened", "recipe_of"]

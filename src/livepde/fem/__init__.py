@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from livepde.fem.blocks import FieldBlock, base_name
 from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
+from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
     Channel,
     Declaration,

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.blocks import FieldBlock, Local, base_name, block_of
+from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
 from livepde.fem.fields import Declaration, Piecewise, Unknown, declared
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment

@@ -11,7 +11,7 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
-from livepde.fleet.engine import Beliefs
+from livepde.fleet.steppers import Beliefs
 from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask

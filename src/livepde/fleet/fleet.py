@@ -21,9 +21,9 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engine import FleetEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.separately import Separately
+from livepde.fleet.steppers import FleetEngine
 from livepde.fleet.together import Together
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status

@@ -9,7 +9,7 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.fem import Moment
-from livepde.fleet.engine import Beliefs, reported
+from livepde.fleet.steppers import Beliefs, reported
 from livepde.laws import AnyLaw, Belief, MemberReports, Problem
 from livepde.linalg import Array, IntArray
 from livepde.stepping import Span

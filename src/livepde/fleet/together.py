@@ -10,9 +10,9 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.fem import Moment
-from livepde.fleet.engine import Beliefs, Factors
+from livepde.fleet.steppers import Beliefs, Factors
 from livepde.laws import Belief, InitialReading, MemberReports
-from livepde.laws.members import join, take
+from livepde.laws.member_arrays import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray
 from livepde.stepping import Span

@@ -4,7 +4,21 @@ from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
 from livepde.laws.auto import AutoLaw
-from livepde.laws.base import (
+from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
+from livepde.laws.damping_bounds import (
+    Constants,
+    ExactBound,
+    NoisyBound,
+    Norms,
+    SmoothedBound,
+    unobserved_damping,
+)
+from livepde.laws.diffusion_operators import diffusion_operator
+from livepde.laws.excitation_gate import ExcitationGate
+from livepde.laws.gradient import GradientLaw
+from livepde.laws.guards import Guards
+from livepde.laws.jumps import Jumps
+from livepde.laws.law import (
     AnyLaw,
     Belief,
     FixedInterval,
@@ -15,21 +29,7 @@ from livepde.laws.base import (
     Status,
     numerical,
 )
-from livepde.laws.bounds import (
-    Constants,
-    ExactBound,
-    NoisyBound,
-    Norms,
-    SmoothedBound,
-    unobserved_damping,
-)
-from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
-from livepde.laws.excitation import ExcitationGate
-from livepde.laws.gradient import GradientLaw
-from livepde.laws.guards import Guards
-from livepde.laws.jumps import Jumps
-from livepde.laws.operators import diffusion_operator
-from livepde.laws.relatives import BaumeisterLaw, KueglerLaw
+from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from livepde.laws.base import Report, Status
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
-from livepde.laws.members import changed
+from livepde.laws.law import Report, Status
+from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span

@@ -23,7 +23,6 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report
 from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
@@ -34,7 +33,8 @@ from livepde.laws.history import (
     opened,
 )
 from livepde.laws.jumps import Jumps
-from livepde.laws.members import changed, join, take
+from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report
+from livepde.laws.member_arrays import changed, join, take
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw, without_factors
 from livepde.laws.sensitivity_state import (

@@ -24,12 +24,12 @@ import numpy as np
 from scipy.linalg import lapack
 
 from livepde.fem import Moment
-from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.input_noise import with_input_noise
-from livepde.laws.members import changed
+from livepde.laws.law import Problem
+from livepde.laws.member_arrays import changed
+from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
-from livepde.laws.sensors import MemberSensors
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, BlockFactor, IntArray, Mask

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.laws.innovations import Innovations
-from livepde.laws.members import changed
+from livepde.laws.member_arrays import changed
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import KeptFactors

@@ -10,11 +10,11 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Problem, Report, Status
 from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.excitation import ExcitationGate, ExcitationLevel
+from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
+from livepde.laws.law import Belief, Law, Problem, Report, Status
 from livepde.laws.metrics import StepBegin, Transition
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array

@@ -9,7 +9,6 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Problem
 from livepde.laws.coupled import (
     CoupledStage,
     KeptFactor,
@@ -19,8 +18,9 @@ from livepde.laws.coupled import (
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.excitation import ExcitationGate, ExcitationLevel, Probes
+from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel, Probes
 from livepde.laws.information import InformationMetric
+from livepde.laws.law import Problem
 from livepde.laws.metrics import ConstantMetric, MetricRule, MetricStep
 from livepde.laws.observed_part import (
     GeneralizedInverse,
@@ -29,7 +29,7 @@ from livepde.laws.observed_part import (
     RegularizedInverse,
     SelfChosenSmoothing,
 )
-from livepde.laws.smoothing import smooths
+from livepde.laws.sample_smoothing import smooths
 from livepde.linalg import Array, Memo, Pattern
 from livepde.stepping import Newton
 

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.fem import FieldBlock, Moment
-from livepde.laws.base import Problem
+from livepde.laws.law import Problem
 from livepde.linalg import Array, IntArray, compact
 from livepde.model import Model
 from livepde.observation import Observed

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from livepde.fem import Inputs
-from livepde.laws.base import Problem
+from livepde.laws.law import Problem
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval, Span, own_noise
 

@@ -66,7 +66,7 @@ failed status, and the data go on to tell J, b and S.
 
 S does not contain a bias that q absorbs without a trace: smoothing that takes too much or too
 little leaves an equation error that moves with w, as a wrong q does. The remedy is smoothing
-without this bias (`livepde.laws.smoothing`).
+without this bias (`livepde.laws.sample_smoothing`).
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from livepde.errors import LawError
 from livepde.laws.coupled import Metric
-from livepde.laws.coupled.forms import StageForms
+from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.metrics import MetricRule, MetricStep, StepBegin, Transition
 from livepde.laws.normal_equations import (
     NormalEquations,

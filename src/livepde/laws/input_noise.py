@@ -9,9 +9,9 @@ from typing import TypeAlias
 import numpy as np
 
 from livepde.fem import Moment
-from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState
-from livepde.laws.members import changed
+from livepde.laws.law import Problem
+from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Span, StepFailed

@@ -21,7 +21,7 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
-from livepde.laws.members import changed, put, take
+from livepde.laws.member_arrays import changed, put, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array

@@ -11,7 +11,7 @@ import scipy
 
 from livepde.errors import LawError
 from livepde.laws.innovations import Innovations
-from livepde.laws.members import where
+from livepde.laws.member_arrays import where
 from livepde.linalg import Array, IntArray, Mask
 
 __all__ = ["Jumps", "Watch"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from livepde.fem import Moment
 from livepde.laws.coupled import Metric
-from livepde.laws.coupled.forms import StageForms
+from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model

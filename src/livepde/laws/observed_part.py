@@ -9,9 +9,9 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from livepde.laws.base import Problem
+from livepde.laws.law import Problem
 from livepde.laws.metrics import NoState
-from livepde.laws.smoothing import Balance, NoiseDetector, SmoothingOperator
+from livepde.laws.sample_smoothing import Balance, NoiseDetector, SmoothingOperator
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Memo
 from livepde.observation import Reconstructed, Split
@@ -122,7 +122,7 @@ class _RegularizedPath(ObservedPath):
 
 
 class SelfChosenSmoothing(ObservedPart[Balance]):
-    """u_alpha smoothed as much as the noise of the samples asks for (`livepde.laws.smoothing`)."""
+    """u_alpha smoothed as the noise of the samples asks for (`livepde.laws.sample_smoothing`)."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem

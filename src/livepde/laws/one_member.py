@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 
 from livepde.laws.assimilation import assimilate
-from livepde.laws.base import Report, Status
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gauss_newton import (
     CONVERGED,
@@ -25,7 +24,8 @@ from livepde.laws.gauss_newton import (
 from livepde.laws.guards import Guards
 from livepde.laws.history import intervals_since
 from livepde.laws.jumps import Jumps
-from livepde.laws.members import changed
+from livepde.laws.law import Report, Status
+from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 
 from livepde.errors import LawError
 from livepde.fem import Evolution, FieldBlock, base_name
-from livepde.laws.base import Problem
+from livepde.laws.law import Problem
 from livepde.linalg import Array, Mask
 
 __all__ = ["ReducedEvolution", "Reduction"]

@@ -11,7 +11,7 @@ from livepde.laws.assimilation import assimilate, assimilate_at_once
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.history import first_interval, following, span_between
-from livepde.laws.members import changed, join, put, take
+from livepde.laws.member_arrays import changed, join, put, take
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.step_diagnostics import Diagnostics

@@ -17,7 +17,6 @@ from livepde.laws.assimilation import (
     assimilate,
     assimilate_at_once,
 )
-from livepde.laws.base import Belief, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter, MeanFilter
 from livepde.laws.filter_state import NO_LEDGER, FilterState, without_ledger
@@ -28,7 +27,9 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
-from livepde.laws.members import changed, join, put, take, where
+from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report, finite
+from livepde.laws.member_arrays import changed, join, put, take, where
+from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
 from livepde.laws.replay import Replay, ReplayState
@@ -41,7 +42,6 @@ from livepde.laws.sensitivity_state import (
     shortened,
     stored,
 )
-from livepde.laws.sensors import MemberSensors
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed

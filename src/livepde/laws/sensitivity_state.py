@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.base import InitialReading
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.guards import Guards, Scale
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
-from livepde.laws.members import changed, where, zeros
+from livepde.laws.law import InitialReading
+from livepde.laws.member_arrays import changed, where, zeros
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from livepde.laws.members import changed
+from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 

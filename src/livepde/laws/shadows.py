@@ -28,7 +28,7 @@ from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
-from livepde.laws.members import changed, put, take
+from livepde.laws.member_arrays import changed, put, take
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask

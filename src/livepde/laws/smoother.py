@@ -28,11 +28,11 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.assimilation import assimilate_at_once
-from livepde.laws.base import FixedInterval
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.iterated_smoother import expecting, missed, moved
-from livepde.laws.members import changed
+from livepde.laws.law import FixedInterval
+from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array
 from livepde.stepping import KeptFactors

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from livepde.laws.base import Problem
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
-from livepde.laws.members import changed, take
+from livepde.laws.law import Problem
+from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess

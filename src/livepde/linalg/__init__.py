@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.linalg.assembler import Assembler
 from livepde.linalg.banded import BandedSolver
-from livepde.linalg.blocks import BandedBlocks, BlockFactor
+from livepde.linalg.banded_blocks import BandedBlocks, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.cholmod import CholmodSolver
 from livepde.linalg.krylov import conjugate_gradients, gmres

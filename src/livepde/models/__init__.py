@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
-from livepde.models.base import Equation, Fluxes, Option, Quantity, Variable
 from livepde.models.battery import BATTERY_PARTICLE, battery_particle
 from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
+from livepde.models.boundary_conditions import Exchange, Flux, Source, with_conditions
 from livepde.models.burgers import BURGERS, burgers
-from livepde.models.conditions import Exchange, Flux, Source, with_conditions
+from livepde.models.description import Equation, Fluxes, Option, Quantity, Variable
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
 from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test

@@ -9,7 +9,7 @@ from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, absolute, dot, grad, linear
 from livepde.fem.upwind import upwind
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, by_name
+from livepde.models.description import Equation, Option, Variable, by_name
 
 __all__ = ["ADVECTION_DIFFUSION", "advection_diffusion"]
 

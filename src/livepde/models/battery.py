@@ -9,7 +9,7 @@ from numpy import exp
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, closed
 
 __all__ = ["BATTERY_PARTICLE", "FARADAY", "battery_particle"]
 

@@ -11,7 +11,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, closed
 
 __all__ = ["GROUTED_BOREHOLE", "grouted_borehole"]
 

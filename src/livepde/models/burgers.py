@@ -7,8 +7,8 @@ from typing import Any
 
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
-from livepde.models.base import Equation, Variable, by_name
 from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.description import Equation, Variable, by_name
 
 __all__ = ["BURGERS", "burgers"]
 

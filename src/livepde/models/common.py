@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 from livepde.fem import Field, Integrand, Unknown
-from livepde.models.base import Variable
+from livepde.models.description import Variable
 
 __all__ = ["INITIAL", "Coefficients", "Number", "beginning", "state"]
 

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Fluxes, Option, Variable, by_name
+from livepde.models.description import Equation, Fluxes, Option, Variable, by_name
 
 __all__ = ["CONDUCTION", "HEAT", "conduction", "heat"]
 

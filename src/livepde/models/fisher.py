@@ -10,7 +10,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, dot, grad, linear, positive
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, by_name
+from livepde.models.description import Equation, Option, Variable, by_name
 
 __all__ = ["FISHER_KPP", "POROUS_FISHER", "fisher_kpp", "porous_fisher"]
 

@@ -12,7 +12,7 @@ from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, closed
 
 __all__ = ["GROUNDWATER", "PUMPING_TEST", "groundwater", "pumping_test", "well"]
 

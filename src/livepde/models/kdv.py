@@ -6,8 +6,8 @@ from typing import Any
 
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
-from livepde.models.base import Equation, Variable, closed
 from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.description import Equation, Variable, closed
 
 __all__ = ["KDV", "kdv"]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Quantity, Variable, closed
 from livepde.models.common import Number
+from livepde.models.description import Equation, Option, Quantity, Variable, closed
 
 __all__ = ["BOREHOLE", "borehole", "fluid"]
 

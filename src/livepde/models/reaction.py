@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Field, Unknown, dot, grad, hermite
 from livepde.model import Model, Source
-from livepde.models.base import Equation, Option, Variable, by_name
+from livepde.models.description import Equation, Option, Variable, by_name
 
 __all__ = ["REACTION_DIFFUSION", "reaction_diffusion"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Channel, Field, On, Unknown, grad, linear
 from livepde.model import Model
-from livepde.models.base import Equation, Option, Variable, closed
+from livepde.models.description import Equation, Option, Variable, closed
 
 __all__ = [
     "ADVECTION_DISPERSION",

@@ -8,7 +8,7 @@ from typing import Any
 from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, dot, grad, linear
 from livepde.model import Model, Source
-from livepde.models.base import Equation, Variable, by_name
+from livepde.models.description import Equation, Variable, by_name
 
 __all__ = ["WAVE", "wave"]
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from livepde.observation.base import Observation, Observed
 from livepde.observation.combined import Calibrated, Combined
 from livepde.observation.functionals import Functionals
 from livepde.observation.moving import Moving
 from livepde.observation.nonlinear import Transformed, TransformedObserved
+from livepde.observation.operator import Observation, Observed
 from livepde.observation.reconstruction import (
     Alpha,
     Apriori,

@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment, Place, Unknown
 from livepde.linalg import Array, Mask
-from livepde.observation.base import STEP, Observation, Observed, numbers
+from livepde.observation.operator import STEP, Observation, Observed, numbers
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]

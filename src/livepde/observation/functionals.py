@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from livepde.errors import ModelError, ObservationError
 from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
 from livepde.linalg import Array
-from livepde.observation.base import Observation, Observed
+from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Functionals", "FunctionalsObserved"]

@@ -27,7 +27,7 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FunctionSpace, Moment
 from livepde.linalg import Array, Mask
-from livepde.observation.base import STEP, Direct, Observation, Observed
+from livepde.observation.operator import STEP, Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Transformed", "TransformedObserved"]

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Moment
 from livepde.linalg import Array
-from livepde.observation.base import Observation, Observed
+from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
 __all__ = ["POSITION", "PlacedObserved", "shift_names"]

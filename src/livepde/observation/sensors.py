@@ -13,7 +13,7 @@ from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Normal, Predicate, Scalars, Unknown
 from livepde.fem.measure import Measure
 from livepde.linalg import Array
-from livepde.observation.base import Direct, Observation, Observed
+from livepde.observation.operator import Direct, Observation, Observed
 from livepde.observation.placed import POSITION, PlacedObserved, shift_names
 from livepde.spaces import HilbertSpace
 

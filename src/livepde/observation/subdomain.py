@@ -11,7 +11,7 @@ from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.fem.measure import Measure
 from livepde.linalg import IntArray, Mask
-from livepde.observation.base import Observation
+from livepde.observation.operator import Observation
 
 __all__ = ["Full", "Subdomain"]
 

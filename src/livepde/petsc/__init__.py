@@ -6,12 +6,12 @@ The process comes from a finite-element package that shares its mesh out, by the
 
 from __future__ import annotations
 
-from livepde.petsc.check import check_petsc_model
-from livepde.petsc.checkpoint import load_state, save_state
 from livepde.petsc.dolfinx import DolfinxModel
-from livepde.petsc.filter import PetscFilter, leading_modes, number_modes
-from livepde.petsc.model import PetscModel
+from livepde.petsc.mpi_io import load_state, save_state
 from livepde.petsc.observer import PetscObserver
+from livepde.petsc.petsc_check import check_petsc_model
+from livepde.petsc.petsc_filter import PetscFilter, leading_modes, number_modes
+from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.step import ImplicitStep
 
 __all__ = [

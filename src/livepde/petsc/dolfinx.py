@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.errors import ModelError
 from livepde.linalg import Array, IntArray
-from livepde.petsc.model import petsc_module
+from livepde.petsc.petsc_model import petsc_module
 from livepde.petsc.vectors import gathered, standard_vector
 
 __all__ = ["DolfinxModel"]

@@ -28,12 +28,12 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.laws.base import Status
+from livepde.laws.coupled.coupled_stage import SMALLEST, nearest_root
 from livepde.laws.coupled.equation import STIFFEST
-from livepde.laws.coupled.stage import SMALLEST, nearest_root
 from livepde.laws.damping import Damping, Residual, ResidualDamping
-from livepde.laws.excitation import PROBES, ExcitationGate, ExcitationLevel
-from livepde.petsc.model import PetscModel, petsc_module
+from livepde.laws.excitation_gate import PROBES, ExcitationGate, ExcitationLevel
+from livepde.laws.law import Status
+from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order
 from livepde.petsc.vectors import free_mask, linear_solver, multigrid, random_vector, zeros
 from livepde.stepping import StepFailed

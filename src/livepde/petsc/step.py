@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from livepde.errors import LawError
-from livepde.laws.base import Status
-from livepde.petsc.model import PetscModel, petsc_module
+from livepde.laws.law import Status
+from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.vectors import free_mask, linear_solver
 from livepde.stepping import StepFailed
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.linalg import Array, IntArray
-from livepde.petsc.model import petsc_module
+from livepde.petsc.petsc_model import petsc_module
 
 __all__ = ["combined", "gathered", "inner", "linear_solver", "multigrid", "random_vector"]
 

@@ -16,7 +16,7 @@ from livepde.plots.dataset import (
     sensor_places,
     time_scale,
 )
-from livepde.plots.run import overview
+from livepde.plots.run_figure import overview
 from livepde.plots.style import GREY, PALETTE, figure
 
 __all__ = [

@@ -15,7 +15,7 @@ from livepde.identifier import Identifier, Sample
 from livepde.result import Result, layout_of
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Journal
-from livepde.runs.live import Live
+from livepde.runs.live_loop import Live
 
 __all__ = ["Driven", "conduct", "drive", "journal_of", "stopped_by_signals"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Advance, Interval, advance, own_noise
-from livepde.stepping.members import (
+from livepde.stepping.member_stage import (
     BandedStage,
     KeptFactors,
     MemberStage,

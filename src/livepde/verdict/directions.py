@@ -13,7 +13,7 @@ from livepde.errors import ObservationError
 from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observed, Points
-from livepde.verdict.process import Process
+from livepde.verdict.missing_terms import Process
 
 __all__ = ["Dictionary", "ScoreDirection"]
 

@@ -35,7 +35,7 @@ from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary
 from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
-from livepde.verdict.process import Now, stride
+from livepde.verdict.missing_terms import Now, stride
 
 __all__ = ["Judge", "Seen"]
 

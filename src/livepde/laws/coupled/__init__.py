@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from livepde.laws.coupled.coupled_stage import CoupledStage, KeptFactor
 from livepde.laws.coupled.equation import (
     StageData,
     StageIterate,
@@ -9,9 +10,8 @@ from livepde.laws.coupled.equation import (
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.forms import StageForms
 from livepde.laws.coupled.metric import Metric
-from livepde.laws.coupled.stage import CoupledStage, KeptFactor
+from livepde.laws.coupled.split_forms import StageForms
 
 __all__ = [
     "CoupledStage",

@@ -16,8 +16,8 @@ from livepde.laws.coupled.equation import (
     StageProblem,
     StageTerms,
 )
-from livepde.laws.coupled.forms import AnyForm
 from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.laws.coupled.split_forms import AnyForm
 from livepde.linalg import Array, Pattern, compact
 
 __all__ = ["BilinearSolver"]

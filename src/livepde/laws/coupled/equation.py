@@ -28,8 +28,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.fem import Moment
-from livepde.laws.coupled.forms import StageForms
 from livepde.laws.coupled.metric import Metric
+from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Factor, Pattern
 from livepde.stepping import TINY

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from livepde.cases.case import Case, Prepared
 from livepde.cases.data import read_data
-from livepde.cases.sources import Data, limits_of, policy_of, publishers_of, source_of
+from livepde.cases.data_sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted
 from livepde.runs.journal import Journal
-from livepde.runs.live import LOOK, Live, Sink
+from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather

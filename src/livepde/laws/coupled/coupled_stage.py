@@ -12,7 +12,7 @@ import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
 from livepde.laws.coupled.bilinear import BilinearSolver
-from livepde.laws.coupled.blocks import BlockSolver
+from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import (
     StageData,
     StageIterate,

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from livepde import checkpoint
-from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import CheckLine, CheckReport
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.identifier import Identifier

@@ -16,7 +16,7 @@ from livepde.cases import Case, load
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange.recipe import Recipe, recipe_of
 from livepde.exchange.slave import FOLDER
-from livepde.runs.export import refuse_file
+from livepde.runs.exported import refuse_file
 
 __all__ = ["export_fmu", "is_code", "write_unit"]
 

@@ -20,10 +20,10 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.base import Belief, Law, Problem, Report
 from livepde.laws.damping import Damping, Residual
 from livepde.laws.gradient import GradientLaw, GradientState
 from livepde.laws.gradient_parts import GradientParts, constant_parts
+from livepde.laws.law import Belief, Law, Problem, Report
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton

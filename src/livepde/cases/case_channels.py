@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.cases.frame import Frame
+from livepde.cases.case_frame import Frame
+from livepde.cases.case_model import constants_of
 from livepde.cases.instruments import calibrated, positions_of
-from livepde.cases.process import constants_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.regions import sides_of
 from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec

@@ -6,7 +6,7 @@ from typing import Any
 
 from livepde.diagnostics import CheckLine, CheckReport
 from livepde.errors import ModelError
-from livepde.petsc.model import PetscModel
+from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.vectors import free_mask, random_vector, zeros
 
 __all__ = ["check_petsc_model"]

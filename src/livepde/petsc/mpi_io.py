@@ -17,11 +17,11 @@ import numpy as np
 
 from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
-from livepde.laws.excitation import ExcitationLevel
+from livepde.laws.excitation_gate import ExcitationLevel
 from livepde.linalg import IntArray
-from livepde.petsc.filter import FilterState
-from livepde.petsc.model import PetscModel, petsc_module
 from livepde.petsc.observer import ObserverState
+from livepde.petsc.petsc_filter import FilterState
+from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.vectors import zeros
 
 __all__ = ["load_state", "save_state"]

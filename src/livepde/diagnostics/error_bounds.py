@@ -8,11 +8,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from livepde.diagnostics.check_report import CheckLine, CheckReport
 from livepde.diagnostics.constants import Spaces
-from livepde.diagnostics.report import CheckLine, CheckReport
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
-from livepde.laws.bounds import (
+from livepde.laws.damping import Damping
+from livepde.laws.damping_bounds import (
     Constants,
     Norms,
     nu_exact,
@@ -21,7 +22,6 @@ from livepde.laws.bounds import (
     theta_noisy,
     theta_smoothed,
 )
-from livepde.laws.damping import Damping
 from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.streams import Twin

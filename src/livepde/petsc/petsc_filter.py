@@ -22,10 +22,10 @@ import numpy as np
 from scipy.linalg import eigh
 
 from livepde.errors import LawError
-from livepde.laws.base import Status
 from livepde.laws.filter import contraction
+from livepde.laws.law import Status
 from livepde.linalg import Array, IntArray, Mask
-from livepde.petsc.model import PetscModel
+from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.step import ImplicitStep, advance, require_order
 from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
 

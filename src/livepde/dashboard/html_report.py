@@ -13,7 +13,7 @@ from livepde import runs
 from livepde.errors import ConfigurationError, RunError
 from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL, bound_text
-from livepde.runs.export import into_place
+from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
 
 __all__ = ["page_of", "write_report"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import CheckLine, CheckReport
 from livepde.errors import LinearAlgebraError, SpaceError
 from livepde.linalg import Array
 from livepde.spaces import HilbertSpace

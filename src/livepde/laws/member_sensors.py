@@ -7,8 +7,8 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.laws.base import Problem
 from livepde.laws.filter_state import FilterState
+from livepde.laws.law import Problem
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, compact
 from livepde.observation import Observed

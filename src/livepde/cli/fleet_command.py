@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from livepde.cli.fleet_parts import Backend, in_parts
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case
-from livepde.cli.parts import Backend, in_parts
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, print_json, show, terminal
 from livepde.cli.run import batch, concluded, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.cases import Case, Prepared
-    from livepde.cases.together import MemberBlock
+    from livepde.cases.members_together import MemberBlock
     from livepde.runs import Check, Driven, Run, RunWriter, Table
 
 __all__ = ["fleet"]
@@ -266,7 +266,7 @@ class Runs:
 
     def __call__(self, rows: Sequence[Member]) -> list[Ended]:
         """Run members as `livepde run` would, as blocks where they can."""
-        from livepde.cases.together import blocks
+        from livepde.cases.members_together import blocks
         from livepde.runs import JOURNAL
 
         members = {row.name: row for row in rows}

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from livepde.cases.case_frame import Frame
 from livepde.cases.conditions import held
-from livepde.cases.frame import Frame
 from livepde.cases.instruments import unknowns_of
 from livepde.cases.limits import check_cells
 from livepde.cases.read import did_you_mean

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.report import CheckLine, CheckReport
-from livepde.diagnostics.space import definite, largest, relative
+from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.space_checks import definite, largest, relative
 from livepde.errors import LinearAlgebraError, ModelError
 from livepde.fem import Composed, Form, Inputs, Moment
 from livepde.linalg import Array, Pattern, analyse

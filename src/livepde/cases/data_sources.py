@@ -9,10 +9,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
+from livepde.cases.case_frame import Frame
 from livepde.cases.data import data_file
-from livepde.cases.frame import Frame
 from livepde.cases.schema import BrokerSpec
-from livepde.runs.live import Backlog, Retention, Sink
+from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.sources import Follow, Lines, Source
 
