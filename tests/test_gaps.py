@@ -15,7 +15,7 @@ import livepde as lp
 from livepde import cases, runs
 from livepde.cases.live_case import Wiring
 from livepde.cli.run import batch, concluded, writer_of
-from livepde.streams import FillGaps, Table
+from livepde.streams import DataTable, FillGaps
 from livepde.streams.gaps import bridged, fill_table, filled_column, find_spikes
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Rows
@@ -191,7 +191,7 @@ def test_a_table_says_what_was_done():
     t, x = channel(2, 100)
     x[30] += 40.0
     x[[60, 99]] = np.nan
-    table = Table(t, np.column_stack([x, x]), ("left", "T"))
+    table = DataTable(t, np.column_stack([x, x]), ("left", "T"))
     filled = fill_table(table, ["left"], ["left"])
     assert filled.remarks == {
         ("spike", "left"): 1,

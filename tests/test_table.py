@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from livepde.errors import DataError, SampleError, TimeOrderError
-from livepde.streams import Clock, Column, Follow, JsonLines, Table, read_csv, read_json_lines
+from livepde.streams import Clock, Column, DataTable, Follow, JsonLines, read_csv, read_json_lines
 from livepde.streams.intake import Intake
 
 COLUMNS = {"T": Column(("a",)), "mean": Column(("a", "b"), factor=2.0, offset=1.0)}
@@ -33,7 +33,7 @@ def csv(tmp_path):
 def test_reads_scales_and_averages(csv):
     path = csv("t, a, b, note\n0, 1, 3, x\n10, , 4, y\n20, 5, 7, z\n")
     table = read_csv(path, COLUMNS, Clock("t", factor=60.0))
-    assert isinstance(table, Table)
+    assert isinstance(table, DataTable)
     assert table.t.tolist() == [0.0, 600.0, 1200.0]
     assert np.allclose(table.values, [[1, 5], [np.nan, np.nan], [5, 13]], equal_nan=True)
     assert len(table) == 3

@@ -31,7 +31,7 @@ from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import Gathered
 from livepde.runs.live_loop import Live
 from livepde.streams.intake import Intake, IntakeOutcome, Ready
-from livepde.streams.sources import Source
+from livepde.streams.sources import RowSource
 
 __all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
 
@@ -118,7 +118,7 @@ def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
 class _Audited(Gathered):
     """Remembers what became of each row, by the place where its line begins."""
 
-    def __init__(self, source: Source, intake: Intake) -> None:
+    def __init__(self, source: RowSource, intake: Intake) -> None:
         super().__init__(source, intake)
         self.reasons: dict[int, set[str]] = {}
 

@@ -46,7 +46,7 @@ from livepde.runs import Journal
 from livepde.runs.outcome import Bound, Sense
 from livepde.runs.summary import ROLES, TOTALS
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
-from livepde.streams import Clock, Column, Table
+from livepde.streams import Clock, Column, DataTable
 
 __all__ = ["Case", "Prepared", "load"]
 
@@ -60,7 +60,7 @@ class Prepared:
     first
         The first sample, which gives the initial state and inputs.
     stream
-        All samples. A `Table` can be iterated again, standard input cannot. Gaps of its boundary
+        All samples. A `DataTable` can be iterated again, standard input cannot. Gaps of boundary
         and input channels are interpolated, and spikes refused.
     assimilate_from
         Model time from which sensors are assimilated; scores count from here, too.
@@ -75,7 +75,7 @@ class Prepared:
     stream: Iterable[Sample]
     assimilate_from: float
     origin: datetime | None
-    raw: Table | None = None
+    raw: DataTable | None = None
 
     @cached_property
     def identifier(self) -> Identifier:
@@ -406,13 +406,13 @@ class Case:
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
         raw = read_data(self.frame, self.columns, self.clock, source)
-        data = without_gaps(self.frame, raw) if isinstance(raw, Table) else raw
+        data = without_gaps(self.frame, raw) if isinstance(raw, DataTable) else raw
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
             raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
         start = assimilation_start(self.frame, self.clock, data.origin)
-        if isinstance(data, Table) and isinstance(raw, Table):
+        if isinstance(data, DataTable) and isinstance(raw, DataTable):
             return Prepared(self, first, data, start, data.origin, raw)
         return Prepared(self, first, chain([first], samples), start, data.origin)
 

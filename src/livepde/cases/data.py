@@ -18,7 +18,15 @@ from livepde.cases.code import check_options, load_code
 from livepde.cases.schema import CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
-from livepde.streams import Clock, Column, JsonLines, Table, read_csv, read_json_lines, tabulated
+from livepde.streams import (
+    Clock,
+    Column,
+    DataTable,
+    JsonLines,
+    read_csv,
+    read_json_lines,
+    tabulated,
+)
 from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
@@ -80,7 +88,7 @@ def read_data(
     columns: Mapping[str, Column],
     clock: Clock,
     source: str | Iterable[str] | None,
-) -> Table | JsonLines:
+) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
     spec = frame.spec.data
     ending = (
@@ -116,7 +124,7 @@ def read_data(
     )
 
 
-def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> Table:
+def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> DataTable:
     """Return several files as one table, joined by time; each channel comes from one of them."""
     data = frame.spec.data
     specs = [data.of(file) for file in files]
@@ -167,7 +175,7 @@ def _header(frame: Frame, spec: DataSpec, path: Path) -> list[str]:
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
-def without_gaps(frame: Frame, table: Table) -> Table:
+def without_gaps(frame: Frame, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
     channels = frame.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
@@ -188,7 +196,7 @@ def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any
 
 def _from_reader(
     frame: Frame, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
-) -> Table:
+) -> DataTable:
     """Return the data of the user's function: times, and a mapping from column to values."""
     spec, where = frame.spec.data, frame.where(f"data.reader: {frame.spec.data.reader}")
     folder = _measurements(frame)

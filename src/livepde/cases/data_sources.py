@@ -14,7 +14,7 @@ from livepde.cases.data import data_file
 from livepde.cases.schema import BrokerSpec
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams.intake import Habit, Policy
-from livepde.streams.sources import Follow, Lines, Source
+from livepde.streams.sources import Follow, Lines, RowSource
 
 if TYPE_CHECKING:
     from livepde.streams.mqtt import Broker
@@ -24,10 +24,10 @@ __all__ = ["Data", "limits_of", "policy_of", "publishers_of", "source_of", "sour
 LOG = logging.getLogger("livepde.run")
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 
-Data: TypeAlias = str | Iterable[str] | Source | None  # a file, lines of JSON, or the case's own
+Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
 
-def source_of(frame: Frame, data: Data, position: str) -> Source:
+def source_of(frame: Frame, data: Data, position: str) -> RowSource:
     """Return the source of the rows of a case, from a position on."""
     spec = frame.spec.data
     if isinstance(data, Iterable) and not isinstance(data, str):

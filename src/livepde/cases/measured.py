@@ -17,7 +17,7 @@ from livepde.cases.read import BLANK
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, SampleError
 from livepde.linalg import Array
-from livepde.streams import Clock, Column, Table, read_csv
+from livepde.streams import Clock, Column, DataTable, read_csv
 from livepde.streams.clock import date_formats, number_of
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES, MISSING
@@ -63,7 +63,7 @@ class Measured:
     time: tuple[str, ...]
     time_format: str
     time_unit: str
-    samples: Table
+    samples: DataTable
     row_numbers: tuple[str, ...]
     texts: tuple[str, ...]
     more: tuple[Measured, ...] = ()

@@ -19,7 +19,7 @@ from livepde.identifier import Identifier
 from livepde.result import Result, layout_of
 from livepde.runs import Driven, Journal, stopped_by_signals
 from livepde.runs.journal import Event
-from livepde.streams import Table
+from livepde.streams import DataTable
 
 __all__ = ["MemberBlock", "blocks"]
 
@@ -55,7 +55,7 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     settings: dict[Case, str] = {}
     apart: dict[str, str] = {}
     for name, one in members.items():
-        if not isinstance(one.stream, Table):
+        if not isinstance(one.stream, DataTable):
             apart[name] = "their samples come one at a time"
             continue
         if one.case not in settings:
@@ -109,7 +109,7 @@ class MemberBlock:
     def __init__(self, members: Mapping[str, Prepared]) -> None:
         self.members = dict(members)
         self._each = list(self.members.values())
-        self._tables = [one.stream for one in self._each if isinstance(one.stream, Table)]
+        self._tables = [one.stream for one in self._each if isinstance(one.stream, DataTable)]
         one = self._each[0]
         case = one.case
         self.fleet = Fleet(

@@ -24,7 +24,7 @@ from livepde.cli.printing import (
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
-    from livepde.streams import Table as Samples
+    from livepde.streams import DataTable
 
 __all__ = ["check"]
 
@@ -58,7 +58,7 @@ def check(
         console.print(f"[bold green]ok[/]  livepde run {escape(str(case))}", soft_wrap=True)
         return
     prepared = loaded.prepare(data)
-    samples: Samples = prepared.raw  # type: ignore[assignment]
+    samples: DataTable = prepared.raw  # type: ignore[assignment]
     _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
     notes = [*loaded.notes, *_refused(prepared), *_show_preview(console, prepared)]
@@ -180,7 +180,7 @@ def _show_model(console: Console, case: Case) -> None:
     )
 
 
-def _show_data(console: Console, case: Case, prepared: Prepared, samples: Samples) -> None:
+def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTable) -> None:
     import numpy as np
 
     from livepde.runs import Table

@@ -399,10 +399,10 @@ class Runs:
     def _through(self, member: Member, prepared: Prepared) -> Ended | None:
         """Return how a run ended that has taken all of its samples before; None if it has not."""
         from livepde import runs
-        from livepde.streams import Table as Samples
+        from livepde.streams import DataTable
 
         target, table = self._target(member.name), prepared.stream
-        if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, Samples)):
+        if not (self.resume and (target / runs.RECORD).exists() and isinstance(table, DataTable)):
             return None
         run = runs.open(target)
         if run.status != "finished" or run.record.get("samples") != len(table):

@@ -232,11 +232,11 @@ def batch(
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case on finished data; an unusable sample ends the run."""
     from livepde.runs import JOURNAL, Journal, drive
-    from livepde.streams import Table as Samples
+    from livepde.streams import DataTable
 
     identifier = prepared.identifier  # raises on inconsistent data before anything is written
     writer, path = write(), folder / JOURNAL
-    table = prepared.stream if isinstance(prepared.stream, Samples) else None
+    table = prepared.stream if isinstance(prepared.stream, DataTable) else None
     if path.exists():
         journal = stack.enter_context(Journal.open(path, write=True))
     else:

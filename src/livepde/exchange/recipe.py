@@ -15,7 +15,7 @@ from livepde.cases import Case, load
 from livepde.cases.code import load_code
 from livepde.errors import ConfigurationError
 from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
-from livepde.streams import Table
+from livepde.streams import DataTable
 
 __all__ = ["Recipe", "opened", "recipe_of"]
 
@@ -90,7 +90,7 @@ def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
         return None, None
     prepared = case.read()
     case.begin(prepared.first, prepared.origin)  # what does not fit together raises here
-    if not isinstance(prepared.stream, Table):
+    if not isinstance(prepared.stream, DataTable):
         return prepared.origin, None
     t = prepared.stream.t / case.clock.second
     step = float(np.median(np.diff(t))) if len(t) > 1 else None

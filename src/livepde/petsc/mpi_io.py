@@ -20,7 +20,7 @@ from livepde.errors import RunError
 from livepde.laws.excitation_gate import ExcitationLevel
 from livepde.linalg import IntArray
 from livepde.petsc.observer import ObserverState
-from livepde.petsc.petsc_filter import FilterState
+from livepde.petsc.petsc_filter import PetscFilterState
 from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.vectors import zeros
 
@@ -30,7 +30,9 @@ OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
 OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X
 
 
-def save_state(path: Path | str, model: PetscModel, state: FilterState | ObserverState) -> None:
+def save_state(
+    path: Path | str, model: PetscModel, state: PetscFilterState | ObserverState
+) -> None:
     """Write a state of `PetscFilter` or `PetscObserver`; all ranks call it."""
     path, comm = Path(path), state.u.comm.tompi4py()
     beside = Path(f"{path}.{comm.bcast(secrets.token_hex(4))}.vectors")
@@ -68,7 +70,7 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
             f"{path}: written for u and q with {numbers['sizes']} coefficients; this model has "
             f"{_sizes(model)}: take the mesh of before."
         )
-    kind: Any = FilterState if numbers["kind"] == "FilterState" else ObserverState
+    kind: Any = PetscFilterState if numbers["kind"] == "PetscFilterState" else ObserverState
     u, q = model.mass.createVecRight(), model.gram.createVecRight()
     beside = str(path.parent / numbers["vectors"])
     viewer, found = petsc_module().Viewer().createMPIIO(beside, "r", comm=u.comm), {}

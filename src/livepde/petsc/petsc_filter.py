@@ -29,13 +29,13 @@ from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.step import ImplicitStep, advance, require_order
 from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
 
-__all__ = ["FilterReport", "FilterState", "PetscFilter", "leading_modes", "number_modes"]
+__all__ = ["FilterReport", "PetscFilter", "PetscFilterState", "leading_modes", "number_modes"]
 
 ACCURATE = 1e-14  # relative change of the variances of modes
 
 
 @dataclass(frozen=True, eq=False)
-class FilterState:
+class PetscFilterState:
     """Estimate and square root of the joint covariance after a sample; k unknowns a.
 
     Attributes
@@ -110,15 +110,17 @@ class PetscFilter:
         require_order("PetscFilter", self.lower, self.upper)
         object.__setattr__(self, "stepper", ImplicitStep(self.model))
 
-    def init(self, u0: Any, t0: float = 0.0) -> FilterState:
+    def init(self, u0: Any, t0: float = 0.0) -> PetscFilterState:
         """Return the state at the start: u0 is exact, the unknowns have their prior."""
         k, u = len(self.modes), u0.copy()
         self.model.impose(u, t0)
         rows = [zeros(u) for _ in range(k)]
         none = np.zeros(self.model.sensors.getSize()[0], dtype=int)
-        return FilterState(t0, u, tuple(rows), np.zeros(k), np.eye(k), none, tuple(self.modes))
+        return PetscFilterState(t0, u, tuple(rows), np.zeros(k), np.eye(k), none, tuple(self.modes))
 
-    def step(self, state: FilterState, t: float, z: Any) -> tuple[FilterState, FilterReport]:
+    def step(
+        self, state: PetscFilterState, t: float, z: Any
+    ) -> tuple[PetscFilterState, FilterReport]:
         """Return the state after a sample z at t, shape (sensors,), NaN where a reading is missing.
 
         Raises `LawError` if z has another shape, or t is not later than the sample before.
@@ -134,11 +136,11 @@ class PetscFilter:
             return state, FilterReport(status, lost, lost, np.zeros(z.shape, dtype=bool))
         return self.update(new, z)
 
-    def parameter(self, state: FilterState) -> Any:
+    def parameter(self, state: PetscFilterState) -> Any:
         """Return the estimate of q within its bounds, a new vector."""
         return self._bounded(combined(state.a, state.modes, self.prior))
 
-    def deviation(self, state: FilterState) -> Any:
+    def deviation(self, state: PetscFilterState) -> Any:
         """Return the standard deviation of each coefficient of q, a new vector."""
         square = zeros(self.prior)
         for row in state.C:
@@ -147,7 +149,7 @@ class PetscFilter:
         square.sqrtabs()
         return square
 
-    def predict(self, state: FilterState, t: float, h: float) -> FilterState:
+    def predict(self, state: PetscFilterState, t: float, h: float) -> PetscFilterState:
         """Return the state a step later; raises `StepFailed`."""
         q = self.parameter(state)
         u = self.stepper.solve(state.u, q, t, h)
@@ -159,7 +161,7 @@ class PetscFilter:
             rows.append(self.stepper.back(b))
         return replace(state, t=t + h, u=u, U=tuple(rows))
 
-    def update(self, state: FilterState, z: Array) -> tuple[FilterState, FilterReport]:
+    def update(self, state: PetscFilterState, z: Array) -> tuple[PetscFilterState, FilterReport]:
         """Return the state after the readings of its time."""
         d = z - self.read(state.u)
         noise = np.broadcast_to(np.asarray(self.noise, dtype=float), z.shape)
@@ -185,7 +187,7 @@ class PetscFilter:
         np.clip(values, self.lower, self.upper, out=values)
         return q
 
-    def _projected(self, state: FilterState) -> FilterState:
+    def _projected(self, state: PetscFilterState) -> PetscFilterState:
         """Return the state with an estimate beyond the bounds projected onto them."""
         if np.isinf(self.lower) and np.isinf(self.upper):
             return state

@@ -13,7 +13,7 @@ import numpy as np
 from livepde.identifier import Sample
 from livepde.samples import by_name
 from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
-from livepde.streams.sources import Row, Source
+from livepde.streams.sources import Row, RowSource
 
 __all__ = ["Feed", "Gathered", "Paced", "SampleFeed", "shifted"]
 
@@ -70,7 +70,7 @@ class Gathered:
         Source of rows, and the intake that turns them into samples.
     """
 
-    def __init__(self, source: Source, intake: Intake) -> None:
+    def __init__(self, source: RowSource, intake: Intake) -> None:
         self.source = source
         self.intake = intake
         self._heard = False

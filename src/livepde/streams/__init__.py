@@ -12,11 +12,11 @@ from livepde.streams.smoothing import (
     Smoother,
     WindowAverage,
 )
-from livepde.streams.sources import Follow, Lines, Row, Rows, Source
+from livepde.streams.sources import Follow, Lines, Row, Rows, RowSource
 from livepde.streams.table import (
     Column,
+    DataTable,
     JsonLines,
-    Table,
     read_json_lines,
     tabulated,
 )
@@ -26,6 +26,7 @@ __all__ = [
     "AbsoluteNoise",
     "Clock",
     "Column",
+    "DataTable",
     "Exponential",
     "FillGaps",
     "Follow",
@@ -35,11 +36,10 @@ __all__ = [
     "Noise",
     "RelativeNoise",
     "Row",
+    "RowSource",
     "Rows",
     "Smoothed",
     "Smoother",
-    "Source",
-    "Table",
     "Twin",
     "WindowAverage",
     "read_csv",

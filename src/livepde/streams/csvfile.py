@@ -24,7 +24,7 @@ from livepde.streams.clock import (
     read_times,
 )
 from livepde.streams.names import check_columns, is_data, no_file
-from livepde.streams.table import MISSING, Column, Table, cell_number, to_table
+from livepde.streams.table import MISSING, Column, DataTable, cell_number, to_table
 
 __all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
 
@@ -76,7 +76,7 @@ def read_csv(
     separator: str = ",",
     encoding: str = UTF_8,
     skip: int = 0,
-) -> Table:
+) -> DataTable:
     """Read channels from a CSV file with one header line.
 
     Parameters

@@ -24,7 +24,7 @@ from scipy.ndimage import median_filter
 from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array, Mask
 from livepde.samples import Sample, number, sample_of
-from livepde.streams.table import Table
+from livepde.streams.table import DataTable
 
 __all__ = ["RECENT", "FillGaps", "Filled", "Series", "bridged", "fill_table", "find_spikes"]
 
@@ -200,8 +200,8 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
 
 
 def fill_table(
-    table: Table, interpolated: Iterable[str], screened: Iterable[str], beyond: float = BEYOND
-) -> Table:
+    table: DataTable, interpolated: Iterable[str], screened: Iterable[str], beyond: float = BEYOND
+) -> DataTable:
     """Return a finished record without gaps between known values, and without spikes.
 
     Its remarks count interpolated values as "interpolated", refused ones as "spike" and remaining

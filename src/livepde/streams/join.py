@@ -11,7 +11,7 @@ import pandas as pd
 from livepde.errors import DataError
 from livepde.linalg import Array
 from livepde.streams.clock import origin_at, since_1970
-from livepde.streams.table import Table
+from livepde.streams.table import DataTable
 
 __all__ = ["join_tables"]
 
@@ -19,12 +19,12 @@ SAME = 1e-10  # of the whole time: times that differ by less are one moment
 
 
 def join_tables(
-    tables: Sequence[Table],
+    tables: Sequence[DataTable],
     second: float,
     sensors: Collection[str],
     needed: Collection[str],
     where: str,
-) -> Table:
+) -> DataTable:
     """Merge the rows of several tables in order of time; absent channels are missing values.
 
     The result begins with the first row in which a sensor has a value and before which every
@@ -91,4 +91,4 @@ def join_tables(
         remarks.update(table.remarks)
     origin = origin_at(first + float(t[0]) / second) if dated else None
     told = {key: number for key, number in remarks.items() if number}
-    return Table(t - t[0] if dated else t, values, tuple(names), origin, told)
+    return DataTable(t - t[0] if dated else t, values, tuple(names), origin, told)

@@ -10,7 +10,7 @@ from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
 from livepde.streams.clock import Clock
 from livepde.streams.names import check_columns, no_file
-from livepde.streams.table import Column, Table, tabulated
+from livepde.streams.table import Column, DataTable, tabulated
 
 __all__ = ["read_parquet"]
 
@@ -22,7 +22,7 @@ def read_parquet(
     *,
     every: int = 1,
     missing: Iterable[float] = (),
-) -> Table:
+) -> DataTable:
     """Read channels from a Parquet file; only the columns that are needed.
 
     Parameters

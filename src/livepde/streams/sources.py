@@ -21,7 +21,7 @@ from livepde.streams.csvfile import UTF_8, too_wide
 from livepde.streams.names import no_file
 from livepde.streams.table import JSON_LINES
 
-__all__ = ["Follow", "Lines", "Row", "Rows", "Source", "drained", "json_row"]
+__all__ = ["Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
 
 T = TypeVar("T")
 
@@ -50,7 +50,7 @@ class Row:
     broken: str = ""
 
 
-class Source(Protocol):
+class RowSource(Protocol):
     """A source of rows as they arrive; used from one thread."""
 
     @property

@@ -29,8 +29,8 @@ from livepde.streams.names import check_columns, hint, no_file
 __all__ = [
     "JSON_LINES",
     "Column",
+    "DataTable",
     "JsonLines",
-    "Table",
     "cell_number",
     "channel_value",
     "read_json_lines",
@@ -74,7 +74,7 @@ class Column:
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class DataTable:
     """Samples in memory, checked: iterate over it, as often as needed.
 
     Attributes
@@ -114,7 +114,7 @@ def read_json_lines(
     *,
     every: int = 1,
     missing: Iterable[float] = (),
-) -> Table:
+) -> DataTable:
     """Read channels from a file of JSON lines, one object with column -> value for each moment.
 
     Parameters
@@ -164,7 +164,7 @@ def tabulated(
     every: int = 1,
     missing: Iterable[float] = (),
     where: str = "data",
-) -> Table:
+) -> DataTable:
     """Return a table of channels from columns in memory.
 
     Parameters
@@ -223,7 +223,7 @@ def to_table(
     every: int,
     missing: Iterable[float],
     where: tuple[str, Callable[[int], str]],
-) -> Table:
+) -> DataTable:
     """Return the channels between start and stop; `numbers` gives the chosen rows of a column."""
     source, row = where
     low, high = clock.bounds(dates, source)
@@ -264,7 +264,7 @@ def to_table(
         origin = origin_at(float(t[0]) / clock.second)
         t = t - t[0]
     told = {key: number for key, number in remarks.items() if number}
-    return Table(t, values, tuple(columns), origin, told)
+    return DataTable(t, values, tuple(columns), origin, told)
 
 
 def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[str, str], int]:

@@ -54,7 +54,7 @@ class ScoreDirection:
 
 
 @dataclass(frozen=True, eq=False)
-class Shifts:
+class ForwardShifts:
     """How readings change if sensors are shifted, as a matrix on the coefficients that matter.
 
     Attributes
@@ -71,7 +71,7 @@ class Shifts:
     rows: Any
 
     @classmethod
-    def of(cls, shifts: Sequence[sp.csr_array]) -> Shifts:
+    def of(cls, shifts: Sequence[sp.csr_array]) -> ForwardShifts:
         """Return the value of the matrices of all axes, each (sensors, n)."""
         rows = sp.csc_array(sp.vstack(shifts))
         used = np.flatnonzero(np.diff(rows.indptr))
@@ -149,9 +149,9 @@ class Dictionary:
                     self.directions.append(ScoreDirection(kind, name, size, of, axis))
                     self.owner.append(k)
             self.parts[kind] = slice(start, len(self.directions))
-        self.shifts: Shifts | None = None
+        self.shifts: ForwardShifts | None = None
         if position is not None and "position" in kinds:
-            self.shifts = Shifts.of(position[0])
+            self.shifts = ForwardShifts.of(position[0])
         start = len(self.directions)
         self.jumps = [place for _, place in jumps]
         self.directions += [ScoreDirection("jump", label, JUMP) for label, _ in jumps]
