@@ -28,6 +28,9 @@ VERSIONS := 3.12 3.13
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
 PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
 
+# Byte code is kept, wherever the environment says not to: every program that a test starts, and every
+# process that runs tests, would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 # Tests run in as many processes as there are cores: threads of BLAS beside them cost a fifth.
 export OMP_NUM_THREADS ?= 1
 

@@ -137,6 +137,7 @@ def test_what_has_moved_between_two_alarms():
     assert "no number has changed for good" in told[1]
 
 
+@pytest.mark.slow
 def test_many_jumps_are_counted_and_dates_are_dates():
     data = dataset([2, 3, 4, 5, 6, 7, 8])
     data.attrs["origin"] = "2025-04-01 12:00:00"

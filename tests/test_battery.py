@@ -61,6 +61,7 @@ def crank(r: Any, t: float) -> Any:
 TIMES = np.concatenate([[0.0], np.geomspace(0.05, 600.0, 200)])
 
 
+@pytest.mark.slow
 def test_constant_flux_is_that_of_the_textbook():
     errors = []
     for cells in (20, 40):

@@ -111,6 +111,7 @@ def test_blocks_serve_a_step_in_which_nothing_is_measured(sensors, gain, monkeyp
     np.testing.assert_allclose(blocks, direct, rtol=0, atol=1e-8 * abs(direct).max())
 
 
+@pytest.mark.slow
 def test_a_law_that_tunes_itself_trusts_no_rate_of_another_metric(monkeypatch):
     model, law = plane(), lp.GradientLaw("auto", newton=EXACT)
     direct, _ = run(model, lp.Full(), law, monkeypatch, large=False, samples=6)
@@ -265,6 +266,7 @@ def test_a_run_resumed_gives_the_same_numbers(gain, stream, tmp_path):
         assert np.array_equal(a.q, b.q)
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_process_renews_the_factors(stream):
     model, sensors, samples, fresh = stream
     identifier = fresh()

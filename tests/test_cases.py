@@ -95,6 +95,7 @@ def test_wrong_quantities_name_the_key(value, unit):
         convert(value, unit, "case.toml: mesh.to")
 
 
+@pytest.mark.slow
 def test_pint_is_loaded_only_for_a_case():
     code = "import sys, livepde, livepde.cli; sys.exit('pint' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -121,6 +122,7 @@ def test_template_runs_and_finds_the_truth(rod):
     assert not row.hardly
 
 
+@pytest.mark.slow
 def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
     def noted(cells: int, places: tuple[str, str, str]) -> bool:
         at = {f"channels.T_{k}.at": x for k, x in zip((10, 20, 30), places, strict=True)}
@@ -390,6 +392,7 @@ def test_every_and_assimilate_from(rod):
     assert data.attrs["assimilate_from"] == 600.0
 
 
+@pytest.mark.slow
 def test_reaction_diffusion_without_units(tmp_path):
     rows = [f"{t / 10},{np.exp(-t / 10)},{np.exp(-t / 10)}" for t in range(30)]
     (tmp_path / "data.csv").write_text("t,a,b\n" + "\n".join(rows))
@@ -646,6 +649,7 @@ def test_missing_case(tmp_path):
         cases.load(tmp_path / "bytes.toml")
 
 
+@pytest.mark.slow
 def test_dates(rod):
     path = rod()
     lines = (path.parent / "rod.csv").read_text().splitlines()
@@ -670,6 +674,7 @@ def test_dates(rod):
         cases.load(other).prepare()
 
 
+@pytest.mark.slow
 def test_lines_instead_of_a_file(rod):
     lines = ['{"time_s": %d, "T_left": %g, "T_right": 20}' % (20 * k, 20 + k) for k in range(5)]  # noqa: UP031
     prepared = cases.load(rod()).prepare(iter(lines))
@@ -842,6 +847,7 @@ def test_families(rod):
         cases.load(rod(("first =", "T_1 =")))
 
 
+@pytest.mark.slow
 def test_very_many_sensors_are_one_row(rod):
     old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
     new = 'W = { role = "withheld", column = "T_20{}", each = [0, 0.4, 50] }'

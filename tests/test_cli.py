@@ -234,6 +234,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
     assert "hardly identified" in output
 
 
+@pytest.mark.slow
 def test_check_shows_notes_and_failures(rod, monkeypatch):
     path = Path(rod)
     path.write_text(path.read_text().replace('kind = "sensitivity"', 'kind = "gradient"')
@@ -415,6 +416,7 @@ def fake(monkeypatch):
     return install
 
 
+@pytest.mark.slow
 def test_demo(fake, here):
     fake(0.04)
     code, output = call("demo")
@@ -439,6 +441,7 @@ def test_reproduce_and_bench_as_json(fake, value, expected):
     assert json.loads(output)["notes"] == ["a note"]
 
 
+@pytest.mark.slow
 def test_reproduce_and_bench_for_people(fake, here):
     fake(0.06)
     code, output = call("reproduce", "seed", "--out", "kept")

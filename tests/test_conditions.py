@@ -31,6 +31,7 @@ def steady(model: lp.Model, values: Mapping[str, float], inputs: Any = None) -> 
     return model.state_block.at_vertices @ u
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["number", "channel", "unknown"])
 def test_a_flux_gives_the_exact_gradient(kind: str) -> None:
     amount = {"number": 6.0, "channel": lp.Channel("J"), "unknown": "J"}[kind]
@@ -139,6 +140,7 @@ def wall(folder: Path, k: float = 28.5, J: float = 2e4) -> Path:
     return folder / "case.toml"
 
 
+@pytest.mark.slow
 def test_a_case_finds_conductivity_and_heat_flux(tmp_path: Path) -> None:
     """The law is the default one; the truth comes from finite volumes on another mesh."""
     prepared = load(wall(tmp_path)).prepare()

@@ -193,6 +193,7 @@ def test_a_mesh_of_few_cells_is_reduced_to_itself():
     assert small.error({"a": 0.9}, h=0.05)["middle"] < 1e-3
 
 
+@pytest.mark.slow
 def test_names_that_do_not_exist_are_told():
     with pytest.raises(lp.errors.ConfigurationError, match="each once"):
         ct.reduce(rod(), OUTPUTS, ["heater", "heater"])
@@ -496,6 +497,7 @@ def test_scenarios_stay_where_the_model_makes_sense():
     assert found.status == "ok"
 
 
+@pytest.mark.slow
 @needs_mpc
 def test_scenarios_are_deviations_of_what_is_gaussian():
     """Of the logarithm: 12 in 20 are a factor of exp(0.6)."""
@@ -508,6 +510,7 @@ def test_scenarios_are_deviations_of_what_is_gaussian():
         assert np.abs(rows - expected).max(axis=1).min() < 1e-9
 
 
+@pytest.mark.slow
 @needs_mpc
 @pytest.mark.parametrize(
     ("options", "says"),
@@ -664,6 +667,7 @@ def test_what_was_really_applied_counts():
     assert stuck.outputs["face"] == pytest.approx(ROOM, abs=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_not_a_number_is_missing():
     """A disturbance holds its last value, a control what was asked for."""
     ends = []
@@ -747,6 +751,7 @@ def test_a_memory_that_is_not_finite_is_not_kept():
     assert seen == [[0.0], [0.5], [0.5], [0.25]]
 
 
+@pytest.mark.slow
 def test_a_row_of_a_pandas_table_counts_by_name_for_all_of_a_loop():
     import pandas as pd
 
@@ -775,6 +780,7 @@ def test_a_controller_that_raises_leaves_a_loop_that_goes_on():
         loop.step(2 * PERIOD, [ROOM] * 2, reference={"tip": 45.0})
 
 
+@pytest.mark.slow
 def test_a_sample_that_is_refused_changes_nothing():
     loops = [ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD)) for _ in range(2)]
     for loop in loops:
@@ -851,6 +857,7 @@ def test_references_and_forecasts_are_checked():
         ct.Loop(identifier(hold=False), ct.LQ(reduced(), GOAL, PERIOD))
 
 
+@pytest.mark.slow
 def test_inputs_that_are_held_do_not_ramp():
     """Several substeps see what the sample brings, as many samples with the same input would."""
     nothing, ends = np.full(2, np.nan), []

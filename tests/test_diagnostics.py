@@ -56,11 +56,13 @@ def test_a_right_derivative_passes():
     check_model(model, u=1.0).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_a_form_that_is_not_analytic_is_found():
     report = check_model(reaction(line(6), ElementLineP1(), B=lambda u, v, x: np.abs(u) * v))
     assert any("B'(u)" in name for name in failed(report))
 
 
+@pytest.mark.slow
 def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1()),
@@ -72,6 +74,7 @@ def test_a_form_that_is_not_linear_in_q_has_its_derivatives_checked():
     assert any("/dq" in line.name for line in report.lines)
 
 
+@pytest.mark.slow
 def test_a_form_that_is_not_analytic_in_q_is_found():
     model = lp.Model(
         lp.Field(line(6), ElementLineP1()),

@@ -102,6 +102,7 @@ def rod(tmp_path) -> runs.Run:
 # --- names and units -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("unit", "expected"),
     [

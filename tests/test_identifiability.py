@@ -92,6 +92,7 @@ def test_a_number_at_its_bound():
     assert found.unknowns[0].bound == 0.2
 
 
+@pytest.mark.slow
 def test_one_that_moves_is_never_flat_for_good():
     walk = lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.RandomWalk(1.0))
     (known,) = report({"a": walk}, lambda q: 0.0 * q.a).unknowns
@@ -99,6 +100,7 @@ def test_one_that_moves_is_never_flat_for_good():
     assert known.verdict == "partly"
 
 
+@pytest.mark.slow
 def test_the_width_counts():
     model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     (known,) = identifiability(model, belief).unknowns

@@ -130,12 +130,14 @@ def test_a_mistake_is_one_sentence_with_its_remedy(mistake, home, monkeypatch, c
     assert contents(home) == before
 
 
+@pytest.mark.slow
 def test_data_in_any_encoding_are_no_case(home, monkeypatch, capsys):
     data("T_20", "Fühler", "cp1252")()
     expected = (2, "", f"Error: {messages()['data as a case']}\n")
     assert livepde(("check", str(DATA)), monkeypatch, capsys) == expected
 
 
+@pytest.mark.slow
 def test_a_file_of_a_run_leads_to_the_run(home, monkeypatch, capsys):
     taken("runs/mine")
     code, _, told = livepde(("report", "runs/mine/run.json"), monkeypatch, capsys)

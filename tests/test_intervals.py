@@ -81,6 +81,7 @@ def test_an_interval_ends_where_latent_values_do():
     assert positive.interval(0.0, 0.0) == pytest.approx((0.0, ends[1]))  # it holds the value
 
 
+@pytest.mark.slow
 def test_fields_have_an_interval_for_each_coefficient():
     field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.3, std=0.2))
     estimate, data = run(identifier(a=field))

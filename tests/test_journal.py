@@ -846,6 +846,7 @@ def test_any_line_of_json_is_a_row_or_says_why_not(line):
     assert row.broken or isinstance(row.values, dict)
 
 
+@pytest.mark.slow
 @settings(
     max_examples=100,
     deadline=None,

@@ -130,6 +130,7 @@ def test_an_integrand_that_is_nonlinear_in_a_corner_only(pieces):
     assert not model.form_B.affine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mesh", "state", "parameter"),
     [
@@ -289,6 +290,7 @@ def test_estimates_on_large_meshes(law, sensors, pieces, monkeypatch):
     np.testing.assert_allclose(found.q, small.q, rtol=0, atol=1e-7 * np.abs(small.q).max())
 
 
+@pytest.mark.slow
 def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
     model = square()
     averages = lp.Averages({"left": lambda x: x[0] < 0.5, "right": lambda x: x[0] >= 0.5})

@@ -63,6 +63,7 @@ def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
     assert abs(estimate.q - 1.0).max() > 0.01  # something was learned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", ENDS)
 def test_members_side_by_side_have_the_numbers_of_a_fleet(ends):
     given, members = costs.Rod(31, 2, ends), 5
@@ -231,6 +232,7 @@ def test_the_lean_reference_is_a_row_where_it_applies():
 # --- the tables, at the smallest size ------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_costs_of_a_small_rod():
     given = costs.Rod(31, 2, "source")
     outcome = costs.rods([given], runs=1, first=4)
@@ -250,6 +252,7 @@ def test_a_row_without_a_bound_has_no_check():
     assert [row[6] for row in outcome.tables[0].rows] == [None, None]
 
 
+@pytest.mark.slow
 def test_costs_of_a_fleet():
     outcome = costs.fleet(members=2, runs=1, first=4)
     assert [row[0] for row in outcome.tables[0].rows] == list(ENDS)

@@ -105,7 +105,7 @@ run.journal.close()
 """
 
 
-@pytest.mark.slow
+@pytest.mark.process
 def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
@@ -385,6 +385,7 @@ def test_blank_lines_do_not_end_a_file(tmp_path):
     assert followed(Follow(path)) == [0.0]
 
 
+@pytest.mark.slow
 def test_silence_is_noticed(tmp_path):
     class Silent(Rows):
         def poll(self, wait):
@@ -455,6 +456,7 @@ def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
     assert kinds[-1] == ("unwell" if grave else "well")
 
 
+@pytest.mark.slow
 def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
     right = [*rows(10)]
     run = live(tmp_path, Rows([*right, *({**right[0], "t": -1.0 - k} for k in range(9))]))
@@ -464,6 +466,7 @@ def test_refused_rows_are_told_also_without_a_limit_of_silence(tmp_path):
     assert "late" in run.why
 
 
+@pytest.mark.slow
 def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
     class Vanishing(Rows):
         def poll(self, wait):

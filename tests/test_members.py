@@ -253,6 +253,7 @@ def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPat
     assert identifier._state.known
 
 
+@pytest.mark.slow
 def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
     law = lp.SensitivityLaw(replay=lp.Replay(first=8), guards=lp.laws.Guards(past=8))
     model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)

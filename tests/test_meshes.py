@@ -201,6 +201,7 @@ def test_the_size_of_cells():
         _ = lp.fem.Place(np.zeros((0,)), None, lp.fem.Moment()).h
 
 
+@pytest.mark.slow
 def test_a_penalty_imposes_an_unknown_boundary_value():
     """Weakly: beta (u - q) v with beta = 100 k/h, identified from one sensor inside."""
     mesh = lp.interval(0.0, 1.0, 20)

@@ -48,6 +48,7 @@ def test_the_share_is_that_of_the_prior_beyond_the_modes():
     assert np.all(np.diff(share) > 0.0)  # what the data narrow is the rest
 
 
+@pytest.mark.slow
 def test_a_sentence_says_so_with_the_remedy():
     data = ran(4).to_xarray()
     (text,) = [text for text in doubts(data) if "modes" in text]

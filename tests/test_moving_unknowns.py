@@ -236,6 +236,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
     assert np.sqrt(((late[:, 0] / late[:, 1]) ** 2).mean()) < 2.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", [lp.SensitivityLaw(modes=3), lp.GradientLaw()])
 def test_a_moving_field_keeps_its_boundary_value(law: Any):
     field = lp.Field(
@@ -276,6 +277,7 @@ def theory(model: lp.Model) -> Any:
     return twin, theory_report(identifier, twin, twin=twin)
 
 
+@pytest.mark.slow
 def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
     _, plain = theory(reacting(lp.Normal(0.4, 0.2)))
     twin, report = theory(
@@ -290,6 +292,7 @@ def test_the_theory_of_a_periodic_unknown_is_that_of_its_visible_part():
     assert twin.error(q) == 0.0
 
 
+@pytest.mark.slow
 def test_the_theory_does_not_speak_of_models_nonlinear_in_what_is_estimated():
     _, report = theory(reacting(lp.LogNormal(0.4, 0.2)))
     assert report.constants is None

@@ -118,6 +118,7 @@ def test_unknowns_of_sensors_are_checked_too():
         decay(["k"]).with_unknowns({"k_std": lp.Normal()})
 
 
+@pytest.mark.slow
 def test_every_name_that_a_dataset_has_is_known_to_the_check():
     """So that what is written later is refused, too: nothing here is copied by hand."""
     field = lp.Field(MESH, ElementLineP1(), prior=lp.LogNormal(1.0, std=0.1))

@@ -307,6 +307,7 @@ def test_rows_as_they_come_are_the_table(tmp_path):
     assert same(_ran(loaded.prepare(lines)), finished)
 
 
+@pytest.mark.slow
 def test_commands_show_the_column_of_noise(tmp_path):
     case(tmp_path)
     code, shown = call("check", tmp_path / "case.toml")

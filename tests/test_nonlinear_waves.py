@@ -50,6 +50,7 @@ def orders(build, q, exact, cells, stop):
     return [error(build(n), q, exact, np.linspace(0.0, stop, n + 1)) for n in (cells, 2 * cells)]
 
 
+@pytest.mark.slow
 def test_burgers_is_the_solution_of_cole_and_hopf():
     nu, a = 0.3, 1.0
     coarse, fine = orders(
@@ -63,6 +64,7 @@ def test_burgers_is_the_solution_of_cole_and_hopf():
     assert coarse / fine > 3.5  # second order in time
 
 
+@pytest.mark.slow
 def test_burgers_scales_with_its_advection():
     """a u obeys the equation with a = 1."""
     mesh, nu, a = lp.interval(0.0, 2 * np.pi, 30), 0.3, 2.5
@@ -99,6 +101,7 @@ def test_the_front_of_allen_cahn():
     assert coarse / fine > 3.5
 
 
+@pytest.mark.slow
 def test_small_waves_of_kuramoto_sivashinsky_grow_as_they_must():
     mesh, k = lp.interval(0.0, 4 * np.pi, 40), 0.5
     model = kuramoto_sivashinsky(mesh, 1.0, ONE, ONE)

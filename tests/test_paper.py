@@ -50,6 +50,7 @@ def test_nothing_is_held_halved_or_left() -> None:
     assert lp.paper.identifier(model, omega).problem.control.halvings == 0
 
 
+@pytest.mark.slow
 def test_every_step_is_solved_to_rounding() -> None:
     """The law's run satisfies the equations of the independent implementation."""
     twin = seed.twin_of(clamped=True, times=seed.TIMES[:11])

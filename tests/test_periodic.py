@@ -50,6 +50,7 @@ def advection(field, speed=1.0):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("field", "size"),
     [

@@ -145,6 +145,7 @@ def test_a_run_with_dates_shows_them() -> None:
     assert texts(panel(plots.overview(data), "u"))[0] == "2016-06-28 06:45:00"
 
 
+@pytest.mark.slow
 def test_long_runs_in_seconds_are_shown_in_days() -> None:
     data = dataset(scalars={"k": 3.0}, span=20 * DAY, unit="s")
     ax = panel(plots.overview(data), "k")
@@ -186,6 +187,7 @@ def test_failed_steps_are_marked() -> None:
     assert "2 failed steps" in texts(panel(drawn(plots.overview(data)), "k"))
 
 
+@pytest.mark.slow
 def test_a_field_in_the_plane_is_a_map_with_its_deviation() -> None:
     points = np.array([[0, 1, 0, 1, 0.5], [0, 0, 1, 1, 0.5]], dtype=float)
     data = dataset(fields=("q",), points=points)

@@ -93,6 +93,7 @@ def test_a_sensor_may_lie_near_or_on_the_end_of_the_mesh(at, shift):
     assert observed.jacobian(u, q, None)[1][0, 1] == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 def test_in_two_dimensions_each_coordinate_has_a_shift():
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (6, 6))
     model = lp.Model(
@@ -168,6 +169,7 @@ def case(folder, place: str):
     return cases.load(folder / "case.toml")
 
 
+@pytest.mark.slow
 def test_a_case_states_it(tmp_path):
     prepared = case(tmp_path, 'at = "30 cm", at_std = "1 cm"').prepare()
     unknown = prepared.case.model.parameter_space.unknowns["position"]

@@ -137,6 +137,7 @@ def test_known_boundary_values_count(element):
     np.testing.assert_allclose(found.u + boundary, u, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("element", [ElementTriP2, ElementQuad2, ElementQuadBFS])
 def test_in_the_plane_linear_states_pass_and_noise_does_not(element):
     mesh = lp.rectangle((0, 1), (0, 1), (6, 6))
@@ -320,6 +321,7 @@ def test_checked_contract_of_the_law():
     ).raise_if_failed()
 
 
+@pytest.mark.slow
 def test_white_noise_has_its_level_in_L2():
     _, twin = noisy._problem()
     gram, ratio = twin.weights, []

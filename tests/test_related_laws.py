@@ -54,6 +54,7 @@ def test_contract(law: Any, observation: lp.observation.Observation) -> None:
     assert report.ok, str(report)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_energy_falls_with_exact_data(name: str) -> None:
     """The terms with A cancel in the coupled step, as in (align:neplusnr)."""

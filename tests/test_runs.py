@@ -99,10 +99,12 @@ def test_outcome():
 # --- loop ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_drive_takes_every_sample(driven):
     assert (driven.status, driven.error, len(driven.result)) == ("finished", None, len(TIMES))
 
 
+@pytest.mark.slow
 def test_drive_keeps_what_it_has_when_a_sample_is_bad():
     stream = [*samples(), lp.Sample(2.0, {"T0": 1.0, "a": 0.0})]
     driven = drive(identifier(), stream, progress=True)
@@ -111,6 +113,7 @@ def test_drive_keeps_what_it_has_when_a_sample_is_bad():
     assert len(driven.result) == len(TIMES)
 
 
+@pytest.mark.slow
 def test_interrupt_ends_between_samples():
     """Ctrl-C within a step ends the run behind that step, Ctrl-C while waiting at once."""
 
@@ -135,6 +138,7 @@ def test_interrupt_ends_between_samples():
     assert (driven.status, len(driven.result)) == ("interrupted", 2)
 
 
+@pytest.mark.slow
 def test_drive_outside_of_the_main_thread():
     from threading import Thread
 
@@ -169,6 +173,7 @@ def test_a_run_comes_back_as_it_was(tmp_path, driven):
     assert "| alpha |" in (tmp_path / "run" / "report.md").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("field", [True, False])
 def test_fields_and_runs_without_withheld_channels(tmp_path, field):
     one = identifier(withheld=False)
@@ -193,6 +198,7 @@ def test_a_run_without_samples(tmp_path):
     assert runs.open(tmp_path / "run").dataset.sizes["time"] == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_written_over(tmp_path, driven):
     written(tmp_path / "run", driven)
     before = (tmp_path / "run" / "run.json").read_text()
@@ -219,6 +225,7 @@ def test_free_path(tmp_path):
     assert runs.free_path(tmp_path / "demo").name == "demo-3"
 
 
+@pytest.mark.slow
 def test_a_folder_that_vanishes(tmp_path, driven):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="")
     (tmp_path / "run" / "run.json").unlink()
@@ -241,6 +248,7 @@ def test_checkpoint_continues(tmp_path):
     assert np.array_equal(second.estimate().q, whole.estimate().q)
 
 
+@pytest.mark.slow
 def test_runs_that_cannot_be_opened(tmp_path, driven):
     with pytest.raises(lp.errors.RunError, match="holds no run"):
         runs.open(tmp_path)
@@ -277,6 +285,7 @@ def test_figures_are_drawn(tmp_path, driven):
 # --- numbers ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_measures_and_checks(driven):
     data = driven.result.to_xarray()
     found = measures(data)
@@ -291,6 +300,7 @@ def test_measures_and_checks(driven):
     assert [check.ok for check in checks] == [True, False]
 
 
+@pytest.mark.slow
 def test_scores_begin_with_the_assimilation(driven):
     data = driven.result.to_xarray()
     data.attrs["assimilate_from"] = 3.0
@@ -327,6 +337,7 @@ def test_markdown_and_plain():
     json.dumps(plain({"x": np.float32(0.5)}), allow_nan=False)
 
 
+@pytest.mark.slow
 def test_dataset_is_netcdf_that_others_read(tmp_path, driven):
     written(tmp_path / "run", driven)
     from scipy.io import netcdf_file
@@ -339,6 +350,7 @@ def test_dataset_is_netcdf_that_others_read(tmp_path, driven):
 # --- the end of a run ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_figure_that_cannot_be_drawn_is_a_note(tmp_path, driven):
     def broken():
         raise ValueError("Axis limits cannot be NaN or Inf\nand more")
@@ -391,6 +403,7 @@ def test_numbers_of_any_size_have_digits(value, std, shown):
     assert digits(value, std) == shown
 
 
+@pytest.mark.slow
 def test_a_report_of_numbers_that_overflow(tmp_path, driven):
     """Tables, figures and the page of what no axis can hold: notes in their place, no crash."""
     data = driven.result.to_xarray().copy(deep=True)
@@ -410,6 +423,7 @@ def test_a_report_of_numbers_that_overflow(tmp_path, driven):
     assert "A run" in output
 
 
+@pytest.mark.slow
 def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypatch):
     """The run ends with its data, its checkpoint and its status."""
 

@@ -319,6 +319,7 @@ def ask(server, path="/", **headers) -> tuple[int, str, http.client.HTTPMessage]
     return answer.status, text, answer.headers
 
 
+@pytest.mark.slow
 def test_on_this_machine_only_its_own_names_are_answered(serving):
     server = serving()
     for host in ("localhost", "127.0.0.1", f"127.0.0.1:{server.port}", "[::1]", "127.9.9.9"):
@@ -355,6 +356,7 @@ def test_no_token_is_repeated_to_who_does_not_know_it(serving):
     assert TOKEN not in text + str(headers)
 
 
+@pytest.mark.slow
 def test_elsewhere_a_token_is_made(serving):
     one, other = Address("0.0.0.0"), Address("0.0.0.0")
     assert len(one.token) >= 32
@@ -515,6 +517,7 @@ def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
         one.close()
 
 
+@pytest.mark.slow
 def test_health_and_metrics_ask_for_the_token_too():
     monitor = Monitor(Address(token=TOKEN), lambda: {"ok": True}, Metrics(["a"]))
     for path in ("/health", "/metrics", "/none"):

@@ -37,6 +37,7 @@ def noisy(model, q_true, times, seed=0, u0=0.0):
     return [(t, G @ u + sizes * rng.standard_normal(3)) for t, u in zip(times, states, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("replay", [None, lp.Replay(first=5)])
 def test_equals_the_bayesian_estimate_of_a_linear_problem(replay):
     """One batch least squares with the prior, by forward runs for each amplitude."""
@@ -145,6 +146,7 @@ def test_drift_and_memory_follow_a_jump():
     assert tracking.q_std[0] > 0
 
 
+@pytest.mark.slow
 def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
     model = conductivity()
     sensors, samples = stream(model, 1.0, 0.1 * np.arange(101))

@@ -395,6 +395,7 @@ def test_offsets_by_direct_and_gain_by_calibration():
     identified(heated(gain=lp.Normal(1.0, std=0.2)), gains, {"k": 0.6, "gain": 1.15}, 0.005)
 
 
+@pytest.mark.slow
 def test_positions_are_inputs_that_may_be_missing(tmp_path):
     model, law = heated(), lp.SensitivityLaw()
     sensors = lp.Combined(

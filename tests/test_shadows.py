@@ -277,6 +277,7 @@ def test_a_field_is_prolonged() -> None:
     assert abs(estimate.diagnostics.shifts.sizes["mesh"]) > 0.0
 
 
+@pytest.mark.slow
 def test_says_where_the_mesh_is_not_followed() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(

@@ -70,7 +70,7 @@ def run(one, pieces):
 )
 def test_equals_separate_identifiers(model, rule):
     built, chosen = MODELS[model](), lp.AutoLaw() if rule == "auto" else LAWS[rule]
-    items = stream(built, {"walks": 12}.get(model, 24))
+    items = stream(built, {"walks": 8}.get(model, 16))
     one = shard(built, chosen)
     assert bool(one.note) == (rule == "auto")
     q, q_std, innovation, status = run(one, batches(items))

@@ -69,6 +69,7 @@ def test_breakthrough_in_a_column(inlet, exact, bound, R):
     assert np.abs(u - exact(mesh.p[0] + 1e-12, 6.0, R)).max() < bound
 
 
+@pytest.mark.slow
 def test_decay_on_the_way():
     mesh = lp.interval(0.0, 30.0, 300)
     model = advection_dispersion(mesh, ONE, ONE, decay=0.3)

@@ -203,6 +203,7 @@ def test_priors_are_gaussian_in_their_latent_values(prior: Any, mean: Any, std: 
     assert prior.transform.value(np.array(prior.latent_mean)) == pytest.approx(prior.centre)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "prior", [lp.Normal(0.5, 0.2), lp.LogNormal(0.5, 0.2), lp.LogitNormal(0.5, 0.2, (0.1, 0.9))]
 )

@@ -324,6 +324,7 @@ def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
     assert one.estimate().q[0] == after.q[0]
 
 
+@pytest.mark.slow
 def test_a_census_knows_what_the_unknowns_take_up():
     from benchmarks.census import FAULTS
     from benchmarks.census.run import TRUTHS, scene_of

@@ -16,7 +16,12 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from livepde.errors import RunError
-from livepde.runs.pending_connections import LONGEST_BODY, LONGEST_HEADER, PendingConnections
+from livepde.runs.pending_connections import (
+    LONGEST_BODY,
+    LONGEST_HEADER,
+    ROOM,
+    PendingConnections,
+)
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -122,7 +127,10 @@ class Server:
             raise RunError("Serving needs cheroot: pip install 'livepde[service]'.") from None
         place = (address.host, address.port)
         server: Callable[..., Any] = Cheroot
-        self._server = server(place, _headed(application, address), numthreads=THREADS)
+        # cheroot lets five callers wait for its accept(); a sixth would try again after a second.
+        self._server = server(
+            place, _headed(application, address), numthreads=THREADS, request_queue_size=ROOM
+        )
         self._pending = PendingConnections(
             self._server.process_conn, lambda e: _why_not(e, address), TIMEOUT
         )
