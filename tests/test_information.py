@@ -246,7 +246,7 @@ def test_exact_data_are_not_smoothed() -> None:
 
 @pytest.mark.long
 def test_more_noise_less_weight_on_the_data() -> None:
-    found = [run(*rod(), noise=noise)[2]["information"] for noise in (0.0, 0.01, 0.03, 0.1)]
+    found = [run(*rod(), noise=noise)[2].information for noise in (0.0, 0.01, 0.03, 0.1)]
     assert found == sorted(found, reverse=True)
 
 
