@@ -105,7 +105,7 @@ run.journal.close()
 """
 
 
-@pytest.mark.process
+@pytest.mark.slow
 def test_killed_at_any_moment_it_goes_on_as_if_nothing_had_happened(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     for folder in (whole, killed):
