@@ -10,7 +10,7 @@ import numpy as np
 
 from livepde.cases.case_frame import Frame
 from livepde.cases.read import did_you_mean
-from livepde.cases.regions import inside
+from livepde.cases.regions import inside, subdomain
 from livepde.cases.schema import BoundarySpec
 from livepde.errors import ModelError
 from livepde.fem import Channel
@@ -63,10 +63,8 @@ def conditioned(frame: Frame) -> Frame:
             for name, (amount, over) in sources.items()
         }
         model = base(mesh, own, dirichlet, **options)
-        try:
+        with frame.located("boundary", ModelError):
             return with_conditions(model, boundary, placed, more)
-        except ModelError as error:
-            raise frame.error("boundary", str(error)) from None
 
     unknowns = {**equation.unknowns, **names.unknowns}
     inputs = {**equation.inputs, **names.inputs}
@@ -132,11 +130,7 @@ def _place(frame: Frame, mesh: Any, over: Any, name: str) -> Any:
     """Return the region of a source: the name of a subdomain, or a predicate on x."""
     key = f"sources.{name}.over"
     if isinstance(over, str):
-        known = mesh.subdomains or {}
-        if over not in known:
-            text = f"the mesh has no subdomain '{over}'; {did_you_mean(over, known)}"
-            raise frame.error(key, text)
-        return over
+        return subdomain(frame, mesh, over, key)
     place = inside(frame, over, len(mesh.p), key)
     if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
         raise frame.error(key, "holds no cell of the mesh.")
