@@ -259,23 +259,26 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
     found, inputs = [], dict(equation.inputs)
     for key, (name, values) in zip(keys, columns.items(), strict=True):
-        key = key if key and keys.count(key) == 1 else name
-        entry = _input_of(name, inputs)
-        if entry:
-            unit = _stated(name, inputs[entry].unit)
-            del inputs[entry]
+        if entry := _input_of(name, inputs):
+            unit = _stated(name, inputs.pop(entry).unit)
             given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
             found.append(FoundChannel(entry, given, (name,), _range(values)))
         else:
-            found.append(_sensor(equation, key, name, values))
+            label = key if key and keys.count(key) == 1 else name
+            found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
+    return [*_in_families(equation, found), *_lacking(equation, inputs, there)]
+
+
+def _lacking(
+    equation: Equation, inputs: Mapping[str, Variable], there: set[str]
+) -> Iterator[FoundChannel]:
+    """Yield those of the inputs without a column that the case needs."""
     chosen = equation.alternatives.get(_alternative(equation, there), ())
-    found = _in_families(equation, found)
     for name, variable in inputs.items():
         if not variable.optional or name in chosen:
             given = {"role": "input", "value": _open(variable.unit)}
-            found.append(FoundChannel(name, given, (), variable.text))
-    return found
+            yield FoundChannel(name, given, (), variable.text)
 
 
 def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
@@ -324,32 +327,34 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
     """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
-
-    def stem(item: FoundChannel) -> tuple[str, bool]:
-        numbered = NUMBERED.fullmatch(item.columns[0])
-        open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
-        return (numbered[1], True) if numbered and open_ else (item.name, False)
-
     result: list[FoundChannel] = []
-    for (name, numbered), items in groupby(found, stem):
+    for (stem, numbered), items in groupby(found, _stem):
         members = list(items)
-        columns = tuple(item.columns[0] for item in members)
-        count = len(members)
-        if numbered and count >= FAMILY:
-            given = {k: v for k, v in members[0].given.items() if k not in ("column", "at")}
-            evenly = columns == tuple(f"{name}{k}" for k in range(count))
-            if evenly and equation.dimension == 1:
-                at = members[0].given["at"]
-                given |= {"column": f"{name}{{}}", "each": [at, at, count]}
-                told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
-            else:
-                given |= {"positions": PLACES}
-                told = "fill in the places there"
-            label = re.sub(r"\W+", "_", name).strip("_") or "sensor"
-            result.append(FoundChannel(label, given, columns, told))
-        else:
-            result += members
+        whole = numbered and len(members) >= FAMILY
+        result += [_family(equation, stem, members)] if whole else members
     return result
+
+
+def _stem(item: FoundChannel) -> tuple[str, bool]:
+    """Return the column of a numbered sensor without its number, and True; else name and False."""
+    numbered = NUMBERED.fullmatch(item.columns[0])
+    open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
+    return (numbered[1], True) if numbered and open_ else (item.name, False)
+
+
+def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> FoundChannel:
+    """Return numbered sensors as one channel: `each` where they may be evenly spaced."""
+    columns = tuple(item.columns[0] for item in members)
+    count, first = len(members), members[0].given
+    given = {key: value for key, value in first.items() if key not in ("column", "at")}
+    if equation.dimension == 1 and columns == tuple(f"{stem}{k}" for k in range(count)):
+        given |= {"column": f"{stem}{{}}", "each": [first["at"], first["at"], count]}
+        told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
+    else:
+        given |= {"positions": PLACES}
+        told = "fill in the places there"
+    label = re.sub(r"\W+", "_", stem).strip("_") or "sensor"
+    return FoundChannel(label, given, columns, told)
 
 
 def _range(values: Array) -> str:

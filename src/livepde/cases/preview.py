@@ -11,11 +11,12 @@ import numpy as np
 
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
-from livepde.identifier import Sample
+from livepde.identifier import Identifier, Sample
 from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
+from livepde.result import Estimate
 from livepde.verdict import REFINE, Shifts, discretised
 
 __all__ = ["Identified", "Preview", "linearised", "preview"]
@@ -125,13 +126,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
 def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
     """Return the posterior after the first of some samples, linearised at the prior."""
     identifier = prepared.identifier_with(linear)
-    count, estimate = 0, None
-    for sample in samples:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        if sample.t >= prepared.assimilate_from:
-            count += bool(np.isfinite(estimate.innovation).any())
-        if count >= MOST_SAMPLES:
-            break
+    count, estimate = _assimilated(identifier, samples, prepared.assimilate_from)
     model = prepared.case.model
     belief = identifier.latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
@@ -150,6 +145,20 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
         *estimate.verdict.unseen,
     )
     return Preview(told, count, sentences)
+
+
+def _assimilated(
+    identifier: Identifier, samples: Iterable[Sample], start: float
+) -> tuple[int, Estimate | None]:
+    """Step through the first samples; return the number of measurements and the last estimate."""
+    count, estimate = 0, None
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        if sample.t >= start:
+            count += bool(np.isfinite(estimate.innovation).any())
+        if count >= MOST_SAMPLES:
+            break
+    return count, estimate
 
 
 def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
