@@ -138,6 +138,7 @@ def layer_edges(frame: Frame) -> list[tuple[str, float]]:
 
 def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
     """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
+    # The ends of the mesh stay where they are.
     inner = nodes[1:-1]
     found: dict[int, float] = {}
     for edge in edges:
@@ -241,6 +242,7 @@ def _without_input(frame: Frame, name: str, what: str) -> CaseError:
 
 
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
+    # "boundary" is all of it, also of a mesh without named boundaries.
     known = [*(mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
     for name, value in held(frame).items():
@@ -279,6 +281,7 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
             return Scalar(**options)
     places = {region: item.over for region, item in spec.regions.items()}
     regions = _regions(frame, mesh, places, f"{key}.regions")
+    # A region may state a prior of its own; the others share that of the unknown.
     own = {}
     for region, item in spec.regions.items():
         if (there := spec.at(item)) is not None:
@@ -369,12 +372,14 @@ def _evolution(
 def _field(
     frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
 ) -> Field:
+    # Default correlation length: a third of the extent along x.
     length = float(np.ptp(mesh.p[0])) / 3
     if spec.length is not None:
         unit = frame.equation.length_unit
         length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
 
-    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside.
+    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
+    # pointwise variance of H^1 would be infinite, so that it takes H^2.
     dimension = len(mesh.p)
     inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
     # A transform acts on each coefficient, which in linear elements is the value at a node.

@@ -125,6 +125,7 @@ def _password(frame: Frame, variable: str | None, key: str) -> str | None:
 def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
     """Return limits of backlog and retention, and the seconds until a source is silent."""
     spec = frame.spec
+    # Without these keys all estimates are kept, and no source counts as silent.
     span = math.inf
     if spec.output.retain is not None:
         span = frame.positive(spec.output.retain, frame.equation.time_unit, "output.retain")
@@ -149,6 +150,7 @@ def policy_of(frame: Frame) -> Policy:
             wait = duration(channel.wait, f"channels.{name}.wait")
         interpolated = channel.gaps == "interpolate"
         habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
+    # Without a unit of time 30 days cannot be converted: then any pause is accepted.
     leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
     if spec.leap is not None:
         leap = frame.positive(spec.leap, unit, "intake.leap")

@@ -153,6 +153,7 @@ def _mesh(equation: Equation) -> dict[str, Any]:
 
 def _data(table: Measured, folder: Path) -> dict[str, Any]:
     """Return the format of the files as keys of [data], without defaults."""
+    # Format keys of the first file hold for all; others state only what differs.
     first, *others = (_written(one, folder) for one in table.tables)
     found = {key: value for key, value in first.items() if value != USUAL.get(key)}
     if others:
@@ -191,6 +192,7 @@ def _contents(table: Measured) -> Iterator[str]:
 def _steps(table: Measured, equation: Equation) -> Iterator[str]:
     """Yield the line of time steps, where intervals between samples are uneven."""
     steps = table.steps
+    # Intervals of more than one and a half times the median count as uneven.
     if len(steps) and steps.max() > 1.5 * np.median(steps):
         known = table.time_unit != BLANK
         number = f"{np.median(steps):g}" if known else BLANK
@@ -256,6 +258,7 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
 def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     """Return the channels of a table, and at the end the inputs that it lacks."""
     columns = table.columns
+    # Keys are names of columns without units; where two would be the same, the full name is one.
     keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
     found, inputs = [], dict(equation.inputs)
     for key, (name, values) in zip(keys, columns.items(), strict=True):
@@ -308,6 +311,7 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     place, fraction = PLACE.search(name), FRACTION.search(name)
     at: Any = _open(equation.length_unit)
     if equation.dimension > 1:
+        # A name states one coordinate at most, so that the place stays open.
         at = [at] * equation.dimension
     elif place is not None and equation.length_unit:
         at = f"{place[1].replace(',', '.')} {place[2]}"

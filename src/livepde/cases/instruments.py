@@ -125,6 +125,7 @@ def _offsets(frame: Frame) -> Unknown | None:
 
 def _gains(frame: Frame) -> Unknown | None:
     sensors = frame.roles("sensor").items()
+    # A gain is a factor without a unit, 1 for an exact sensor.
     stds = {name: item.gain for name, item in sensors if item.gain is not None}
     return Scalars(tuple(stds), Normal(1.0, _common(frame, stds, "gain"))) if stds else None
 
@@ -156,6 +157,7 @@ def _correlated(frame: Frame) -> Unknown | None:
     if not errors:
         return None
     std, time = _common(frame, errors, "correlated")
+    # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
     prior, fades = Normal(0.0, std), MeanReverting(time)
     return Scalars(tuple(errors), prior, unit=_difference(unit), evolution=fades)
 

@@ -200,6 +200,7 @@ class MemberBlock:
 
     def _write(self, k: int, journal: Journal, identifier: Identifier) -> None:
         """Add pending samples, estimates and events to the journal of a member."""
+        # Another process may have extended the journal between two writes.
         if journal.accepted != self._written:
             raise RunError(f"{journal.path.parent} is being written by another process: stop it.")
         table = self._tables[k]
@@ -207,6 +208,7 @@ class MemberBlock:
         if not set(journal.noise).isdisjoint(table.names):
             names += journal.noise
         absent = np.full((len(rows), 1), np.nan)
+        # Column -1 is the appended one of NaN, for channels that this table lacks.
         places = [table.names.index(name) if name in table.names else -1 for name in names]
         rows = np.hstack([rows, absent])[:, places]
         for event in self._events[k]:

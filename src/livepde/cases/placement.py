@@ -156,6 +156,7 @@ def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
     """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
+    # -(-n // m) is n / m, rounded up.
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
     return block.at_vertices[::every], block.field.mesh.p[:, ::every], part
 
@@ -185,6 +186,7 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
     if not weights:
         raise ConfigurationError(NOTHING)
     now = _left(weights, C)
+    # The ranking counts single readings; a preview of the best few counts all of them.
     tried = []
     for best in np.argsort(-told)[:SHORT_LIST]:
         at: Any = positions[:, best].tolist()
@@ -250,6 +252,8 @@ def _weights(model: Model, factor: Array | None) -> dict[str, Array]:
     if factor is None:
         return {}
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
+    # The mass matrix integrates the variance of a field over the domain. Division by the trace
+    # makes the share of the prior, P = I, equal to one.
     for name in space.fields:
         part = space.part(name)
         found[name] = factor[part].T @ (model.parameter_mass[part, part] @ factor[part])

@@ -96,6 +96,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
         law = law.member
     if not isinstance(law, SensitivityLaw):
         return None
+    # A replay that never comes keeps the reference, an infinite gate every reading.
     replay = Replay(NEVER, NEVER)
     return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf, shadows=None)
 
@@ -113,6 +114,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
         return Preview()
     if linear.noise is None and prepared.identifier.observed.noise is None:
         return Preview()  # the law estimates it from the samples
+    # Samples may come from a stream, so they are iterated once, for both previews.
     begun, all_of = tee(samples)
     found = _told(prepared, replace(linear, shadows=Shadows()), begun)
     end = deque(enumerate(all_of, 1), maxlen=MOST_SAMPLES)
@@ -133,6 +135,7 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     if not count or estimate is None or prior is None or posterior is None:
         return Preview()
     latent = model.latent
+    # Factors are in latent coefficients; the tangent at the prior makes them physical.
     rest = None if belief.rest is None else latent.deviation(latent.prior, belief.rest)
     before, after = (
         replace(belief, q_factor=latent.tangent(latent.prior, factor), rest=rest)
@@ -191,6 +194,7 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
         prior, posterior = (
             np.asarray(belief.deviation(block.at_vertices, part)) for belief in (before, after)
         )
+        # A vertex without prior variance has no share that could remain.
         inside = np.flatnonzero(prior > 1e-12 * prior.max())
         left = posterior[inside] / prior[inside]
         for what, k in (("best", inside[left.argmin()]), ("worst", inside[left.argmax()])):

@@ -92,6 +92,7 @@ class Component:
         if "identifier" not in leaves:
             self._identifier = None
             return
+        # A new identifier is built only if the state began with another sample.
         if self._identifier is None or not np.array_equal(
             self._first, leaves["first"], equal_nan=True
         ):
