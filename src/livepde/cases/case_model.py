@@ -188,13 +188,14 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
     constants = constants_of(frame)
+    given = {*inputs, *constants}
     for name, variable in frame.equation.inputs.items():
-        if name not in {**inputs, **constants} and not variable.optional:
+        if name not in given and not variable.optional:
             raise _without_input(frame, name, f"the {variable.text}")
     unknowns = _unknowns(frame, mesh)
     with frame.located("unknowns", NameClashError):
         model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
-    _check_inputs(frame, model, inputs, constants)
+    _check_inputs(frame, model, given, constants)
     model = model.with_constant_inputs(constants) if constants else model
     own = unknowns_of(frame)
     if not own:
@@ -203,15 +204,13 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         return model.with_unknowns(own)
 
 
-def _check_inputs(
-    frame: Frame, model: Model, channels: Iterable[str], constants: Iterable[str]
-) -> None:
+def _check_inputs(frame: Frame, model: Model, given: set[str], constants: Iterable[str]) -> None:
     """Refuse inputs that the model reads and the case lacks, and constants that it does not read.
 
     Only the built model knows which optional inputs it reads with these unknowns.
     """
     for name in model.inputs:
-        if name not in {*channels, *constants}:
+        if name not in given:
             known = frame.equation.inputs.get(name)
             raise _without_input(
                 frame, name, f"the {known.text}" if known else "the equation reads it"

@@ -72,6 +72,8 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
     """Return the text of a case in `folder` that equation and table tell; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
+    # Noise is a standard deviation, a difference of temperatures: in K.
+    noise = _open(equation.state.unit.replace("degC", "K"))
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
@@ -79,7 +81,7 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_contents(table),
         *_unknowns(equation, given),
         *_inputs(found),
-        *_inline("law", {"noise": _noise(equation)}, "standard deviation of a single reading"),
+        *_inline("law", {"noise": noise}, "standard deviation of a single reading"),
         *_steps(table, equation),
         "",
         "[channels]",
@@ -95,10 +97,6 @@ def places_for(found: list[FoundChannel], equation: Equation) -> str:
     axes = "xyz"[: equation.dimension]
     lines = [",".join(["name", *axes]), *(",".join([c, *BLANK * len(axes)]) for c in columns)]
     return "\n".join(lines) + "\n" if columns else ""
-
-
-def _noise(equation: Equation) -> str:
-    return _open(equation.state.unit.replace("degC", "K"))
 
 
 def _quantity(number: str, unit: str) -> str:
