@@ -34,10 +34,7 @@ from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import (
-    AnyLaw,
-    GradientLaw,
-)
+from livepde.laws import AnyLaw, GradientLaw
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
@@ -190,6 +187,7 @@ def load(
         An invalid case: one sentence with key, given value, expected value and remedy.
     """
     file = Path(path)
+    # A run directory keeps the effective text: settings are written into it, too.
     text = original = read_text(file)
     document = read_toml(text, str(file))
     if settings:
@@ -197,6 +195,7 @@ def load(
         text = to_toml(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
+    # Families of sensors become single channels first, because conditions name single ones.
     frame = conditioned(expanded(Frame(file, spec, resolve(*place), reader_of(*place))))
     case = Case(frame, text, original)
     case.check()
@@ -255,6 +254,7 @@ class Case:
         frame, space = self.frame, self.model.parameter_space
         found = {}
         for label, value in frame.spec.reference.items():
+            # 'source' names the publication, unless an unknown of that name exists.
             if label == "source" and label not in space.labels:
                 continue
             if label not in space.labels:
@@ -407,6 +407,8 @@ class Case:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
         raw = read_data(self.frame, self.columns, self.clock, source)
         data = without_gaps(self.frame, raw) if isinstance(raw, DataTable) else raw
+        # The first sample is needed before the run. A stream can be read only once, so it is put
+        # back.
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:

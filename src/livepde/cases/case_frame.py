@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,14 @@ class Frame:
     def missing(self, key: str, text: str) -> CaseError:
         """Return an error about a key that is missing."""
         return CaseError(f"{self.path}: {key} is missing: {text}")
+
+    @contextmanager
+    def located(self, key: str, kind: type[Exception]) -> Iterator[None]:
+        """Raise errors of one kind within the block as errors that name file and key."""
+        try:
+            yield
+        except kind as error:
+            raise self.error(key, str(error)) from None
 
     def where(self, key: str) -> str:
         """Return file and key for a message."""

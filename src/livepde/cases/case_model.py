@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from livepde.cases.conditions import held
 from livepde.cases.instruments import unknowns_of
 from livepde.cases.limits import check_cells
 from livepde.cases.read import did_you_mean
-from livepde.cases.regions import inside, sides_of
+from livepde.cases.regions import inside, sides_of, subdomain
 from livepde.cases.schema import EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
@@ -50,23 +49,39 @@ def mesh_of(frame: Frame) -> Any:
     spec, unit = frame.spec.mesh, frame.equation.length_unit
     if spec.file is not None:
         scale = conversion(spec.unit or unit, unit, frame.where("mesh.unit")).factor
-        file = frame.path.parent / spec.file
-        return _built(frame, "mesh.file", lambda: read_mesh(file, scale))
+        with frame.located("mesh.file", SpaceError):
+            return read_mesh(frame.path.parent / spec.file, scale)
     if spec.nodes is not None:
         nodes = [frame.convert(node, unit, "mesh.nodes") for node in spec.nodes]
-        return _built(frame, "mesh.nodes", lambda: line(nodes))
+        with frame.located("mesh.nodes", SpaceError):
+            return line(nodes)
     if spec.x is not None and spec.y is not None:
-        x = [frame.convert(node, unit, "mesh.x") for node in spec.x]
-        y = [frame.convert(node, unit, "mesh.y") for node in spec.y]
-        if isinstance(spec.cells, tuple):
-            number = spec.cells
-            check_cells(float(number[0]) * number[1], frame.where("mesh.cells"))
-            if isinstance(spec.spacing, tuple):
-                graded = [one == "geometric" for one in spec.spacing]
-                return _built(frame, "mesh", lambda: _graded(frame, (x, y), number, graded))
-            return _built(frame, "mesh", lambda: rectangle((x[0], x[1]), (y[0], y[1]), number))
-        check_cells(float(len(x)) * len(y), frame.where("mesh"))
-        return _built(frame, "mesh", lambda: grid(x, y))
+        return _rectangle(frame, spec.x, spec.y)
+    return _interval(frame)
+
+
+def _rectangle(frame: Frame, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
+    """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
+    spec, unit = frame.spec.mesh, frame.equation.length_unit
+    sides = (
+        [frame.convert(node, unit, "mesh.x") for node in x],
+        [frame.convert(node, unit, "mesh.y") for node in y],
+    )
+    if not isinstance(spec.cells, tuple):
+        check_cells(float(len(sides[0])) * len(sides[1]), frame.where("mesh"))
+        with frame.located("mesh", SpaceError):
+            return grid(*sides)
+    check_cells(float(spec.cells[0]) * spec.cells[1], frame.where("mesh.cells"))
+    with frame.located("mesh", SpaceError):
+        if isinstance(spec.spacing, tuple):
+            return _graded(frame, sides, spec.cells, [one == "geometric" for one in spec.spacing])
+        (x0, x1), (y0, y1) = sides
+        return rectangle((x0, x1), (y0, y1), spec.cells)
+
+
+def _interval(frame: Frame) -> Any:
+    """Return an interval of cells, with nodes at the ends of layers."""
+    spec, unit = frame.spec.mesh, frame.equation.length_unit
     cells: Any = spec.cells  # the schema allows only a number here
     check_cells(cells, frame.where("mesh.cells"))
     start = frame.convert(spec.start, unit, "mesh.from")
@@ -123,6 +138,7 @@ def layer_edges(frame: Frame) -> list[tuple[str, float]]:
 
 def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
     """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
+    # The ends of the mesh stay where they are.
     inner = nodes[1:-1]
     found: dict[int, float] = {}
     for edge in edges:
@@ -136,14 +152,6 @@ def _inside(nodes: Array, edge: float) -> bool:
     # Conversion of units rounds, so that an end of the mesh may seem to lie just inside of it.
     slack = 1e-6 * float(np.ptp(nodes))
     return bool(nodes.min() + slack < edge < nodes.max() - slack)
-
-
-def _built(frame: Frame, key: str, build: Callable[[], Any]) -> Any:
-    """Return what is built, a mesh or an unknown; an error names the key of the case."""
-    try:
-        return build()
-    except SpaceError as error:
-        raise frame.error(key, str(error)) from None
 
 
 def options_of(frame: Frame) -> dict[str, Any]:
@@ -180,17 +188,29 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
     constants = constants_of(frame)
+    given = {*inputs, *constants}
     for name, variable in frame.equation.inputs.items():
-        if name not in {**inputs, **constants} and not variable.optional:
+        if name not in given and not variable.optional:
             raise _without_input(frame, name, f"the {variable.text}")
     unknowns = _unknowns(frame, mesh)
-    try:
+    with frame.located("unknowns", NameClashError):
         model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
-    except NameClashError as error:
-        raise frame.error("unknowns", str(error)) from None
-    # Only the built model knows which optional inputs it reads with these unknowns.
+    _check_inputs(frame, model, given, constants)
+    model = model.with_constant_inputs(constants) if constants else model
+    own = unknowns_of(frame)
+    if not own:
+        return model
+    with frame.located("channels", ModelError):
+        return model.with_unknowns(own)
+
+
+def _check_inputs(frame: Frame, model: Model, given: set[str], constants: Iterable[str]) -> None:
+    """Refuse inputs that the model reads and the case lacks, and constants that it does not read.
+
+    Only the built model knows which optional inputs it reads with these unknowns.
+    """
     for name in model.inputs:
-        if name not in {**inputs, **constants}:
+        if name not in given:
             known = frame.equation.inputs.get(name)
             raise _without_input(
                 frame, name, f"the {known.text}" if known else "the equation reads it"
@@ -200,14 +220,6 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
         if name not in model.inputs:
             text = "the equation does not read it with these unknowns; leave it out."
             raise frame.error(f"inputs.{name}", text)
-    model = model.with_constant_inputs(constants) if constants else model
-    own = unknowns_of(frame)
-    if not own:
-        return model
-    try:
-        return model.with_unknowns(own)
-    except ModelError as error:
-        raise frame.error("channels", str(error)) from None
 
 
 def constants_of(frame: Frame) -> dict[str, float]:
@@ -229,6 +241,7 @@ def _without_input(frame: Frame, name: str, what: str) -> CaseError:
 
 
 def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
+    # "boundary" is all of it, also of a mesh without named boundaries.
     known = [*(mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
     for name, value in held(frame).items():
@@ -260,18 +273,23 @@ def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
     options = _options_of(frame, spec, unit, key)
     if spec.field:
-        return _built(frame, key, lambda: _field(frame, mesh, spec, name, options))
+        with frame.located(key, SpaceError):
+            return _field(frame, mesh, spec, name, options)
     if spec.regions is None:
-        return _built(frame, key, lambda: Scalar(**options))
+        with frame.located(key, SpaceError):
+            return Scalar(**options)
     places = {region: item.over for region, item in spec.regions.items()}
     regions = _regions(frame, mesh, places, f"{key}.regions")
+    # A region may state a prior of its own; the others share that of the unknown.
     own = {}
     for region, item in spec.regions.items():
         if (there := spec.at(item)) is not None:
             where = f"{key}.regions.{region}"
             given = _options_of(frame, there, unit, where)
-            own[region] = _built(frame, where, partial(Scalar, **given))
-    return _built(frame, key, lambda: Piecewise(regions, **options, own=own))
+            with frame.located(where, SpaceError):
+                own[region] = Scalar(**given)
+    with frame.located(key, SpaceError):
+        return Piecewise(regions, **options, own=own)
 
 
 def _options_of(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
@@ -311,8 +329,8 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
-        normal: Prior = _built(frame, key, lambda: Normal(prior, std, (low, high)))
-        return normal
+        with frame.located(key, SpaceError):
+            return Normal(prior, std, (low, high))
     return _transformed(frame, spec.transform, prior, std, (low, high), key)
 
 
@@ -331,8 +349,8 @@ def _transformed(
         text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
         raise frame.error(key, text + "inside of the bounds.")
     distribution = LogNormal if transform == "log" else LogitNormal
-    found: Prior = _built(frame, key, lambda: distribution(median, std, (low, high)))
-    return found
+    with frame.located(key, SpaceError):
+        return distribution(median, std, (low, high))
 
 
 def _evolution(
@@ -353,12 +371,14 @@ def _evolution(
 def _field(
     frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
 ) -> Field:
+    # Default correlation length: a third of the extent along x.
     length = float(np.ptp(mesh.p[0])) / 3
     if spec.length is not None:
         unit = frame.equation.length_unit
         length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
 
-    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside.
+    # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
+    # pointwise variance of H^1 would be infinite, so that it takes H^2.
     dimension = len(mesh.p)
     inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
     # A transform acts on each coefficient, which in linear elements is the value at a node.
@@ -371,43 +391,40 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
 
     Every point has to lie in exactly one.
     """
-    unit = frame.equation.length_unit
     # Midpoints of cells decide, since a vertex on an interface would belong to two regions.
     middle = mesh.p[:, mesh.t].mean(axis=1)
     count = np.zeros(middle.shape[1])
     found: dict[str, Any] = {}
     for name, given in regions.items():
+        where = f"{key}.{name}"
         if isinstance(given, str):
-            known = mesh.subdomains or {}
-            if given not in known:
-                text = f"the mesh has no subdomain '{given}'; {did_you_mean(given, known)}"
-                raise frame.error(f"{key}.{name}", text)
-            found[name] = given
-            count[known[given]] += 1
+            found[name] = subdomain(frame, mesh, given, where)
+            count[mesh.subdomains[given]] += 1
             continue
-        place = inside(frame, given, len(mesh.p), f"{key}.{name}")
-        here = place(middle)
+        found[name] = inside(frame, given, len(mesh.p), where)
+        here = found[name](middle)
         if not here.any():
-            sides = sides_of(frame, given, len(mesh.p), f"{key}.{name}")
-            spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
-            ends = " x ".join(f"{a:g} to {b:g}" for a, b in zip(*_ends(mesh), strict=True))
-            raise frame.error(
-                f"{key}.{name}",
-                f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}.",
-            )
+            raise _without_cells(frame, mesh, given, where)
         count += here
-        found[name] = place
     wrong = np.flatnonzero(count != 1)
     if len(wrong):
         x, times = middle[:, wrong[0]], int(count[wrong[0]])
         what = "layers" if len(x) == 1 else "regions"
-        text = f"{', '.join(f'{c:.4g}' for c in x)} {unit} lies in {times} {what}; "
-        raise frame.error(key, text + "every point has to lie in exactly one.")
+        point = f"{', '.join(f'{c:.4g}' for c in x)} {frame.equation.length_unit}"
+        text = f"{point} lies in {times} {what}; every point has to lie in exactly one."
+        raise frame.error(key, text)
     return found
 
 
-def _ends(mesh: Any) -> tuple[Any, Any]:
-    return mesh.p.min(axis=1), mesh.p.max(axis=1)
+def _without_cells(frame: Frame, mesh: Any, given: Any, key: str) -> CaseError:
+    """Return the error about a layer or box without a cell of the mesh."""
+    unit = frame.equation.length_unit
+    sides = sides_of(frame, given, len(mesh.p), key)
+    spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
+    limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
+    ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
+    text = f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}."
+    return frame.error(key, text)
 
 
 def drive_notes(frame: Frame, model: Model) -> list[str]:
@@ -424,13 +441,7 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
     held = any(field.boundary_values or field.periodic for field in fields)
     if held or model.channels or model.form_initial is not None:
         return []
-    # Terms at a constant state are compared with those at an uneven one, which give their size:
-    # rounding leaves no exact zeros.
-    level = model.state_space.interpolate(1.0)
-    uneven = level * (1.0 + np.arange(len(level)) % 3)
-    flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
-    known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
-    if known or model.F().any() or (flat > 1e-9 * steep).any():
+    if not _rests(model):
         return []
     return [
         "No boundary value, flux, exchange, source or input: nothing drives the process, and only "
@@ -439,26 +450,39 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
     ]
 
 
+def _rests(model: Model) -> bool:
+    """Return whether A'(q), B and F vanish at a constant state."""
+    # Terms at a constant state are compared with those at an uneven one, which give their size:
+    # rounding leaves no exact zeros.
+    level = model.state_space.interpolate(1.0)
+    uneven = level * (1.0 + np.arange(len(level)) % 3)
+    flat, steep = (abs(model.A(u).matrix).max(axis=0).toarray() for u in (level, uneven))
+    known = np.abs(model.B(level)).max() > 1e-9 * np.abs(model.B(uneven)).max()
+    return not (known or model.F().any() or (flat > 1e-9 * steep).any())
+
+
 def process_notes(frame: Frame, mesh: Any) -> list[str]:
     """Return notes on allowed settings that may be mistakes."""
-    found = []
-    nodes, spec = mesh.p[0], frame.spec.mesh
+    found, spec = [], frame.spec.mesh
     graded = frame.equation.spacing == "geometric"
     if graded and spec.start is not None and spec.spacing == "uniform":
         found.append(
             "The mesh is uniform, with cells too large at the left end, where "
             f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
         )
-    if len(mesh.p) == 1 and spec.file is None:
-        within = 1e-6 * np.ptp(nodes)
-        crossed = dict.fromkeys(
-            what
-            for what, edge in layer_edges(frame)
-            if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
-        )
-        if crossed:
-            remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
-            names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
-            names = f"{names[0].upper()}{names[1:]}"
-            found.append(f"{names} {end} inside of a cell: {remedy}.")
+    if len(mesh.p) == 1 and spec.file is None and (crossed := _off_nodes(frame, mesh.p[0])):
+        remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
+        names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
+        found.append(f"{names[0].upper()}{names[1:]} {end} inside of a cell: {remedy}.")
     return found
+
+
+def _off_nodes(frame: Frame, nodes: Array) -> list[str]:
+    """Return the names of layers and sources with an end inside of a cell."""
+    within = 1e-6 * np.ptp(nodes)
+    crossed = dict.fromkeys(
+        what
+        for what, edge in layer_edges(frame)
+        if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
+    )
+    return list(crossed)

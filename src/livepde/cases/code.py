@@ -54,8 +54,9 @@ def check_options(function: Any, given: Iterable[str], where: str) -> None:
     _, *known = inspect.signature(function).parameters.values()
     if any(item.kind is inspect.Parameter.VAR_KEYWORD for item in known):
         return
+    names = [item.name for item in known]
     for name in given:
-        if name not in (names := [item.name for item in known]):
+        if name not in names:
             raise CaseError(
                 f"{where}: '{function.__name__}' has no option '{name}'; "
                 f"{did_you_mean(name, names)}"
@@ -77,6 +78,7 @@ def _module(source: str, folder: Path, where: str) -> Any:
         path = folder / source
         if not path.is_file():
             raise CaseError(f"{where}: {_no_code(path, source, folder)}")
+        # A file beside the case belongs to no package, so it is loaded by its path.
         loader = importlib.util.spec_from_file_location(path.stem, path)
         if loader is None or loader.loader is None:
             raise ImportError(f"{path} is not a Python file")

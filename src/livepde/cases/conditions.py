@@ -10,7 +10,7 @@ import numpy as np
 
 from livepde.cases.case_frame import Frame
 from livepde.cases.read import did_you_mean
-from livepde.cases.regions import inside
+from livepde.cases.regions import inside, subdomain
 from livepde.cases.schema import BoundarySpec
 from livepde.errors import ModelError
 from livepde.fem import Channel
@@ -52,6 +52,8 @@ def conditioned(frame: Frame) -> Frame:
     def build(
         mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
     ) -> Model:
+        # The equation gets its own unknowns; those that fluxes and sources name are added
+        # afterwards.
         own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
         more = {name: item for name, item in unknowns.items() if name in names.unknowns}
         for name in boundary:
@@ -63,10 +65,8 @@ def conditioned(frame: Frame) -> Frame:
             for name, (amount, over) in sources.items()
         }
         model = base(mesh, own, dirichlet, **options)
-        try:
+        with frame.located("boundary", ModelError):
             return with_conditions(model, boundary, placed, more)
-        except ModelError as error:
-            raise frame.error("boundary", str(error)) from None
 
     unknowns = {**equation.unknowns, **names.unknowns}
     inputs = {**equation.inputs, **names.inputs}
@@ -81,6 +81,7 @@ def _passing(names: _Names, units: Fluxes, name: str, given: BoundarySpec) -> li
     if given.flux is not None:
         found.append(Flux(names.amount(given.flux, units.flux, f"{key}.flux")))
     if given.transfer is not None and given.ambient is not None:
+        # Robin condition: D u_n = h (ambient - u).
         h = names.amount(given.transfer, units.transfer, f"{key}.transfer")
         unit = names.frame.equation.state.unit
         found.append(Exchange(h, names.amount(given.ambient, unit, f"{key}.ambient")))
@@ -106,6 +107,7 @@ class _Names:
                 raise self.frame.error(key, f"the channel '{value}' has to be of role 'input'.")
             self._named(self.inputs, self.frame.equation.inputs, value, unit, key)
             return Channel(value)
+        # Text without a digit is no quantity: a name was meant.
         if isinstance(value, str) and not any(letter.isdigit() for letter in value):
             text = f"there is no unknown and no channel '{value}'; "
             text += did_you_mean(value, [*spec.unknowns, *spec.channels])
@@ -120,6 +122,7 @@ class _Names:
         unit: str,
         key: str,
     ) -> None:
+        # Several conditions may share a name, if it has the same unit in all of them.
         before, own = found.get(name) or taken.get(name), name in taken
         clash = own and found is self.unknowns
         if before is not None and (clash or before.unit != unit):
@@ -132,11 +135,7 @@ def _place(frame: Frame, mesh: Any, over: Any, name: str) -> Any:
     """Return the region of a source: the name of a subdomain, or a predicate on x."""
     key = f"sources.{name}.over"
     if isinstance(over, str):
-        known = mesh.subdomains or {}
-        if over not in known:
-            text = f"the mesh has no subdomain '{over}'; {did_you_mean(over, known)}"
-            raise frame.error(key, text)
-        return over
+        return subdomain(frame, mesh, over, key)
     place = inside(frame, over, len(mesh.p), key)
     if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
         raise frame.error(key, "holds no cell of the mesh.")

@@ -29,17 +29,25 @@ Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSO
 
 def source_of(frame: Frame, data: Data, position: str) -> RowSource:
     """Return the source of the rows of a case, from a position on."""
+    match data:
+        case None:
+            return _own_source(frame, position)
+        case str():
+            return _file_source(frame, Path(data), position)
+        case Iterable():
+            return Lines(data)
+    return data
+
+
+def _own_source(frame: Frame, position: str) -> RowSource:
+    """Return the source that the case names: a broker, a server or a file."""
     spec = frame.spec.data
-    if isinstance(data, Iterable) and not isinstance(data, str):
-        return Lines(data)
-    if data is not None and not isinstance(data, str):
-        return data
-    if data is None and spec.mqtt is not None:
+    if spec.mqtt is not None:
         from livepde.streams.mqtt import MqttSource
 
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
         return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.times[0])
-    if data is None and spec.opcua is not None:
+    if spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
         return OpcuaSource(
@@ -50,7 +58,11 @@ def source_of(frame: Frame, data: Data, position: str) -> RowSource:
             username=spec.opcua.username,
             password=_password(frame, spec.opcua.password_env, "data.opcua"),
         )
-    path = Path(data) if data is not None else data_file(frame)
+    return _file_source(frame, data_file(frame), position)
+
+
+def _file_source(frame: Frame, path: Path, position: str) -> Follow:
+    spec = frame.spec.data
     if spec.follow and not path.exists():
         LOG.warning("there is no file '%s' yet: waits for it", path)
     return Follow(
@@ -113,6 +125,7 @@ def _password(frame: Frame, variable: str | None, key: str) -> str | None:
 def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
     """Return limits of backlog and retention, and the seconds until a source is silent."""
     spec = frame.spec
+    # Without these keys all estimates are kept, and no source counts as silent.
     span = math.inf
     if spec.output.retain is not None:
         span = frame.positive(spec.output.retain, frame.equation.time_unit, "output.retain")
@@ -137,6 +150,7 @@ def policy_of(frame: Frame) -> Policy:
             wait = duration(channel.wait, f"channels.{name}.wait")
         interpolated = channel.gaps == "interpolate"
         habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
+    # Without a unit of time 30 days cannot be converted: then any pause is accepted.
     leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
     if spec.leap is not None:
         leap = frame.positive(spec.leap, unit, "intake.leap")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,29 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
 
 def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
     """Return a bare function as an equation whose units are those the case writes."""
+    channels = spec.channels
+    units = (item.unit for item in channels.values() if item.role == "sensor" and item.unit)
+    inputs = {key: item.unit for key, item in channels.items() if item.role == "input"}
+    return Equation(
+        name=name,
+        summary=(function.__doc__ or "").strip().split("\n")[0],
+        formula=name,
+        state=Variable(next(units, ""), "state"),
+        unknowns=_variables({key: item.unit for key, item in spec.unknowns.items()}),
+        inputs=_variables(inputs | dict.fromkeys(spec.inputs, "")),
+        options={key: _option(value) for key, value in spec.options.items()},
+        build=_checked(name, function, where),
+        element=linear,
+        fluxes=Fluxes("", "", ""),
+    )
+
+
+def _variables(units: Mapping[str, str | None]) -> dict[str, Variable]:
+    return {name: Variable(unit or "", "") for name, unit in units.items()}
+
+
+def _checked(name: str, function: Any, where: str) -> Callable[..., Model]:
+    """Return a user's function, which has to return a model; its failures become `CaseError`."""
 
     def build(
         mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
@@ -58,24 +81,7 @@ def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
             )
         return model
 
-    units = [item.unit for item in spec.channels.values() if item.role == "sensor" and item.unit]
-    return Equation(
-        name=name,
-        summary=(function.__doc__ or "").strip().split("\n")[0],
-        formula=name,
-        state=Variable(units[0] if units else "", "state"),
-        unknowns={key: Variable(item.unit or "", "") for key, item in spec.unknowns.items()},
-        inputs={
-            key: Variable(item.unit or "", "")
-            for key, item in spec.channels.items()
-            if item.role == "input"
-        }
-        | {key: Variable("", "") for key in spec.inputs},
-        options={key: _option(value) for key, value in spec.options.items()},
-        build=build,
-        element=linear,
-        fluxes=Fluxes("", "", ""),
-    )
+    return build
 
 
 def _option(value: Any) -> Option:

@@ -72,6 +72,8 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
     """Return the text of a case in `folder` that equation and table tell; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
+    # Noise is a standard deviation, a difference of temperatures: in K.
+    noise = _open(equation.state.unit.replace("degC", "K"))
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
@@ -79,7 +81,7 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_contents(table),
         *_unknowns(equation, given),
         *_inputs(found),
-        *_inline("law", {"noise": _noise(equation)}, "standard deviation of a single reading"),
+        *_inline("law", {"noise": noise}, "standard deviation of a single reading"),
         *_steps(table, equation),
         "",
         "[channels]",
@@ -95,10 +97,6 @@ def places_for(found: list[FoundChannel], equation: Equation) -> str:
     axes = "xyz"[: equation.dimension]
     lines = [",".join(["name", *axes]), *(",".join([c, *BLANK * len(axes)]) for c in columns)]
     return "\n".join(lines) + "\n" if columns else ""
-
-
-def _noise(equation: Equation) -> str:
-    return _open(equation.state.unit.replace("degC", "K"))
 
 
 def _quantity(number: str, unit: str) -> str:
@@ -153,6 +151,7 @@ def _mesh(equation: Equation) -> dict[str, Any]:
 
 def _data(table: Measured, folder: Path) -> dict[str, Any]:
     """Return the format of the files as keys of [data], without defaults."""
+    # Format keys of the first file hold for all; others state only what differs.
     first, *others = (_written(one, folder) for one in table.tables)
     found = {key: value for key, value in first.items() if value != USUAL.get(key)}
     if others:
@@ -191,6 +190,7 @@ def _contents(table: Measured) -> Iterator[str]:
 def _steps(table: Measured, equation: Equation) -> Iterator[str]:
     """Yield the line of time steps, where intervals between samples are uneven."""
     steps = table.steps
+    # Intervals of more than one and a half times the median count as uneven.
     if len(steps) and steps.max() > 1.5 * np.median(steps):
         known = table.time_unit != BLANK
         number = f"{np.median(steps):g}" if known else BLANK
@@ -256,26 +256,30 @@ def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
 def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
     """Return the channels of a table, and at the end the inputs that it lacks."""
     columns = table.columns
+    # Keys are names of columns without units; where two would be the same, the full name is one.
     keys = [re.sub(r"\W+", "_", IN_BRACKETS.sub("", name)).strip("_") for name in columns]
     found, inputs = [], dict(equation.inputs)
     for key, (name, values) in zip(keys, columns.items(), strict=True):
-        key = key if key and keys.count(key) == 1 else name
-        entry = _input_of(name, inputs)
-        if entry:
-            unit = _stated(name, inputs[entry].unit)
-            del inputs[entry]
+        if entry := _input_of(name, inputs):
+            unit = _stated(name, inputs.pop(entry).unit)
             given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
             found.append(FoundChannel(entry, given, (name,), _range(values)))
         else:
-            found.append(_sensor(equation, key, name, values))
+            label = key if key and keys.count(key) == 1 else name
+            found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
+    return [*_in_families(equation, found), *_lacking(equation, inputs, there)]
+
+
+def _lacking(
+    equation: Equation, inputs: Mapping[str, Variable], there: set[str]
+) -> Iterator[FoundChannel]:
+    """Yield those of the inputs without a column that the case needs."""
     chosen = equation.alternatives.get(_alternative(equation, there), ())
-    found = _in_families(equation, found)
     for name, variable in inputs.items():
         if not variable.optional or name in chosen:
             given = {"role": "input", "value": _open(variable.unit)}
-            found.append(FoundChannel(name, given, (), variable.text))
-    return found
+            yield FoundChannel(name, given, (), variable.text)
 
 
 def _input_of(column: str, inputs: Mapping[str, Variable]) -> str:
@@ -305,6 +309,7 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
     place, fraction = PLACE.search(name), FRACTION.search(name)
     at: Any = _open(equation.length_unit)
     if equation.dimension > 1:
+        # A name states one coordinate at most, so that the place stays open.
         at = [at] * equation.dimension
     elif place is not None and equation.length_unit:
         at = f"{place[1].replace(',', '.')} {place[2]}"
@@ -324,32 +329,34 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
     """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
-
-    def stem(item: FoundChannel) -> tuple[str, bool]:
-        numbered = NUMBERED.fullmatch(item.columns[0])
-        open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
-        return (numbered[1], True) if numbered and open_ else (item.name, False)
-
     result: list[FoundChannel] = []
-    for (name, numbered), items in groupby(found, stem):
+    for (stem, numbered), items in groupby(found, _stem):
         members = list(items)
-        columns = tuple(item.columns[0] for item in members)
-        count = len(members)
-        if numbered and count >= FAMILY:
-            given = {k: v for k, v in members[0].given.items() if k not in ("column", "at")}
-            evenly = columns == tuple(f"{name}{k}" for k in range(count))
-            if evenly and equation.dimension == 1:
-                at = members[0].given["at"]
-                given |= {"column": f"{name}{{}}", "each": [at, at, count]}
-                told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
-            else:
-                given |= {"positions": PLACES}
-                told = "fill in the places there"
-            label = re.sub(r"\W+", "_", name).strip("_") or "sensor"
-            result.append(FoundChannel(label, given, columns, told))
-        else:
-            result += members
+        whole = numbered and len(members) >= FAMILY
+        result += [_family(equation, stem, members)] if whole else members
     return result
+
+
+def _stem(item: FoundChannel) -> tuple[str, bool]:
+    """Return the column of a numbered sensor without its number, and True; else name and False."""
+    numbered = NUMBERED.fullmatch(item.columns[0])
+    open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
+    return (numbered[1], True) if numbered and open_ else (item.name, False)
+
+
+def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> FoundChannel:
+    """Return numbered sensors as one channel: `each` where they may be evenly spaced."""
+    columns = tuple(item.columns[0] for item in members)
+    count, first = len(members), members[0].given
+    given = {key: value for key, value in first.items() if key not in ("column", "at")}
+    if equation.dimension == 1 and columns == tuple(f"{stem}{k}" for k in range(count)):
+        given |= {"column": f"{stem}{{}}", "each": [first["at"], first["at"], count]}
+        told = f'evenly from ... to ...; else positions = "{PLACES}" (name, x)'
+    else:
+        given |= {"positions": PLACES}
+        told = "fill in the places there"
+    label = re.sub(r"\W+", "_", stem).strip("_") or "sensor"
+    return FoundChannel(label, given, columns, told)
 
 
 def _range(values: Array) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,17 +57,10 @@ def _evenly(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[An
 def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a table of positions."""
     key, file = f"channels.{name}.positions", frame.path.parent / str(channel.positions)
-    try:
-        table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
-    except (OSError, ValueError) as error:
-        raise frame.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
+    table = _positions_table(frame, key, file)
     axes = [axis for axis in "xyz" if axis in table.columns]
-    if "name" not in table.columns or not axes:
-        got = ", ".join(map(str, table.columns[:8]))
-        raise frame.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
-    if len(table) > MEMBERS:
-        raise frame.error(key, f"{file} has more than {MEMBERS} sensors.")
     found: dict[str, tuple[Any, str]] = {}
+    # Row 1 of the file is its header.
     for row, label in enumerate(table["name"], 2):
         if not label or label in found:
             what = f"the name '{label}' stands there twice" if label else "the name is missing"
@@ -76,6 +70,20 @@ def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[An
         column = str(channel.column or "{}").replace("{}", label)
         found[label] = (place if len(place) > 1 else place[0], column)
     return found
+
+
+def _positions_table(frame: Frame, key: str, file: Path) -> pd.DataFrame:
+    """Return a table with the columns name, x (and y, z), as text; empty where a cell is."""
+    try:
+        table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
+    except (OSError, ValueError) as error:
+        raise frame.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
+    if "name" not in table.columns or table.columns.intersection(["x", "y", "z"]).empty:
+        got = ", ".join(map(str, table.columns[:8]))
+        raise frame.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
+    if len(table) > MEMBERS:
+        raise frame.error(key, f"{file} has more than {MEMBERS} sensors.")
+    return table
 
 
 def _coordinate(frame: Frame, cell: str, where: str) -> float:
@@ -93,44 +101,65 @@ def _coordinate(frame: Frame, cell: str, where: str) -> float:
 
 def unknowns_of(frame: Frame) -> dict[str, Unknown]:
     """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
+    found = {
+        "offset": _offsets(frame),
+        "gain": _gains(frame),
+        POSITION: _shifts(frame),
+        "correlated": _correlated(frame),
+    }
+    return {name: unknown for name, unknown in found.items() if unknown is not None}
+
+
+def _offsets(frame: Frame) -> Unknown | None:
     unit = frame.equation.state.unit
-    found: dict[str, Unknown] = {}
-    offsets = {
+    stds = {
         name: frame.positive(item.offset, unit, f"channels.{name}.offset")
         for name, item in frame.roles("sensor").items()
         if item.offset is not None
     }
-    if offsets:
-        std = _common(frame, offsets, "offset")
-        found["offset"] = Scalars(tuple(offsets), Normal(0.0, std), unit=_difference(unit))
-    gains = {
-        name: item.gain for name, item in frame.roles("sensor").items() if item.gain is not None
-    }
-    if gains:
-        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(frame, gains, "gain")))
-    shifts = positions_of(frame, frame.roles("sensor"))
-    if shifts:
-        std = _common(frame, shifts, "at_std")
-        names = [
-            shift
-            for name in shifts
-            for shift in shift_names(name, _dimension(frame.spec.channels[name]))
-        ]
-        found[POSITION] = Scalars(names, Normal(0.0, std), unit=frame.equation.length_unit)
-    errors = {}
+    if not stds:
+        return None
+    prior = Normal(0.0, _common(frame, stds, "offset"))
+    return Scalars(tuple(stds), prior, unit=_difference(unit))
+
+
+def _gains(frame: Frame) -> Unknown | None:
+    sensors = frame.roles("sensor").items()
+    # A gain is a factor without a unit, 1 for an exact sensor.
+    stds = {name: item.gain for name, item in sensors if item.gain is not None}
+    return Scalars(tuple(stds), Normal(1.0, _common(frame, stds, "gain"))) if stds else None
+
+
+def _shifts(frame: Frame) -> Unknown | None:
+    """Return the distances of sensors from their stated positions, one for each coordinate."""
+    stds = positions_of(frame, frame.roles("sensor"))
+    if not stds:
+        return None
+    prior = Normal(0.0, _common(frame, stds, "at_std"))
+    places = {name: frame.spec.channels[name].at for name in stds}
+    names = [
+        shift
+        for name, at in places.items()
+        for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
+    ]
+    return Scalars(names, prior, unit=frame.equation.length_unit)
+
+
+def _correlated(frame: Frame) -> Unknown | None:
+    """Return the errors of sensors that fade with a correlation time."""
+    unit, errors = frame.equation.state.unit, {}
     for name, item in frame.roles("sensor").items():
         if item.correlated is not None:
             key = f"channels.{name}.correlated"
             std = frame.positive(item.correlated.std, unit, f"{key}.std")
             time = frame.positive(item.correlated.time, frame.equation.time_unit, f"{key}.time")
             errors[name] = (std, time)
-    if errors:
-        std, time = _common(frame, errors, "correlated")
-        fades = MeanReverting(time)
-        found["correlated"] = Scalars(
-            tuple(errors), Normal(0.0, std), unit=_difference(unit), evolution=fades
-        )
-    return found
+    if not errors:
+        return None
+    std, time = _common(frame, errors, "correlated")
+    # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
+    prior, fades = Normal(0.0, std), MeanReverting(time)
+    return Scalars(tuple(errors), prior, unit=_difference(unit), evolution=fades)
 
 
 def positions_of(frame: Frame, channels: Mapping[str, ChannelSpec]) -> dict[str, float]:
@@ -141,10 +170,6 @@ def positions_of(frame: Frame, channels: Mapping[str, ChannelSpec]) -> dict[str,
         for name, item in channels.items()
         if item.at_std is not None
     }
-
-
-def _dimension(channel: ChannelSpec) -> int:
-    return len(channel.at) if isinstance(channel.at, tuple) else 1
 
 
 def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
@@ -158,6 +183,7 @@ def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
 
 
 def _difference(unit: str) -> str:
+    """Return the unit of differences of a temperature, or of another quantity."""
     return "K" if unit == "degC" else unit
 
 

@@ -32,12 +32,10 @@ __all__ = ["law_of"]
 def law_of(frame: Frame) -> AnyLaw:
     """Return the law; raises `CaseError`."""
     spec = frame.spec.law
-    try:
+    with frame.located("law", LawError):
         if isinstance(spec, GradientSpec):
             return _gradient(spec)
         return _auto(frame, spec) if isinstance(spec, AutoSpec) else _sensitivity(frame, spec)
-    except LawError as error:
-        raise frame.error("law", str(error)) from None
 
 
 def _gradient(spec: GradientSpec) -> GradientLaw:

@@ -51,19 +51,9 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
     members
         Name -> case with its data.
     """
-    alike: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
-    settings: dict[Case, str] = {}
-    apart: dict[str, str] = {}
-    for name, one in members.items():
-        if not isinstance(one.stream, DataTable):
-            apart[name] = "their samples come one at a time"
-            continue
-        if one.case not in settings:
-            settings[one.case] = _settings(one.case)
-        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
-        alike.setdefault(key, {})[name] = one
+    groups, apart = _alike(members)
     found = []
-    for group in alike.values():
+    for group in groups:
         why = {name: reason for name, one in group.items() if (reason := _refuses(one))}
         apart |= why
         rest = {name: one for name, one in group.items() if name not in why}
@@ -76,6 +66,23 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
         else:
             apart |= dict.fromkeys(rest, block.fleet.note)
     return found, apart
+
+
+def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], dict[str, str]]:
+    """Return groups of members with the same settings and times, and those without a table."""
+    groups: dict[tuple[str, float, bytes], dict[str, Prepared]] = {}
+    settings: dict[Case, str] = {}
+    apart: dict[str, str] = {}
+    for name, one in members.items():
+        if not isinstance(one.stream, DataTable):
+            apart[name] = "their samples come one at a time"
+            continue
+        # Members often share one case, whose text takes longer to write than a look-up.
+        if one.case not in settings:
+            settings[one.case] = _settings(one.case)
+        key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
+        groups.setdefault(key, {})[name] = one
+    return list(groups.values()), apart
 
 
 def _settings(case: Case) -> str:
@@ -193,6 +200,7 @@ class MemberBlock:
 
     def _write(self, k: int, journal: Journal, identifier: Identifier) -> None:
         """Add pending samples, estimates and events to the journal of a member."""
+        # Another process may have extended the journal between two writes.
         if journal.accepted != self._written:
             raise RunError(f"{journal.path.parent} is being written by another process: stop it.")
         table = self._tables[k]
@@ -200,6 +208,7 @@ class MemberBlock:
         if not set(journal.noise).isdisjoint(table.names):
             names += journal.noise
         absent = np.full((len(rows), 1), np.nan)
+        # Column -1 is the appended one of NaN, for channels that this table lacks.
         places = [table.names.index(name) if name in table.names else -1 for name in names]
         rows = np.hstack([rows, absent])[:, places]
         for event in self._events[k]:

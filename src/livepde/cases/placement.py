@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -75,47 +76,12 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         raise ConfigurationError(
             "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
         )
-    space = case.model.parameter_space
-    if law.drift or any(
-        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
-        for unknown in space.unknowns.values()
-    ):
+    if _moves(case.model, law):
         return _advise_moving(prepared, law, list(samples))
-    silent = replace(prepared, assimilate_from=np.inf)
-    identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise, shadows=None))
-    values, positions, part = _candidates(prepared)
-    noise = _noise(identifier, law)
-    known: dict[str, float] = {}
-    here: Array = np.zeros(0)
-    each: Array = np.zeros(0)
-    count = 0
-    for sample in samples:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        known |= _inputs(identifier, sample)
-        belief, seen = estimate.belief, np.isfinite(estimate.innovation)
-        if sample.t < prepared.assimilate_from or not seen.any():
-            continue
-        if belief.u_factor is None or belief.q_factor is None:
-            break
-        H_u, H_q = identifier.observed.jacobian(
-            estimate.u, estimate.q, Moment(sample.t, Inputs(known))
-        )
-        Y = H_u @ belief.u_factor
-        if H_q is not None:
-            Y = Y + H_q @ belief.q_factor
-        Y = (Y / noise[:, None])[seen]
-        new = (values @ belief.u_factor[part]) / np.median(noise)
-        if not count:
-            k = Y.shape[1]
-            here, each = np.eye(k), np.zeros((len(new), k, k))
-        here += Y.T @ Y
-        each += new[:, :, None] * new[:, None, :]
-        count += 1
-        if count >= MOST_SAMPLES:
-            break
-    if not count:
+    here, each, factor = _information(prepared, law, samples)
+    if factor is None:
         raise ConfigurationError(NOTHING)
-    weights = _weights(case.model, estimate.belief.q_factor)
+    weights = _weights(case.model, factor)
     before = np.linalg.inv(here)
     after = np.linalg.inv(here + each)
     mean = sum(weights.values()) / len(weights)
@@ -124,13 +90,73 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         {name: float(np.sqrt(np.sum(W * P))) for name, W in weights.items()}
         for P in (before, after[best])
     )
+    _, positions, _ = _candidates(prepared)
     return Advice(positions[:, best], now, then, len(after))
+
+
+def _moves(model: Model, law: SensitivityLaw) -> bool:
+    """Return whether an unknown changes in time, by the law or by its own evolution."""
+    return bool(law.drift) or any(
+        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
+        for unknown in model.parameter_space.unknowns.values()
+    )
+
+
+def _information(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
+) -> tuple[Array, Array, Array | None]:
+    """Return the information on a, prior included, that of each candidate, and the factor of q.
+
+    Shapes (k, k), (candidates, k, k) and (m, k); without a measurement the factor is None.
+    """
+    here, each = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    factor: Array | None = None
+    for Y, new, q_factor in islice(_sensitivities(prepared, law, samples), MOST_SAMPLES):
+        if not here.size:
+            k = Y.shape[1]
+            here, each = np.eye(k), np.zeros((len(new), k, k))
+        here += Y.T @ Y
+        each += new[:, :, None] * new[:, None, :]
+        factor = q_factor
+    return here, each, factor
+
+
+def _sensitivities(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield the sensitivities of present readings to a, of candidates, and the factor of q.
+
+    Sensitivities are over the noise, shapes (readings, k) and (candidates, k), at each measurement.
+    """
+    silent = replace(prepared, assimilate_from=np.inf)
+    identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise, shadows=None))
+    values, _, part = _candidates(prepared)
+    noise = _noise(identifier, law)
+    known: dict[str, float] = {}
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        known |= _inputs(identifier, sample)
+        belief, seen = estimate.belief, np.isfinite(estimate.innovation)
+        if sample.t < prepared.assimilate_from or not seen.any():
+            continue
+        if belief.u_factor is None or belief.q_factor is None:
+            return
+        # Readings depend on the unknowns through the state, and where H_q is given directly.
+        H_u, H_q = identifier.observed.jacobian(
+            estimate.u, estimate.q, Moment(sample.t, Inputs(known))
+        )
+        Y = H_u @ belief.u_factor
+        if H_q is not None:
+            Y = Y + H_q @ belief.q_factor
+        new = (values @ belief.u_factor[part]) / np.median(noise)
+        yield (Y / noise[:, None])[seen], new, belief.q_factor
 
 
 def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
     """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
+    # -(-n // m) is n / m, rounded up.
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
     return block.at_vertices[::every], block.field.mesh.p[:, ::every], part
 
@@ -160,6 +186,7 @@ def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sa
     if not weights:
         raise ConfigurationError(NOTHING)
     now = _left(weights, C)
+    # The ranking counts single readings; a preview of the best few counts all of them.
     tried = []
     for best in np.argsort(-told)[:SHORT_LIST]:
         at: Any = positions[:, best].tolist()
@@ -225,6 +252,8 @@ def _weights(model: Model, factor: Array | None) -> dict[str, Array]:
     if factor is None:
         return {}
     found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
+    # The mass matrix integrates the variance of a field over the domain. Division by the trace
+    # makes the share of the prior, P = I, equal to one.
     for name in space.fields:
         part = space.part(name)
         found[name] = factor[part].T @ (model.parameter_mass[part, part] @ factor[part])

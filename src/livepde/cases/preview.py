@@ -11,11 +11,12 @@ import numpy as np
 
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
-from livepde.identifier import Sample
+from livepde.identifier import Identifier, Sample
 from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
+from livepde.result import Estimate
 from livepde.verdict import REFINE, Shifts, discretised
 
 __all__ = ["Identified", "Preview", "linearised", "preview"]
@@ -95,6 +96,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
         law = law.member
     if not isinstance(law, SensitivityLaw):
         return None
+    # A replay that never comes keeps the reference, an infinite gate every reading.
     replay = Replay(NEVER, NEVER)
     return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf, shadows=None)
 
@@ -112,6 +114,7 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
         return Preview()
     if linear.noise is None and prepared.identifier.observed.noise is None:
         return Preview()  # the law estimates it from the samples
+    # Samples may come from a stream, so they are iterated once, for both previews.
     begun, all_of = tee(samples)
     found = _told(prepared, replace(linear, shadows=Shadows()), begun)
     end = deque(enumerate(all_of, 1), maxlen=MOST_SAMPLES)
@@ -125,19 +128,14 @@ def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:
 def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample]) -> Preview:
     """Return the posterior after the first of some samples, linearised at the prior."""
     identifier = prepared.identifier_with(linear)
-    count, estimate = 0, None
-    for sample in samples:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-        if sample.t >= prepared.assimilate_from:
-            count += bool(np.isfinite(estimate.innovation).any())
-        if count >= MOST_SAMPLES:
-            break
+    count, estimate = _assimilated(identifier, samples, prepared.assimilate_from)
     model = prepared.case.model
     belief = identifier.latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
     if not count or estimate is None or prior is None or posterior is None:
         return Preview()
     latent = model.latent
+    # Factors are in latent coefficients; the tangent at the prior makes them physical.
     rest = None if belief.rest is None else latent.deviation(latent.prior, belief.rest)
     before, after = (
         replace(belief, q_factor=latent.tangent(latent.prior, factor), rest=rest)
@@ -150,6 +148,20 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
         *estimate.verdict.unseen,
     )
     return Preview(told, count, sentences)
+
+
+def _assimilated(
+    identifier: Identifier, samples: Iterable[Sample], start: float
+) -> tuple[int, Estimate | None]:
+    """Step through the first samples; return the number of measurements and the last estimate."""
+    count, estimate = 0, None
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        if sample.t >= start:
+            count += bool(np.isfinite(estimate.innovation).any())
+        if count >= MOST_SAMPLES:
+            break
+    return count, estimate
 
 
 def _shifted(shifts: Shifts[float], std: Mapping[str, float]) -> list[str]:
@@ -182,6 +194,7 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
         prior, posterior = (
             np.asarray(belief.deviation(block.at_vertices, part)) for belief in (before, after)
         )
+        # A vertex without prior variance has no share that could remain.
         inside = np.flatnonzero(prior > 1e-12 * prior.max())
         left = posterior[inside] / prior[inside]
         for what, k in (("best", inside[left.argmin()]), ("worst", inside[left.argmax()])):

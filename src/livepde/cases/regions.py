@@ -1,4 +1,4 @@
-"""Layers and boxes of a case: by the ends of their sides."""
+"""Regions of a case: layers and boxes by the ends of their sides, and subdomains of the mesh."""
 
 from __future__ import annotations
 
@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case_frame import Frame
+from livepde.cases.read import did_you_mean
 
-__all__ = ["inside", "sides_of"]
+__all__ = ["inside", "sides_of", "subdomain"]
+
+
+def subdomain(frame: Frame, mesh: Any, name: str, key: str) -> str:
+    """Return the name of a subdomain, which the mesh has to have."""
+    known = mesh.subdomains or {}
+    if name not in known:
+        text = f"the mesh has no subdomain '{name}'; {did_you_mean(name, known)}"
+        raise frame.error(key, text)
+    return name
 
 
 def inside(frame: Frame, given: Any, dimension: int, key: str) -> Callable[[Any], Any]:

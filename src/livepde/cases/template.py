@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -92,8 +92,9 @@ def write_template(
         The table cannot be used as it is.
     """
     if table is None:
-        files = {"rod.csv": _measurements, "case.toml": lambda: CASE.format(folder / "case.toml")}
-        write_files(folder, files)
+        check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
+        text = CASE.format(folder / "case.toml")
+        write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])
     found = table if isinstance(table, Measured) else measured(table, equation.time_unit)
@@ -116,14 +117,13 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
             raise RunError(f"{path} is there already: choose another folder, nothing was written.")
 
 
-def write_files(folder: Path, files: Mapping[str, str | Callable[[], str]]) -> None:
+def write_files(folder: Path, files: Mapping[str, str]) -> None:
     """Write files that are not there yet, or none."""
     check_free(folder, files)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in files.items():
-            content = text if isinstance(text, str) else text()
-            (folder / name).write_text(content, encoding="utf-8")
+            (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error
 

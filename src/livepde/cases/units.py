@@ -170,7 +170,8 @@ def conversion(given: str, unit: str, where: str) -> Affine:
         ) from None
     except (pint.PintError, *NOT_A_UNIT):
         raise CaseError(f"{where}: '{given}' is not a unit; {_expected(unit, given)}.") from None
-    if not math.isclose(two - one, one - zero):  # decibels
+    # Units as decibels are logarithmic: three points do not lie on a line.
+    if not math.isclose(two - one, one - zero):
         raise CaseError(f"{where}: '{given}' has no linear scale; {_expected(unit, given)}.")
     return Affine(float(one - zero), float(zero))
 
@@ -190,6 +191,7 @@ def in_si(unit: str) -> SI | None:
         return None
     if not math.isclose((two - one).magnitude, (one - zero).magnitude):
         return None
+    # A unit definition of FMI has whole powers of the seven SI base units, and no others.
     exponents = {BASE[name]: power for name, power in one.dimensionality.items() if name in BASE}
     if len(exponents) < len(one.dimensionality) or any(p != int(p) for p in exponents.values()):
         return None

@@ -59,6 +59,7 @@ def _encoding(value: str) -> str:
 def _time_format(value: str) -> str:
     moment = datetime(2001, 2, 3, 4)
     try:
+        # A complete format returns the date that was written with it.
         if datetime.strptime(moment.strftime(value), value).date() == moment.date():
             return value
     except (ValueError, re.error):  # the latter of a part that stands twice

@@ -54,13 +54,9 @@ class Component:
             return ""
         process, t = self.process, seconds * self.process.second
         try:
-            z = {
-                port.name: port.taken(value, process.missing)
-                for port, value in zip(process.inputs, self.inputs, strict=True)
-            }
-            for port in process.inputs:
-                if port.column.needed and math.isnan(z[port.name]):
-                    return ""  # as data without that channel are left out
+            z = self._sample()
+            if z is None:
+                return ""
             if self._identifier is None:
                 self._identifier = self._begun(np.array([t, *z.values()]))
             estimate = self._identifier.step(t, z)
@@ -96,11 +92,21 @@ class Component:
         if "identifier" not in leaves:
             self._identifier = None
             return
+        # A new identifier is built only if the state began with another sample.
         if self._identifier is None or not np.array_equal(
             self._first, leaves["first"], equal_nan=True
         ):
             self._identifier = self._begun(leaves["first"])
         self._identifier.restore(leaves["identifier"].tobytes(), where)
+
+    def _sample(self) -> dict[str, float] | None:
+        """Return the inputs in the model's units, NaN if missing; None without a needed one."""
+        ports, missing = self.process.inputs, self.process.missing
+        given = zip(ports, self.inputs, strict=True)
+        z = {port.name: port.taken(value, missing) for port, value in given}
+        # A case leaves out rows of its data without a needed channel, too.
+        lost = any(math.isnan(z[port.name]) for port in ports if port.column.needed)
+        return None if lost else z
 
     def _begun(self, first: Array) -> Identifier:
         """Return the identifier started by a first sample: its time, then the inputs."""

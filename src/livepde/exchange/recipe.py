@@ -71,6 +71,7 @@ def _of_case(case: Case) -> Recipe:
         settings["data.reader"] = _moved(spec.data.reader, folder, files)
     if spec.mesh.file is not None:
         settings["mesh.file"] = _taken(folder / spec.mesh.file, files)
+    # Times of the data become the default experiment of the unit.
     origin, experiment = _dated(case)
     inside = {
         "name": case.name,

@@ -71,6 +71,7 @@ class IdentifierSlave:
             self.register_variable(self._kit(kind)(item.name, **about), nested=False)
             self._units[item.name] = item.unit
 
+        # FMI 3.0 wants the independent variable as a variable; FMI 2.0 leaves it out.
         if self.fmi == 3:
             time = OutputVariable("time", "s", "Time.")
             add(real, time, causality.independent, float, variability=variability.continuous)

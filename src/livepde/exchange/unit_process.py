@@ -272,6 +272,7 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
         identifier.model,
         (*sensors, *inputs),
         (*sensors, *unseen),
+        # Each instance of the unit starts from a copy: `identifier` stays as it was built.
         lambda first: copy.deepcopy(identifier),
         second,
         covariance=_has_covariance(identifier.law),

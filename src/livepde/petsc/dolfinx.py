@@ -229,6 +229,8 @@ class DolfinxModel:
             F = derivative(F, self.u if name == "u" else self.q)
         elif name != "F":
             ufl, number = self.api.ufl, self.given[int(name)]
+            # The derivative in a number is that of each integrand: UFL derives forms by functions
+            # only.
             terms = [one.reconstruct(ufl.diff(one.integrand(), number)) for one in F.integrals()]
             F = ufl.Form(terms)
         return F
@@ -278,6 +280,7 @@ class DolfinxModel:
             raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside of the mesh.")
         G = petsc_module().Mat().createAIJ(((None, len(x)), self.create_u().getSizes()), comm=comm)
         G.setUp()
+        # How many shape functions a row has depends on the element, so none are preallocated.
         G.setOption(petsc_module().Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         for k in np.flatnonzero(first == comm.rank).tolist():
             dofs, values = rows[k] or ([], [])
@@ -309,6 +312,7 @@ class Interface:
         """Assemble a linear form into a vector."""
         PETSc = petsc_module()
         b = self.petsc.assemble_vector(form)
+        # Cells at the border of a rank add to coefficients of its neighbours.
         b.ghostUpdate(addv=PETSc.InsertMode.ADD, mode=PETSc.ScatterMode.REVERSE)
         vector.getArray()[:] = b.getArray()
         b.destroy()

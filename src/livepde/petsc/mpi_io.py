@@ -41,15 +41,14 @@ def save_state(
     viewer = petsc_module().Viewer().createMPIIO(str(beside), "w", comm=comm)
     for name, value in ((one.name, getattr(state, one.name)) for one in fields(state)):
         if name in OF_Q + OF_U:
-            parts = value if isinstance(value, tuple) else [] if value is None else [value]
+            parts, order = _parts(value), model.numbers_q if name in OF_Q else model.numbers_u
             for vector in parts:
-                _ordered(vector, model.numbers_q if name in OF_Q else model.numbers_u).view(viewer)
+                _ordered(vector, order).view(viewer)
             numbers[name] = len(parts)
-        elif isinstance(value, ExcitationLevel):
-            numbers[name] = {k: np.asarray(v).tolist() for k, v in asdict(value).items()}
         else:
-            numbers[name] = np.asarray(value).tolist()
+            numbers[name] = _encoded(value)
     viewer.destroy()
+    # One rank replaces the file, and then removes the vectors to which the replaced one referred.
     if comm.rank == 0:
         old = _read(path)["vectors"] if path.exists() else None
         write_bytes(path, json.dumps(numbers).encode(), sync=True)
@@ -87,6 +86,20 @@ def load_state(path: Path | str, model: PetscModel) -> Any:
 
 def _sizes(model: PetscModel) -> list[int]:
     return [model.mass.getSize()[0], model.gram.getSize()[0]]
+
+
+def _parts(value: Any) -> tuple[Any, ...]:
+    """Return the vectors of a field of a state: none, one or several."""
+    if isinstance(value, tuple):
+        return value
+    return () if value is None else (value,)
+
+
+def _encoded(value: Any) -> Any:
+    """Return a number, an array or an excitation level as JSON holds it."""
+    if isinstance(value, ExcitationLevel):
+        return {key: _encoded(item) for key, item in asdict(value).items()}
+    return np.asarray(value).tolist()
 
 
 def _decoded(value: Any) -> Any:

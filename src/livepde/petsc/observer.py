@@ -243,6 +243,7 @@ class CoupledSolver:
             self._best, self._width = 0.0, stage.h
         b = PETSc.Vec().createNest([stage.first, stage.second], comm=self.free.comm)
         x = PETSc.Vec().createNest([zeros(stage.first), zeros(stage.second)], comm=self.free.comm)
+        # Inexact Newton: an update is solved no better than the tolerance can tell.
         accuracy = min(max(0.3 * self.law.tolerance / found, FORCING), 0.3)
         self.ksp.setTolerances(rtol=accuracy, atol=0.0, max_it=ITERATIONS)
         self.ksp.solve(b, x)
@@ -279,10 +280,12 @@ class CoupledSolver:
     def mult(self, matrix: Any, x: Any, y: Any) -> None:
         """Set y = K x; PETSc calls it."""
         stage, (u, q), (first, second) = self.stage, x.getNestSubVecs(), y.getNestSubVecs()
+        # First line: (S + b a^T) u + A q, with the border (b, a).
         stage.S.mult(u, first)
         first.axpy(1.0, (stage.A * q) * self.free)
         if stage.border is not None:
             first.axpy(stage.border[1].dot(u), stage.border[0])
+        # Second line: G_Q (1/h + sigma)/gain q - A(w)^T u.
         self.model.gram.mult(q, second)
         second.scale(stage.weight)
         back = zeros(second)
@@ -299,6 +302,8 @@ class CoupledSolver:
             model, inside = self.model, self.free.copy()
             hidden = (model.mass - model.mass_observed).getDiagonal().getArray()
             size = model.mass.getDiagonal().getArray()
+            # A test function may not reach into cells outside of omega, where M - M_omega is
+            # positive.
             inside.getArray()[np.abs(hidden) > 1e-12 * size] = 0.0
             rows = inside.getOwnershipRange()[0] + np.flatnonzero(inside.getArray() == 0.0)
             matrix = model.mass.copy()

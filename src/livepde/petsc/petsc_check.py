@@ -25,6 +25,7 @@ def check_petsc_model(
     """
     du = random_vector(u, model.numbers_u, seed) * free_mask(u, model.fixed)
     dq = random_vector(q, model.numbers_q, seed + 1)
+    # Directions as large as u and q keep relative differences well scaled.
     for direction, at in ((du, u), (dq, q)):
         direction.scale((at.norm() or 1.0) / (direction.norm() or 1.0))
     v = random_vector(u, model.numbers_u, seed + 2)

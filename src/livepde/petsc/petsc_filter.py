@@ -142,6 +142,7 @@ class PetscFilter:
 
     def deviation(self, state: PetscFilterState) -> Any:
         """Return the standard deviation of each coefficient of q, a new vector."""
+        # The diagonal of Phi C^T C Phi^T.
         square = zeros(self.prior)
         for row in state.C:
             direction = combined(row, state.modes)
@@ -155,6 +156,7 @@ class PetscFilter:
         u = self.stepper.solve(state.u, q, t, h)
         A, rows = self.model.jacobian_q(u, q, t + h), []
         for row, c in zip(state.U, state.C, strict=True):
+            # Right-hand side M U_i/h - A(u+) Phi C_i.
             b = self.model.mass * row
             b.scale(1.0 / h)
             b.axpy(-1.0, A * combined(c, state.modes))
@@ -165,12 +167,15 @@ class PetscFilter:
         """Return the state after the readings of its time."""
         d = z - self.read(state.u)
         noise = np.broadcast_to(np.asarray(self.noise, dtype=float), z.shape)
+        # Y N^(-1/2), shape (k, sensors), and the square root of the diagonal of N + Y^T Y.
         Y = np.array([self.read(row) for row in state.U]) / noise
         expected = noise * np.sqrt(1.0 + (Y**2).sum(axis=0))
+        # A sensor that the gate has refused `patience` times in a row is believed again.
         present = np.isfinite(d)
         far = present & (np.abs(np.where(present, d, 0.0)) > self.gate * expected)
         used = present & (~far | (state.refused >= self.patience))
         (W,), (half,), _ = contraction((Y * used)[None], np.where(used, d / noise, 0.0)[None])
+        # W is upper triangular: row i of W^T U needs the first i + 1 rows of U.
         U = [combined(W[: i + 1, i], state.U[: i + 1]) for i in range(len(W))]
         C = W.T @ state.C
         u, a = combined(half, U, state.u), state.a + half @ C
@@ -195,6 +200,8 @@ class PetscFilter:
         excess = self._bounded(q.copy()) - q
         if excess.norm() == 0.0:
             return state
+        # Least squares in the span of the modes: Phi^T Phi shift = Phi^T excess. The state follows
+        # by its covariance with a, U^T C^-T shift.
         square = np.array([inner(one, state.modes) for one in state.modes])
         shift = np.linalg.solve(square, inner(excess, state.modes))
         weights = np.asarray(np.linalg.solve(state.C.T, shift), dtype=float)
@@ -227,6 +234,7 @@ def leading_modes(model: PetscModel, count: int, *, iterations: int = 60) -> lis
     for _ in range(iterations):
         for vector in basis:
             solver.solve(model.mass_q * vector, vector)
+        # Rayleigh-Ritz: the eigenproblem in the span of the basis, a small dense one.
         G = np.array([inner(model.gram * x, basis) for x in basis])
         M = np.array([inner(model.mass_q * x, basis) for x in basis])
         found, axes = eigh((M + M.T) / 2.0, (G + G.T) / 2.0)

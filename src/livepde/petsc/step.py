@@ -36,6 +36,7 @@ def advance(stage: Callable[..., Any], state: Any, t0: float, t1: float) -> tupl
         except StepFailed as failure:
             if count >= SHORTEST:
                 return state, Status.of(failure)
+            # Steps half as long: those that are done count twice.
             count, done = 2 * count, 2 * done
         else:
             done += 1
@@ -77,6 +78,7 @@ class ImplicitStep:
         u = begin.copy()
         model.impose(u, t + h)
         rate = begin.duplicate()
+        # At rest all terms vanish: then the residual is relative to that of a small change of u.
         least = RESTING * self.dual(model.mass * begin) / h
         stale = True
         for count in range(self.iterations + 1):
@@ -94,6 +96,7 @@ class ImplicitStep:
                 raise StepFailed("not_converged", left)
             if stale:
                 self.linearise(u, q, t + h, h)
+                # One operator serves all updates of a linear process.
                 stale = not model.linear
             u.axpy(-1.0, self.back(force))
         if stale:

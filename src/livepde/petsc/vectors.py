@@ -46,6 +46,7 @@ def free_mask(x: Any, fixed: IntArray) -> Any:
 def random_vector(like: Any, numbers: IntArray, seed: int) -> Any:
     """Return a vector of values in (-1, 1) that depend on `numbers` and the seed alone."""
     vector = like.duplicate()
+    # The fractional part of a large sine: a hash as shaders use, equal on all ranks.
     hashed = 43758.5453 * np.sin(12.9898 * (np.asarray(numbers) + 1.0) + 78.233 * seed)
     vector.getArray()[:] = 2.0 * (hashed - np.floor(hashed)) - 1.0
     return vector
