@@ -292,15 +292,16 @@ class Identifier:
             self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         start = self._inputs if t > self._t else values
-        missing, gaps = np.array([name in held for name in self.inputs], dtype=float), {}
-        if self.inputs:
-            gaps = self._gaps.gaps(self.inputs, missing)
+        names, gaps = self.inputs, {}
+        missing = np.array([name in held for name in names], dtype=float)
+        if names:
+            gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
-            if self.inputs:
+            if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held, scored=True)

@@ -63,14 +63,17 @@ class _Pass:
 
 def iterate_starts(
     work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityState, Diagnostics[Array]]:
-    """Return all members after the iteration of those that are due, and diagnostics of these."""
-    due, moved = state.assimilated >= state.start_due, np.full(len(state), np.nan)
-    for k in np.flatnonzero(due).tolist() if due.any() else ():
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
+    """Return all members after the iteration of those that are due, and diagnostics if one was."""
+    due = state.assimilated >= state.start_due
+    if not due.any():
+        return state, None
+    moved = np.full(len(state), np.nan)
+    for k in np.flatnonzero(due).tolist():
         one, moved[k] = _iterated(work, take(state, k))
         state = put(state, k, one) if len(state) > 1 else one
     if np.isnan(moved).all():
-        return state, Diagnostics()
+        return state, None
     return state, replace(state.now.innovations.diagnostics, smoother_moved=moved)
 
 

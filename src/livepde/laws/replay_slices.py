@@ -24,11 +24,11 @@ AT_ONCE = 32  # samples: a replay of so few is not divided
 
 def replay_slice(
     work: SensitivityWork, state: SensitivityState
-) -> tuple[SensitivityState, Diagnostics[Array]]:
-    """Return all members after a slice of their replays, and diagnostics where they ended."""
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
+    """Return all members after a slice of their replays, and diagnostics if one ended."""
     replay = work.replay
     if replay is None:
-        return state, Diagnostics()
+        return state, None
     due = (state.assimilated >= state.due) & ~state.replay.active
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
@@ -46,11 +46,11 @@ def _with(state: SensitivityState, k: int, replay: ReplayState) -> SensitivitySt
 
 def _advanced(
     work: SensitivityWork, state: SensitivityState, most: float
-) -> tuple[SensitivityState, Diagnostics[Array]]:
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
     """Return all members after at most so many stored samples of each, and diagnostics."""
     which = np.flatnonzero(state.replay.active)
     if not len(which):
-        return state, Diagnostics()
+        return state, None
     # Those that replay are apart, so that no stored sample copies the others, or the log.
     part = take(state, which) if len(which) < len(state) else state
     ended, taken = np.zeros(len(which), dtype=bool), 0
@@ -63,7 +63,7 @@ def _advanced(
             part, ended[k] = _turned(work, part, k, k in failed)
             failures[k] = ended[k] and k in failed
         taken += 1
-    told: Diagnostics[Array] = Diagnostics()
+    told = None
     if ended.any():
         left, wrong = np.full((2, len(state)), np.nan)
         left[which[ended]], wrong[which[failures]] = part.replay.distance[ended], 1.0

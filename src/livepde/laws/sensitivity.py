@@ -391,8 +391,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return new, reports
         new, replayed = replay_slice(work, new)
         new, started = iterate_starts(work, new)
-        started = started.each(lambda number: np.where(taken, number, np.nan))
-        return shortened(work, new), reports.updated(replayed).updated(started)
+        if replayed is not None:
+            reports = reports.updated(replayed)
+        if started is not None:
+            reports = reports.updated(started.each(lambda number: np.where(taken, number, np.nan)))
+        return shortened(work, new), reports
 
     def _after(
         self, work: SensitivityWork, state: SensitivityState, span: Span
