@@ -102,6 +102,7 @@ def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _with(text: str, path: tuple[str, ...], value: Any) -> str:
+    """Return a case with another value of a key, in the line that has it or in one of its own."""
     lines = text.splitlines()
     for line in _values(text):
         inside = isinstance(line.value, dict) and path[: len(line.path)] == line.path
@@ -118,11 +119,17 @@ def _with(text: str, path: tuple[str, ...], value: Any) -> str:
         replaced = [] if new is None else [f"{key} = {shown.partition(' = ')[2]}{comment}"]
         lines[line.number : line.number + 1] = replaced
         return "\n".join(lines) + "\n"
-    if value is None:
-        return text
+    if value is not None:
+        _insert(lines, list(_values(text)), path, value)
+        return "\n".join(lines) + "\n"
+    return text
+
+
+def _insert(lines: list[str], values: list[_Line], path: tuple[str, ...], value: Any) -> None:
+    """Insert a line for a key that has none: below the head of its table, beside its neighbours."""
     *table, name = path
     heads = [k for k, line in enumerate(lines) if _table(line) == tuple(table)]
-    others = [line for line in _values(text) if line.path[:-1] == tuple(table)]
+    others = [line for line in values if line.path[:-1] == tuple(table)]
     if heads:
         lines.insert(heads[0] + 1, toml_line(name, value))
     elif table and others:  # options.H = ... has no head
@@ -133,7 +140,6 @@ def _with(text: str, path: tuple[str, ...], value: Any) -> str:
         lines.append(toml_line(name, value))
     else:
         lines.insert(_begin(lines), toml_line(name, value))
-    return "\n".join(lines) + "\n"
 
 
 def _begin(lines: list[str]) -> int:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from livepde.cases.case import Case, Prepared
 from livepde.cases.data import read_data
@@ -226,21 +227,27 @@ class Wiring:
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
             return SampleFeed(table, after=last)
-        begun = None if journal is None else journal.layout.attrs.get("origin")
-        shift, position = shifted("" if journal is None else journal.position)
-        self._intake = Intake(
-            case.columns,
-            case.clock,
-            self._policy,
-            missing=spec.missing,
-            origin=None if journal is None else _seconds(begun),
-            dates=None if journal is None else begun is not None,
-            last=last,
-            shift=shift,
-            recent=[(one.t, one.values) for one in journal.recent(RECENT)] if journal else (),
-        )
-        self._intake.past = journal
+        self._intake, position = self._new_intake()
         return Gathered(source_of(case.frame, data, position), self._intake)
+
+    def _new_intake(self) -> tuple[Intake, str]:
+        """Return an intake of rows that follow those of the journal, and the source's position."""
+        case, journal = self.case, self._journal
+        options: dict[str, Any] = {"missing": case.frame.spec.data.missing}
+        position = ""
+        if journal is not None:
+            begun = journal.layout.attrs.get("origin")
+            shift, position = shifted(journal.position)
+            options |= {
+                "origin": _seconds(begun),
+                "dates": begun is not None,
+                "last": journal.last,
+                "shift": shift,
+                "recent": [(one.t, one.values) for one in journal.recent(RECENT)],
+            }
+        intake = Intake(case.columns, case.clock, self._policy, **options)
+        intake.past = journal
+        return intake, position
 
 
 def _seconds(origin: str | None) -> float:

@@ -343,12 +343,15 @@ class ChannelSpec(Spec):
         return self.drives and self.spikes != "keep"
 
     @model_validator(mode="after")
-    def _consistent(self) -> ChannelSpec:
+    def _one_column(self) -> ChannelSpec:
         if self.positions is None and (self.column is None) == (not self.columns):
             raise ValueError("expected column = name, or columns = [names] that are averaged")
-        families = (self.each, self.positions)
-        places = (self.at, self.over, self.along, self.follows, self.quantity, *families)
-        placed = sum(place is not None for place in places)
+        return self
+
+    @model_validator(mode="after")
+    def _one_place(self) -> ChannelSpec:
+        fixed = (self.at, self.over, self.along, self.each, self.positions)
+        placed = sum(place is not None for place in (*fixed, self.follows, self.quantity))
         if self.role in ("input", "position") and placed:
             raise ValueError(f"a channel of role {self.role} has no place: leave it out")
         if self.role == "boundary" and not isinstance(self.at, str):
@@ -358,23 +361,33 @@ class ChannelSpec(Spec):
                 "expected one of: at = position, over = [from, to], along = [start, end], "
                 "follows = channel, each = [from, to, count], positions = file, quantity = name"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _families(self) -> ChannelSpec:
         if self.each is not None and "{}" not in (self.column or ""):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
         if self.positions is not None and (self.columns or "{}" not in (self.column or "{}")):
             raise ValueError('positions takes column = a name with {} for that of a row, as "T_{}"')
-        if self.at_std is not None and all(place is None for place in (self.at, *families)):
+        given = (self.at, self.each, self.positions)
+        if self.at_std is not None and not any(place is not None for place in given):
             raise ValueError("at_std belongs to at = position")
+        return self
+
+    @model_validator(mode="after")
+    def _options_of_role(self) -> ChannelSpec:
+        sensor = self.role in ("sensor", "withheld")
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         if own and self.role != "sensor":
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
-        if self.of is not None and self.role not in ("sensor", "withheld"):
+        if self.of is not None and not sensor:
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
         if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
             raise ValueError(
                 'missing = "interpolate" and spikes belong to boundary and input channels; '
                 "values of sensors that are far off are refused by law.gate"
             )
-        if self.noise_column is not None and self.role not in ("sensor", "withheld"):
+        if self.noise_column is not None and not sensor:
             raise ValueError("noise_column belongs to sensors: leave it out")
         if self.role == "position" and self.noise is not None:
             raise ValueError("noise of a channel of role position is not possible: leave it out")
