@@ -112,54 +112,53 @@ class Dictionary:
         dearer: bool,
         windows: int,
     ) -> None:
-        sensors = observed.size
         self.left_out: list[str] = []
         self.process = Process(model, observed, float(np.median(noise))) if dearer else None
-        refused = Process.refused(model)
         if not dearer:
             self.left_out.append("missing sources, losses, boundary values (verdict = 'cheap')")
-        elif refused:
+        elif refused := Process.refused(model):
             self.left_out.append(f"missing sources, losses, boundary values: {refused}")
         terms = self.process.terms if self.process else []
-        position = _positions(model, observed)
         jumps = unknowns[:MOST_JUMPS]
-        kinds = ["offset", "lag", *([] if position is None else ["position"]), "gain", "drift"]
-        fixed = len(jumps) + len(terms)
-        room = MOST_SUMS // (windows * sensors) - fixed
-        axes = 1 if position is None else len(position[0])
-        wide = {kind: sensors * (axes if kind == "position" else 1) for kind in kinds}
-        while kinds and sum(wide[kind] for kind in kinds) > room:
-            self.left_out.append(f"{kinds.pop()} of single sensors: there are {sensors}")
-        self.kinds = kinds
         self.directions: list[ScoreDirection] = []
-        self.owner: list[int] = []  # sensor of each of the first directions
-        unit = observed.observation.unit
         self.parts: dict[str, slice] = {}
-        for kind in kinds:
-            start = len(self.directions)
-            for axis in range(axes if kind == "position" else 1):
-                for k, name in enumerate(observed.names):
-                    size, of = np.nan, ""
-                    if kind in ("offset", "drift"):
-                        size, of = OFFSET * float(noise[k]), unit
-                    elif kind == "gain":
-                        size = GAIN
-                    elif kind == "position" and position is not None:
-                        size, of = position[1], model.length_unit
-                    self.directions.append(ScoreDirection(kind, name, size, of, axis))
-                    self.owner.append(k)
-            self.parts[kind] = slice(start, len(self.directions))
-        self.shifts: ForwardShifts | None = None
-        if position is not None and "position" in kinds:
-            self.shifts = ForwardShifts.of(position[0])
-        start = len(self.directions)
+        # Every direction is a row and a column of sums of products, kept for each window.
+        room = MOST_SUMS // (windows * observed.size) - len(jumps) - len(terms)
+        self._add_sensors(model, observed, noise, room)
         self.jumps = [place for _, place in jumps]
-        self.directions += [ScoreDirection("jump", label, JUMP) for label, _ in jumps]
-        self.parts["jump"] = slice(start, len(self.directions))
+        self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
+        self._add("process", [ScoreDirection(term.kind, term.subject) for term in terms])
+
+    def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
+        """Append the directions of single sensors, as many kinds as there is room for."""
+        sensors, unit = observed.size, observed.observation.unit
+        shifts, step = _positions(model, observed)
+        amplitudes = {  # of each sensor, with their unit; where room is short the last go first
+            "offset": (OFFSET * noise, unit),
+            "lag": (np.full(sensors, np.nan), ""),
+            "position": (np.full(sensors, step), model.length_unit),
+            "gain": (np.full(sensors, GAIN), ""),
+            "drift": (OFFSET * noise, unit),
+        }
+        if not shifts:
+            del amplitudes["position"]
+        axes = {kind: len(shifts) if kind == "position" else 1 for kind in amplitudes}
+        while amplitudes and sensors * sum(axes[kind] for kind in amplitudes) > room:
+            kind, _ = amplitudes.popitem()
+            self.left_out.append(f"{kind} of single sensors: there are {sensors}")
+        self.kinds = tuple(amplitudes)
+        for kind, (size, of) in amplitudes.items():
+            own = list(zip(observed.names, size.tolist(), strict=True))
+            each = [(axis, name, one) for axis in range(axes[kind]) for name, one in own]
+            self._add(kind, [ScoreDirection(kind, name, one, of, k) for k, name, one in each])
+        self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
+        self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
+
+    def _add(self, part: str, directions: list[ScoreDirection]) -> None:
+        """Append directions, and note where they stand."""
         start = len(self.directions)
-        self.directions += [ScoreDirection(term.kind, term.subject) for term in terms]
-        self.parts["process"] = slice(start, len(self.directions))
-        self.own: IntArray = np.array(self.owner, dtype=np.int64)
+        self.directions += directions
+        self.parts[part] = slice(start, len(self.directions))
 
     def __len__(self) -> int:
         return len(self.directions)
@@ -207,14 +206,14 @@ class Dictionary:
         return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
 
 
-def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float] | None:
+def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
     """Return how readings change if sensors are shifted along each axis, and by how much.
 
-    None for sensors that have no position, or an uncertain one that is estimated anyway.
+    No axes for sensors that have no position, or an uncertain one that is estimated anyway.
     """
     observation = observed.observation
     if not isinstance(observation, Points) or observation.position_std is not None:
-        return None
+        return [], np.nan
     at = observation.positions
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
@@ -232,7 +231,7 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
                 moved = at.copy()
                 rows = sp.csr_array(block.probe(moved.T, "sensor"))
             if rows.shape[0] != len(at):  # sensors of vectors, each with several readings
-                return None
+                return [], np.nan
             ends.append(observed.state.widen(rows, observation.of))
             width += sign * moved[:, axis]
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
