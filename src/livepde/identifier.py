@@ -110,18 +110,17 @@ class Identifier:
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | None = None,
     ) -> None:
-        given = (model, Model), (observation, Observation), (law, Law)
-        for part, kind in given:
-            if not isinstance(part, kind):
-                remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
-                raise ConfigurationError(
-                    "Identifier(model, observation, law): in the place of the "
-                    f"{kind.__name__.lower()} stands {part!r:.80}{remedy}."
-                )
+        _check_parts(model, observation, law)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
         if not np.isfinite(t0):
             raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
+        if u0_from and u0 is None:
+            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
+        if u0 is not None and model.form_initial is not None:
+            raise ConfigurationError(
+                "the model has an initial state of its own (initial=): leave out u0."
+            )
         known = model.parameter_space.unknowns
         own = {name: item for name, item in observation.unknowns.items() if name not in known}
         model = model.with_unknowns(own) if own else model
@@ -132,18 +131,12 @@ class Identifier:
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, hold, start=start)
-        if u0_from and u0 is None:
-            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
         noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
         self.problem = Problem(model, self.observed, control, noise, readings, u0)
         self.assimilate_from = assimilate_from
         self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
-        if u0 is not None and model.form_initial is not None:
-            raise ConfigurationError(
-                "the model has an initial state of its own (initial=): leave out u0."
-            )
         self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
         self._state: Any = None
         self._t = float(t0)
@@ -275,19 +268,10 @@ class Identifier:
             An input has no value yet; a later gap holds the last value and is noted. The position
             of a moving sensor may be missing, and is not held.
         """
-        t = number(t, "time t")
-        if math.isnan(t):
-            raise SampleError("time t is NaN; give the time of the sample.")
+        t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
-        first = self._samples == 0
-        self._reachable(t)
-        if t < self._t or (t == self._t and not first):
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "
-                "sort the stream, and drop repeated samples."
-            )
         if self._state is None:
             self._begun_by(values, t)
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
@@ -305,6 +289,19 @@ class Identifier:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
         return self._estimate(t, measured, withheld, values, report, held, scored=True)
+
+    def _time_of_next(self, t: float) -> float:
+        """Return the time of the next sample, checked; only the first may be at the start."""
+        t = number(t, "time t")
+        if math.isnan(t):
+            raise SampleError("time t is NaN; give the time of the sample.")
+        self._check_reachable(t)
+        if t < self._t or (t == self._t and self._samples):
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "
+                "sort the stream, and drop repeated samples."
+            )
+        return t
 
     def _begun_by(self, inputs: Inputs, t: float) -> None:
         """Begin with the inputs of the first sample, unless no finite state comes of them."""
@@ -519,7 +516,7 @@ class Identifier:
                 f"forecast: times must increase from the last sample at t = {self._t!r} on; got "
                 f"{t.tolist()}."
             )
-        self._reachable(float(t[-1]))
+        self._check_reachable(float(t[-1]))
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
         state, before = self._state, self._inputs
         if state is None:
@@ -624,7 +621,7 @@ class Identifier:
         beliefs = data and self.law.smoothed(self._work, before, who._state, data)
         return run.dataset(result, self.problem, beliefs or ())
 
-    def _reachable(self, t: float) -> None:
+    def _check_reachable(self, t: float) -> None:
         """Refuse a time that is too many substeps away."""
         if t - self._t > MOST_SUBSTEPS * self.problem.control.dt_max:
             raise SampleError(
@@ -709,6 +706,17 @@ class Identifier:
         self._state, self._withheld, self._gaps = state, withheld, gaps
         if state is None and not self.inputs:
             self._begin(inputs)
+
+
+def _check_parts(*parts: object) -> None:
+    """Refuse what is no model, observation and law, in this order."""
+    for part, kind in zip(parts, (Model, Observation, Law), strict=True):
+        if not isinstance(part, kind):
+            remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
+            raise ConfigurationError(
+                "Identifier(model, observation, law): in the place of the "
+                f"{kind.__name__.lower()} stands {part!r:.80}{remedy}."
+            )
 
 
 def _quiet() -> np.errstate:
