@@ -104,6 +104,7 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
     An error of less than `SEEN` standard errors is not seen, and none is taken larger than the
     amplitude of its direction, which is a usual size.
     """
+    # sum g g, the information on each amplitude: its standard error is one over the root.
     den = at.ledger.sums[at.member, 1, 0].sum(axis=1)
     hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
     found = []
@@ -128,6 +129,7 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
 
 def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     """Return whether innovations go with a cause more than chance allows."""
+    # By Ville's inequality the mean e-value exceeds 1/alpha with a probability of at most alpha.
     limit = -math.log(CAUSES)
     recent = _mended(at, evidence)
     if evidence.total < limit:
@@ -137,6 +139,7 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     if recent and _recovered(at, evidence, order):
         yield _past(at)
         return
+    # Slow noise alone would look so: no cause may be named, but the intervals have to be wider.
     if evidence.whitened < limit:
         worst = float(evidence.correlation.max(initial=0.0))
         text = (
@@ -149,6 +152,7 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
     shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
+    # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
     grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
     text = (
@@ -349,6 +353,7 @@ def _following(at: Position, window: int) -> Iterator[Finding]:
 def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     """Return whether the unknowns changed, and whether sensors disagree on them."""
     rho = float(evidence.correlation.max(initial=0.0))
+    # Variance of a mean of AR(1) errors over that of independent ones.
     wider = (1.0 + rho) / (1.0 - rho)
     severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
     change = constancy(at.ledger, at.member, wider)
@@ -379,6 +384,8 @@ def _noise(at: Position) -> Iterator[Finding]:
 
 def _stuck(at: Position) -> Iterator[Finding]:
     ledger, k = at.ledger, at.member
+    # A steady process repeats readings rightly: a sensor is stuck if the model expects another
+    # value.
     off = np.abs(ledger.value[k] - ledger.last[k]) / at.noise
     for i in np.flatnonzero((ledger.stuck[k] >= STANDS - 1) & (off > FAR)):
         name, count = at.sensors[int(i)], int(ledger.stuck[k, i]) + 1

@@ -76,6 +76,7 @@ class ForwardShifts:
         rows = sp.csc_array(sp.vstack(shifts))
         used = np.flatnonzero(np.diff(rows.indptr))
         rows = rows[:, used]
+        # A sparse product of few entries takes longer than a dense one.
         dense = rows.shape[0] * rows.shape[1] <= MOST_DENSE
         return cls(len(shifts), used, rows.toarray() if dense else sp.csr_array(rows))
 
@@ -222,6 +223,7 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
     found = []
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
+        # Central differences; at the edge of the box they are one-sided, and `width` is shorter.
         for sign in (-1.0, 1.0):
             moved = at.copy()
             moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])

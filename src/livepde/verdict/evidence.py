@@ -80,7 +80,9 @@ def levels(ledger: Ledger, member: int = 0) -> Array:
     count, _, squares, products, pairs = ledger.noise[member]
     del count
     # Half of the squared differences: the ends of a window hardly count.
+    # sum (r_k - r_(k-1))^2 / 2 = sum r r - sum r_k r_(k-1), up to the ends.
     differences = np.maximum(squares - products, 0.0)
+    # Short windows lean on the level of the whole run, and that on the stated one.
     whole = (differences[0] + NU) / (pairs[0] + NU)
     found: Array = (differences + TRUSTED_LEVEL * whole) / (pairs + TRUSTED_LEVEL)
     return found
@@ -105,6 +107,8 @@ def causes_of(ledger: Ledger, member: int = 0) -> CauseEvidence:
     log_e, size, share = _tested(sums, noise, spread, np.zeros_like(spread))
     weights = _weights(ledger, member, log_e.shape[1])
     total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
+    # The same test once more with first-order autoregressive errors: what slow noise explains as
+    # well is no evidence for a cause. The smaller one counts.
     rho, left = _left(sums, noise, log_e, size)
     white, _, _ = _tested(sums, noise, left, rho)
     whitened = float(scipy.special.logsumexp(white + weights)) if white.size else 0.0
@@ -123,6 +127,7 @@ def following(ledger: Ledger, member: int, window: int) -> Following | None:
     """Return the sensor whose successive errors are correlated most, None if by chance."""
     _, _, squares, products, pairs = ledger.noise[member][:, window]
     rho = products / np.maximum(squares, 1e-300)
+    # Under white errors the correlation of n pairs is normal with the variance 1/n.
     z = rho * np.sqrt(np.maximum(pairs, 1.0))
     worst = int(np.argmax(z))
     p = min(1.0, 0.5 * math.erfc(float(z[worst]) / math.sqrt(2.0)) * len(z))
@@ -158,16 +163,20 @@ def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array
     count, _, squares, products, _ = noise
     now = ((1.0 + rho**2) / spread)[:, None]
     before = (rho / spread)[:, None]
+    # Generalised least squares for the AR(1) errors e_k - rho e_(k-1), from the sums of both
+    # products.
     num = (num * now - cross * before).sum(axis=2)
     den = np.maximum((den * now - 2.0 * lagged * before).sum(axis=2), 0.0)
     rss = ((squares * (1.0 + rho**2) - 2.0 * rho * products) / spread).sum(axis=1)
     rss = np.maximum(rss, 0.0)[:, None]
     total = count.sum(axis=1)[:, None]
+    # Bayes factor of theta ~ N(0, 1) under Student's t: the noise level is integrated out.
     k = 1.0 / (1.0 + den)
     gained = np.minimum(num**2 * k / (NU + rss), 1.0 - 1e-12)
     log_e = 0.5 * np.log(k) - 0.5 * (NU + total) * np.log1p(-gained)
     log_e = np.where(np.isfinite(log_e), log_e, 0.0)
     size = num / np.where(den > 0.0, den, np.inf)
+    # Misfit beyond the noise; a cause cannot explain more than all of it.
     excess = np.maximum(rss - total, num * size)
     share = num * size / np.where(excess > 0.0, excess, np.inf)
     return log_e, size, share
@@ -181,6 +190,7 @@ def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, 
         rows, best = np.arange(len(log_e)), log_e.argmax(axis=1)
         theta = size[rows, best][:, None]
         num, den, cross, lagged = (part[rows, best] for part in sums)
+        # Sums of squares of r - theta g, and of its neighbours.
         squares = np.maximum(squares - 2.0 * theta * num + theta**2 * den, 0.0)
         products = products - theta * cross + theta**2 * lagged
     rho = (products / np.maximum(squares, 1e-300)) * pairs / (pairs + NU)
@@ -244,6 +254,7 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
     """
     score, information = (part.sum(axis=1) for part in _record(ledger, member, wider))
     k = score.shape[1]
+    # A change is looked for between blocks of the record, each as many samples long.
     used = int(ledger.seen[member] - 1) // int(ledger.length[member]) + 1
     if not k or used < 4:
         return None
@@ -253,10 +264,13 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
         return None
     best, at, change, looks = -1.0, 0, np.zeros(k), 0
     for j in range(min(used, BLOCKS) - 1):
+        # Near the ends of the record one side holds too little information to tell a change.
         before = float(np.trace(inverse @ F[j])) / rank
         if not LEAST < before < 1.0 - LEAST:
             continue
         looks += 1
+        # Score of the first part at the estimate of the whole: zero but for chance without a
+        # change.
         c = B[j] - F[j] @ inverse @ B[-1]
         A, _ = _inverse(F[j] - F[j] @ inverse @ F[j])
         statistic = float(c @ A @ c)
@@ -265,6 +279,7 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
             best, at, change = statistic, j, -A @ c
     if not looks:
         return None
+    # Bonferroni's bound over the places that were looked at.
     p = min(1.0, looks * chance(best, rank))
     after = (at + 1) * int(ledger.length[member]) / int(ledger.seen[member])
     return Constancy(p, min(after, 1.0), change)
@@ -284,6 +299,7 @@ def disagreement(ledger: Ledger, member: int = 0, wider: float = 1.0) -> tuple[f
     each, freedom = np.zeros(sensors), -rank
     for i in range(sensors):
         own, told = _inverse(information[i])
+        # Score of a sensor at the estimate of all of them.
         left = score[i] - information[i] @ inverse @ score.sum(axis=0)
         each[i] = left @ own @ left
         freedom += told

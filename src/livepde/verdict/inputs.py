@@ -41,6 +41,7 @@ class InputLedger:
 
         The interval in which a channel has a value again is no gap: there the value changes.
         """
+        # The first count is of all samples.
         counts = self.counts + np.append(1, missing).astype(np.int64)
         return InputLedger(counts, (self.held + length) * missing)
 

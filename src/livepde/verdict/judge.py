@@ -99,6 +99,8 @@ class Judge:
     ) -> None:
         self.dictionary = dictionary
         self.sensors, self.unknowns, self.n, self.rank = sensors, unknowns, n, rank
+        # The record takes (k, k) numbers for each sensor and block, and the scores of unknowns that
+        # move cannot be cumulated.
         self.recorded = still and 0 < sensors * unknowns**2 <= MOST_RECORDED
         self.windows = len(WINDOWS)
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
@@ -144,6 +146,8 @@ class Judge:
         """Return M of a sample, the identity before its update, and the ledger."""
         M, full = seen.causes, ledger.waiting == self.batch
         members, r, _ = M.shape
+        # A batch is summed when the next sample comes, so that whoever reads the verdict in between
+        # sums a copy and changes nothing.
         if full.any() or not ledger.seen.all():
             M, ledger = self._begun(ledger, seen, full)
         each: dict[str, Array | Mask] = {
@@ -158,6 +162,7 @@ class Judge:
         parts: dict[str, Any] = {}
         if self.dictionary.shifts is not None:
             each["moved"] = self.dictionary.moved(seen.u)
+        # The answers of the process cost a solve for each term and member.
         if self.terms and members <= MOST_MEMBERS:
             parts = self._answered(ledger, seen)
             each["answers"] = _between(parts, seen.at.t)
@@ -172,6 +177,8 @@ class Judge:
         rows = ledger.rows.copy()
         rows[np.arange(members), ledger.waiting] = row
         more = {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
+        # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
+        # [U C].
         fresh = np.broadcast_to(self._fresh[:r], (members, r, self.rank))
         return fresh, _changed(ledger, more | parts)
 
@@ -192,12 +199,14 @@ class Judge:
         members, sensors = len(ledger.seen), self.sensors
         at, due = self._at, ledger.due
         there = np.arange(self.batch) < ledger.waiting[:, None]  # (members, batch)
+        # Only as many rows as some member has waiting are summed.
         ledger = self._timed(ledger, there)
         batch = max(int(ledger.waiting.max(initial=0)), 1)
         rows, some = ledger.rows[:, :batch], there[:, :batch, None]
         used = rows[:, :, at["used"]] * some
         Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, sensors)
         own, answers = self._effects(ledger, rows, used, due)
+        # T = (1 + Y^T Y)^(-1/2) whitens the innovations of a sample: r = T d, g <- T g.
         Yt, (X, scale) = Y.swapaxes(-1, -2), _whitening(Y)
         before, w = self._followed(ledger, self._through(own, answers, Yt))
         # With T = 1 + X scale X^T all of g T is f and a product of few columns.
@@ -209,11 +218,15 @@ class Judge:
         g[..., self._process] += answers.swapaxes(-1, -2)[:, :, :, None]
         d = rows[:, :, at["d"]]
         r = d + (X @ (scale * (X.swapaxes(-1, -2) @ d[..., None])))[..., 0]
+        # A single wild value must be no evidence for a cause (Huber's loss).
         r = ledger.clipped(r) * some
         if not some.all():
             g *= some[..., None, None]
+        # Sums over the samples that waited, in the windows that go on or begin with them.
         names = ("sums", "noise", "before", "present")
         parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
+        # The record is of raw residuals about the prior mean, d + Y^T a: its scores do not depend
+        # on the estimate of the moment, so that blocks of different times may be added.
         if self.recorded:
             Y, told = self._record(rows, Y[:, :, : self.unknowns])
             Y, told = Y * used[:, :, None], told * used
@@ -331,10 +344,12 @@ class Judge:
         if not due.any() or not count:
             return w
         members, r, _ = w.shape
+        # Directions of a new window have not moved the estimate yet: w = 0 ...
         w = w.reshape(members, r, self.windows, count)
         w.transpose(0, 2, 1, 3)[due] = 0.0
         jumps = self.dictionary.jumps
         if jumps and ledger.seen.any():
+            # ... but a jump of an unknown is a shift C^T w = e of the estimate from the beginning.
             units = JUMP * np.eye(seen.C.shape[2])[:, jumps]
             for k in np.flatnonzero(due[:, 1:].any(axis=1)).tolist():
                 moved = np.linalg.lstsq(seen.C[k].T, units, rcond=None)[0]
@@ -352,6 +367,7 @@ class Judge:
         members, batch, _ = rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
+        # A sensor that is late by a sample shows the prediction of the sample before it.
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
             share = ledger.times[:, 1:] / (t - before)
@@ -366,6 +382,7 @@ class Judge:
         f = f.reshape(members, batch, -1) * used[:, :, self.dictionary.own]
         own = np.repeat(np.where(np.isfinite(f), f, 0.0)[:, :, None], self.windows, axis=2)
         if self._drift.stop > self._drift.start:
+            # A drift begins with its window and grows by one unit with each sample.
             age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
             own[..., self._drift] *= age[..., None]
         answers = rows[:, :, at["answers"]].reshape(members, batch, self.terms, self.sensors)
@@ -375,12 +392,14 @@ class Judge:
     def _answered(self, ledger: Ledger, seen: Seen) -> dict[str, Any]:
         """Return responses of the process that reach this sample at least."""
         process, t = self.dictionary.process, seen.at.t
+        # One step of the process answers for several samples, which interpolate between its ends.
         behind = ~(ledger.reached[:, 1] >= t)
         if process is None or not behind.any():
             return {"readings": ledger.readings, "reached": ledger.reached}
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached, q = ledger.reached.copy(), seen.q()
         for k in np.flatnonzero(behind).tolist():
+            # Without a better guess, what the sensors showed first is where nothing is lost.
             rest = float(np.nanmean(ledger.first[k])) if np.isfinite(ledger.first[k]).any() else 0.0
             now = Now(seen.u[k], q[k], seen.at.member(k), self._unit(ledger, k, t), rest)
             if not np.isfinite(reached[k, 1]):
@@ -431,6 +450,7 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
     values, axes = np.linalg.eigh(Y @ Yt if small else Yt @ Y)
     values = np.maximum(values, 0.0)
     scale = 1.0 / np.sqrt(1.0 + values) - 1.0
+    # X = Y^T V scaled by L^(-1): a product with the axes of the small matrix Y Y^T.
     if small:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes

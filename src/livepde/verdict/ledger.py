@@ -162,6 +162,8 @@ class Ledger:
     def clipped(self, r: Array) -> Array:
         """Return whitened innovations, (members, batch, sensors), none far beyond usual."""
         count, squares = self.noise[:, 0, 0], self.noise[:, 2, 0]
+        # Ten samples of the stated noise count beforehand: the first ones are not clipped by
+        # chance.
         usual = np.sqrt(np.maximum((squares + 10.0) / (count + 10.0), 1.0))
         limit = CLIP * usual[:, None]
         return np.minimum(np.maximum(r, -limit), limit)
@@ -191,16 +193,19 @@ def summed(
         1 where there is a value, (members, batch, sensors).
     """
     members, batch, sensors, windows, directions = g.shape
+    # Sums of windows that begin anew start from nothing.
     anew = due & (old.age > 0)
     kept = ~anew
     rs = np.concatenate([old.before[:, :1], r], axis=1)
     present = np.concatenate([old.present[:, None], used], axis=1)
+    # Products of successive values count where both samples had one.
     pair = present[:, 1:] * present[:, :-1]
     r1 = rs[:, :-1] * pair
     beside = r1.copy()  # what g_k is multiplied with in g_k r_(k-1) + g_(k-1) r_k
     beside[:, :-1] += r[:, 1:] * pair[:, 1:]
     g = g.reshape(members, batch, sensors, -1)
     weights = np.stack([r, beside], axis=1).transpose(0, 3, 1, 2)
+    # Two sums over the batch in one product: of g r, and of g_k r_(k-1) + g_(k-1) r_k.
     first = weights @ g.transpose(0, 2, 1, 3)  # (members, sensors, 2, columns)
     after = g[:, 1:] if pair.all() else g[:, 1:] * pair[:, 1:, :, None]
     parts = [
@@ -236,6 +241,7 @@ def blocked(old: Ledger, before: IntArray, Y: Array, r: Array) -> tuple[Array, A
         prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
     """
     score, information, length = old.score, old.information, old.length
+    # All blocks are in use: neighbours merge, and each holds twice as many samples from now on.
     full = before // length >= BLOCKS
     if full.any():
         score, information = _merged(score, full), _merged(information, full)

@@ -108,8 +108,12 @@ class Process:
     def _boundary_values(self) -> None:
         model, n = self.model, self.model.X.dim
         zero, none = np.zeros(n), _nothing
+        # Boundary values are affine in the inputs: the difference of two states is the lift of a
+        # channel.
         known = dict.fromkeys(model.channels, 0.0)
         at_rest = model.impose(zero, Moment(0.0, Inputs(known)))
+        # Boundary values that no channel moves are constants of the model, which may be wrong as
+        # well.
         rest = model.X.free == 0.0
         for name in model.channels:
             moved = Inputs({**known, name: 1.0})
@@ -141,11 +145,13 @@ class Process:
         model = self.model
         names = [str(name) for name in (model.mesh.boundaries or {})]
         ones = model.state_space.interpolate(1.0)
+        # Each costs a solve with every answer of the process.
         for name in names[:MOST_ENDS]:
             form: Any = On(name, lambda u, v, x: u * v)
             load = model.bilinear(form) @ ones
             if np.abs(load[model.X.free == 0.0]).any() or not load.sum() > 0.0:
                 continue
+            # As much as the source of amplitude one brings into the whole domain.
             shape = load * (self._whole.sum() / load.sum())
             self._add(Term("flux", name), _flux(shape, self.level), np.zeros(model.X.dim))
 
@@ -171,6 +177,7 @@ class Process:
         """Return the responses a time h later, shape (terms, n)."""
         loads = np.array([load(now) for load in self._loads])
         lifts = np.array(self._lifts)
+        # M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
         factor, rows = self.stage.linearised(now.u, now.q, h, now.moment)
         known = (self.model.mass @ p.T).T / h + loads - (rows @ lifts.T).T
         free = self.model.X.free

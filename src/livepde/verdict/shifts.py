@@ -93,6 +93,8 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
         f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
         f"of it is {what}{_listed(shifts.by(kind))}. The intervals were widened by that."
     )
+    # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
+    # and says more on the mesh and the step than on the data.
     severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
 
