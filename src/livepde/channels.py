@@ -127,6 +127,14 @@ class Channels:
             raise SampleError(
                 f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
             )
+        values, noise = self._valued(z)
+        measured = _row(self.observed.names, values)
+        withheld = _row(self.hidden, values) if self.hidden else NOTHING
+        named = {name: values[name] for name in self.inputs if name in values}
+        return measured, own_noise(_row(self.observed.names, noise)), withheld, named
+
+    def _valued(self, z: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the values of all channels, and the noise of the sensors that state one."""
         values: dict[str, float] = {}
         noise: dict[str, float] = {}
         for name, value in z.items():  # words for a message cost more than the usual value
@@ -137,13 +145,7 @@ class Channels:
                 value, noise[name] = self._pair(name, value)
             usual = type(value) is float and math.isfinite(value)
             values[name] = value if usual else number(value, f"channel '{name}'")
-        measured = np.array([values.get(name, math.nan) for name in self.observed.names])
-        withheld = NOTHING
-        if self.hidden:
-            withheld = np.array([values.get(name, math.nan) for name in self.hidden])
-        own = own_noise([noise.get(name, math.nan) for name in self.observed.names])
-        named = {name: values[name] for name in self.inputs if name in values}
-        return measured, own, withheld, named
+        return values, noise
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
         """Return value and noise of a reading given as a pair."""
@@ -212,3 +214,7 @@ class Channels:
             last, _ = self.filled(named, last)
             planned.append(last)
         return planned
+
+
+def _row(names: Sequence[str], values: Mapping[str, float]) -> Array:
+    return np.array([values.get(name, math.nan) for name in names])

@@ -166,28 +166,31 @@ def _are_pairs(z: Any, size: int) -> bool:
         return False
 
 
+def _array(z: Any) -> Array:
+    """Return an array of floats; refuses text and truth values, which NumPy would convert."""
+    if isinstance(z, list | tuple):
+        text = any(isinstance(value, str | bytes | bool) for value in z)
+    else:
+        text = np.asarray(z).dtype.kind in "USb"
+    if text:
+        raise SampleError(f"z = {z!r} is not an array of numbers.")
+    return numbers(z, "z")
+
+
 def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     """Return the measurements of all sensors, shape (sensors,), as an array of their own.
 
     And the noise of each, None if none has one of its own.
     """
+    # Most samples are arrays as they should be: they pass without the slower checks below.
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.isfinite(z).all():
         return np.array(z), None
     if _are_pairs(z, observed.size):
-        named = list(zip(observed.names, z, strict=True))
-        noise = own_noise([check_noise(name, std) for name, (_, std) in named])
-        return readings([value for _, (value, _) in named], observed)[0], noise
-    if (
-        np.asarray(z).dtype.kind in "USb"
-        if not isinstance(z, list | tuple)
-        else any(isinstance(value, str | bytes | bool) for value in z)
-    ):
-        raise SampleError(f"z = {z!r} is not an array of numbers.")
-    try:
-        array = np.asarray(z, dtype=float)
-    except (TypeError, ValueError):
-        raise SampleError(f"z = {z!r} holds something that is not a number.") from None
+        values, stds = np.array(z, dtype=object).T.tolist()
+        noise = own_noise(list(map(check_noise, observed.names, stds)))
+        return readings(values, observed)[0], noise
+    array = _array(z)
     if array.ndim == 0 and observed.size == 1:
         array = array.reshape(1)
     if array.shape != (observed.size,):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from statistics import fmean
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -47,6 +48,9 @@ __all__ = [
 
 # The first sample interpolated: with the noise of its readings, or as if they had none.
 INTERPOLATED = ("interpolate", "interpolate-exact")
+
+Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, ChannelSpec]]
+"""(kind of sensor, component of the state) -> its channels."""
 
 
 def columns_of(frame: Frame) -> dict[str, Column]:
@@ -90,28 +94,33 @@ def observation_of(
     channels = frame.roles(role)
     if not channels:
         return None
-    how = _reconstruction(frame) if role == "sensor" else Pseudoinverse()
-    kinds: dict[tuple[str, str], dict[str, ChannelSpec]] = {}
+    # One observation reads all channels of a kind and a component of the state.
+    kinds: Kinds = {}
     for name, channel in channels.items():
-        kinds.setdefault((_kind(channel), channel.of or ""), {})[name] = channel
-    names = [name for members in kinds.values() for name in members]
+        kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
+    names = [*chain.from_iterable(kinds.values())]
     levels = noise_of(frame, role)
     outer: dict[str, Any] = {
-        "noise": None if levels is None else [levels[name] for name in names],
+        "noise": levels and [levels[name] for name in names],
         "unit": frame.equation.state.unit,
-        "reconstruction": how,
+        "reconstruction": _reconstruction(frame) if role == "sensor" else Pseudoinverse(),
     }
-    own = any(item.offset or item.gain or item.correlated for item in channels.values())
-    common = {} if own or len(kinds) > 1 else outer
-    parts = []
-    for (kind, of), members in kinds.items():
-        component = {"of": of} if of else {}
-        parts.append(_part(frame, mesh, options, kind, members, {**component, **common}))
-    if len(parts) > 1:
-        whole: Observation = Combined(parts, **({} if own else outer))
-    else:
-        (whole,) = parts
-    return calibrated(frame, whole, names, **outer) if own else whole
+    if any(item.offset or item.gain or item.correlated for item in channels.values()):
+        whole = _whole(frame, mesh, options, kinds, {})
+        return calibrated(frame, whole, names, **outer)
+    return _whole(frame, mesh, options, kinds, outer)
+
+
+def _whole(
+    frame: Frame, mesh: Any, options: Mapping[str, Any], kinds: Kinds, outer: Mapping[str, Any]
+) -> Observation:
+    """Return one observation of all kinds, which has the keyword arguments `outer`."""
+    common = outer if len(kinds) == 1 else {}
+    parts = [
+        _part(frame, mesh, options, kind, members, {"of": of, **common} if of else common)
+        for (kind, of), members in kinds.items()
+    ]
+    return parts[0] if len(parts) == 1 else Combined(parts, **outer)
 
 
 def _kind(channel: ChannelSpec) -> str:

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -91,21 +92,25 @@ def read_data(
 ) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
     spec = frame.spec.data
-    ending = (
-        ""
-        if source is not None and not isinstance(source, str)
-        else Path(str(source if source is not None else spec.file or "")).suffix
-    )
-    if clock.hour and ending in ("", ".parquet", *JSON_LINES):
-        text = "times in two columns are read from CSV files only: join them in one column."
-        raise frame.error("data.time", text)
-    if source is not None and not isinstance(source, str):
+    if source is None and isinstance(spec.file, tuple):
+        return _joined(frame, spec.file, columns)
+    _check_hours(frame, clock, spec.file if source is None else source)
+    if not isinstance(source, str | None):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and frame.reader is not None:
         return _from_reader(frame, frame.reader, columns, clock)
-    if source is None and isinstance(spec.file, tuple):
-        return _joined(frame, spec.file, columns)
-    path = Path(source) if source is not None else data_file(frame)
+    return _read(data_file(frame) if source is None else Path(source), columns, clock, spec)
+
+
+def _check_hours(frame: Frame, clock: Clock, source: Any) -> None:
+    ending = Path(source).suffix if isinstance(source, str) else ""
+    if clock.hour and ending in ("", ".parquet", *JSON_LINES):
+        text = "times in two columns are read from CSV files only: join them in one column."
+        raise frame.error("data.time", text)
+
+
+def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
+    """Return the data of a file, whose ending tells its format."""
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
     if path.suffix == ".parquet":
@@ -126,23 +131,13 @@ def read_data(
 
 def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> DataTable:
     """Return several files as one table, joined by time; each channel comes from one of them."""
-    data = frame.spec.data
-    specs = [data.of(file) for file in files]
+    specs = [frame.spec.data.of(file) for file in files]
     paths = [_found(frame, str(spec.file)) for spec in specs]
-    headers = [_header(frame, spec, path) for spec, path in zip(specs, paths, strict=True)]
-    owners: dict[str, int] = {}
-    for name, column in columns.items():
-        places = [k for k, header in enumerate(headers) if set(column.names) <= set(header)]
-        if len(places) != 1:
-            what = " and ".join(map(repr, column.names))
-            text = f"no file has the column {what}; the files are {', '.join(map(str, paths))}."
-            if places:
-                both = " and ".join(str(paths[k]) for k in places)
-                text = f"{both} have a column {what} each; rename one."
-            raise frame.error(f"channels.{column.noise_of or name}", text)
-        owners[name] = places[0]
+    headers = list(map(partial(_header, frame), specs, paths))
+    owners = {name: _owner(frame, name, one, paths, headers) for name, one in columns.items()}
     tables = []
     for k, (spec, path) in enumerate(zip(specs, paths, strict=True)):
+        # Which rows are needed is decided once they are joined.
         own = {
             name: replace(column, decimal=spec.decimal, needed=False)
             for name, column in columns.items()
@@ -150,22 +145,26 @@ def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Colum
         }
         if not own:
             raise frame.error("data.file", f"no channel has a column of {path}; leave it out.")
-        tables.append(
-            read_csv(
-                path,
-                own,
-                clock_of(frame, spec),
-                every=spec.every,
-                missing=spec.missing,
-                separator=spec.separator,
-                encoding=spec.encoding,
-                skip=spec.skip,
-            )
-        )
+        tables.append(_read(path, own, clock_of(frame, spec), spec))
     second = clock_of(frame).second
     sensors = frame.roles("sensor", "withheld")
     needed = [name for name, column in columns.items() if column.needed]
     return join_tables(tables, second, sensors, needed, frame.where("data.file"))
+
+
+def _owner(
+    frame: Frame, name: str, column: Column, paths: Sequence[Path], headers: Sequence[list[str]]
+) -> int:
+    """Return the number of the one file that has a column."""
+    places = [k for k, header in enumerate(headers) if set(column.names) <= set(header)]
+    if len(places) == 1:
+        return places[0]
+    what = " and ".join(map(repr, column.names))
+    text = f"no file has the column {what}; the files are {', '.join(map(str, paths))}."
+    if places:
+        both = " and ".join(str(paths[k]) for k in places)
+        text = f"{both} have a column {what} each; rename one."
+    raise frame.error(f"channels.{column.noise_of or name}", text)
 
 
 def _header(frame: Frame, spec: DataSpec, path: Path) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from statistics import mode
 
 import numpy as np
 
@@ -29,6 +30,7 @@ AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
+VALUES = {"number", "date"}  # kinds of cells that a header does not have
 
 DateOrder = Callable[[str, str, Sequence[str]], str]
 """(column, first cell, formats) -> the format of dates whose order cannot be known."""
@@ -152,21 +154,21 @@ def measured(
     found = ""
     if kinds[time[0]] == "date":
         found = _format(table, written, time, time_format, choose)
-    numbers = [name for name, kind in kinds.items() if kind == "number" and name not in time]
+    numbers = [name for name in _of_kind(kinds, "number") if name not in time]
     counted = tuple(name for name in numbers if _counts_rows(name, written))
-    names = [name for name in numbers if name not in counted]
-    if not names:
+    columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
+    if not columns:
         raise SampleError(f"{table}: beside the times, '{time[0]}', no column holds numbers.")
     samples = read_csv(
         table,
-        {name: Column((name,), decimal=written.decimal) for name in names},
+        columns,
         Clock(time[0], format=found, decimal=written.decimal, hour="".join(time[1:])),
         separator=written.separator,
         encoding=written.encoding,
         skip=written.skip,
     )
     unit = time_unit
-    if unit:
+    if unit:  # dates are read as seconds since the first one
         unit = "s" if samples.origin else unit_in(time[0], unit, IN_BRACKETS, AT_THE_END) or BLANK
     texts = tuple(name for name in kinds if name not in (*time, *numbers))
     return Measured(table, written, time, found, unit, samples, counted, texts)
@@ -188,62 +190,66 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
     if not rows:
         raise SampleError(f"{table}: holds no rows beside its header.")
     form = form or next(iter(written.time_formats), "")
-
-    def of_cell(cell: str) -> str:
-        if number_of(cell, written.decimal) is not None:
-            return "number"
-        if Clock("").stamp(cell, form) is not None or Clock("").stamp(cell) is not None:
-            return "date"
-        return "hour" if HOUR.fullmatch(cell.strip()) else "text"
-
-    def of_column(cells: list[str]) -> str:
-        found = Counter(of_cell(cell) for cell in cells if cell.lower() not in MISSING)
-        return found.most_common(1)[0][0] if found else "text"
-
-    if all(of_cell(cell) in ("number", "date") for cell in header if cell):
+    of_cell = partial(_kind, decimal=written.decimal, form=form)
+    if VALUES.issuperset(map(of_cell, filter(None, header))):
         raise SampleError(f"{table}: has no header: begin it with a line of names of its columns.")
     if len(header) < 2:
         raise SampleError(
             f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
             "comma, a semicolon or a tab between them."
         )
-    if not any(of_cell(cell) in ("number", "date") for cell in rows[0]):
+    if VALUES.isdisjoint(map(of_cell, rows[0])):
         raise SampleError(
             f"{table}, row {written.skip + 2}: holds no numbers; the header is one line: delete "
             "the second, or say --skip if the first are titles."
         )
     return {
-        name: of_column([row[k].strip() for row in rows if k < len(row)])
-        for k, name in enumerate(header)
+        name: mode([of_cell(cell) for cell in _cells(name, written)] or ["text"])
+        for name in header
         if name
     }
 
 
+def _kind(cell: str, decimal: str, form: str) -> str:
+    if number_of(cell, decimal) is not None:
+        return "number"
+    if Clock("").stamp(cell, form) is not None or Clock("").stamp(cell) is not None:
+        return "date"
+    return "hour" if HOUR.fullmatch(cell.strip()) else "text"
+
+
+def _of_kind(kinds: Mapping[str, str], kind: str) -> list[str]:
+    return [name for name, found in kinds.items() if found == kind]
+
+
 def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str, ...]:
     """Return the column of times: dates, or numbers that increase; or days and times of day."""
-    dates, hours, numbers = (
-        [n for n, k in kinds.items() if k == kind] for kind in ("date", "hour", "number")
-    )
-    complete = [name for name in dates if any(":" in cell for cell in _cells(name, written))]
+    dates, hours, numbers = (_of_kind(kinds, kind) for kind in ("date", "hour", "number"))
+    complete = [name for name in dates if ":" in "".join(_cells(name, written))]
     if dates and hours and not complete:
         return dates[0], hours[0]
+    found = [*complete, *dates, *_most_like_times(numbers, written)]
+    if found:
+        return (found[0],)
+    more = ""
+    if "" in written.header:
+        more = f" Column {written.header.index('') + 1} has no name: give it one."
+    elif hours:
+        more = f" '{hours[0]}' has times of day: add a column of days."
+    raise SampleError(
+        f"{table}: no column holds times: expected dates, or numbers that increase from row to "
+        f"row.{more}"
+    )
+
+
+def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
+    """Return columns of numbers that may be times, those with the surest signs first."""
     timed = [name for name in numbers if unit_in(name, "s", IN_BRACKETS, AT_THE_END)]
     rising = [name for name in numbers if _rises(name, written)]
-    named = [name for name in rising if CALLED_TIME.match(name)]
-    others = [name for name in rising if not _counts_rows(name, written)]
     both = [name for name in timed if name in rising]
-    found = [*complete, *dates, *both, *named, *others, *rising, *timed]
-    if not found:
-        more = ""
-        if "" in written.header:
-            more = f" Column {written.header.index('') + 1} has no name: give it one."
-        elif hours:
-            more = f" '{hours[0]}' has times of day: add a column of days."
-        raise SampleError(
-            f"{table}: no column holds times: expected dates, or numbers that increase from row to "
-            f"row.{more}"
-        )
-    return (found[0],)
+    # Row numbers increase, too: they are times only if nothing else is.
+    others = [name for name in rising if not _counts_rows(name, written)]
+    return [*both, *filter(CALLED_TIME.match, rising), *others, *rising, *timed]
 
 
 def _format(

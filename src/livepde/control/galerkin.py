@@ -11,10 +11,11 @@ import numpy as np
 
 from livepde.control.affine import Output
 from livepde.control.linear import Linear, Linearisation
-from livepde.errors import ModelError
+from livepde.errors import ConfigurationError, ModelError
+from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.observation import Observed
+from livepde.observation import Observation, Observed
 from livepde.result import unknown_of
 
 __all__ = ["GalerkinReduction", "likely"]
@@ -49,6 +50,30 @@ class GalerkinReduction:
     u: Array
     q: Array
     inputs: Mapping[str, float]
+
+    @classmethod
+    def linearised(
+        cls,
+        model: Model,
+        outputs: Observation,
+        sensors: Observation | None,
+        u: Any,
+        q: Any,
+        inputs: Mapping[str, float] | None,
+    ) -> GalerkinReduction:
+        """Return the data at a linearisation point, with a basis that is still empty."""
+        given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
+        physical = model.latent.value(model.initial_parameter(q))
+        start = model.initial(0.0 if u is None else u, Moment(0.0, Inputs(given)))
+        if not np.isfinite(start).all():
+            raise ConfigurationError(
+                "reduce: u is not finite; give the state where it is linearised."
+            )
+        spaces, n = (model.state_space, model.X, model.parameter_space), model.X.dim
+        seen = outputs.bind(*spaces)
+        measured = seen if sensors is None else sensors.bind(*spaces)
+        empty, test = np.zeros((n, 0)), np.zeros((0, n))
+        return cls(model, seen, measured, empty, test, start, physical, given)
 
     @property
     def rows(self) -> list[int]:
@@ -88,6 +113,15 @@ class GalerkinReduction:
             inputs={**self.inputs, **(inputs or {})},
         )
 
+    def extremes(self) -> list[Array]:
+        """Return the reference parameter, and those with one number at an end of its interval."""
+        found, space = [self.q], self.model.parameter_space
+        for label, k in space.labels.items():
+            for end in likely(space, label):
+                found.append(self.q.copy())
+                found[-1][k] = end
+        return found
+
     def values(self) -> list[Array]:
         """Return parameters at which systems are sampled: the reference, then one per number."""
         found, space = [self.q], self.model.parameter_space
@@ -117,6 +151,7 @@ class GalerkinReduction:
 
     def _projected(self, system: Linear) -> Array:
         """Return [K, E, f] projected on the basis, shape (r, r + channels + 1)."""
+        # K acts on u = fixed + V (x - V^T M fixed), where fixed = W c + known are boundary values.
         W, known = self.boundary
         fixed = np.column_stack([W, known])
         K: Array = self.V.T @ (system.K @ self.V)
@@ -125,6 +160,7 @@ class GalerkinReduction:
 
     def check(self) -> None:
         """Raise `ModelError` if the model is not linear in its unknown numbers."""
+        # If affine: f(q + sum_k (q_k - q)/2) = f(q) + sum_k (f(q_k) - f(q))/2.
         values = self.values()
         systems = [self._projected(self.linearisation.at(q)) for q in values]
         both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))

@@ -20,12 +20,14 @@ __all__ = ["Controller", "Decision", "Goal", "Plan", "check"]
 FREE = (-np.inf, np.inf)
 
 
-def _real(value: Any) -> bool:
-    return isinstance(value, Real)
-
-
 def _finite(value: Any) -> bool:
     return isinstance(value, Real) and math.isfinite(value)
+
+
+def _range(ends: Any) -> bool:
+    """Return True for (least, largest); either may be infinite."""
+    two = np.shape(ends) == (2,) and all(isinstance(end, Real) for end in ends)
+    return two and bool(ends[0] < ends[1])
 
 
 @dataclass(frozen=True)
@@ -67,23 +69,19 @@ class Goal:
                     f"Goal: {what} must be a mapping from names to numbers; got "
                     f"{getattr(self, what)!r}."
                 )
-        for what, weights, least in (("track", self.track, 0.0), ("move", self.move, 1e-300)):
-            for name, weight in weights.items():
-                if not (_finite(weight) and weight >= least):
+        for what, valid, expected in (
+            ("track", lambda weight: _finite(weight) and weight >= 0.0, "a positive number"),
+            # R of the Riccati equation is made of these and must be regular.
+            ("move", lambda weight: _finite(weight) and weight >= 1e-300, "a positive number"),
+            ("inputs", _range, "(least, largest) with least < largest"),
+            ("limits", _range, "(least, largest) with least < largest"),
+            ("price", _finite, "a number"),
+        ):
+            for name, value in getattr(self, what).items():
+                if not valid(value):
                     raise ConfigurationError(
-                        f"Goal: {what}['{name}'] must be a positive number; got {weight!r}."
+                        f"Goal: {what}['{name}'] must be {expected}; got {value!r}."
                     )
-        for what, ranges in (("inputs", self.inputs), ("limits", self.limits)):
-            for name, ends in ranges.items():
-                two = np.shape(ends) == (2,) and all(_real(end) for end in ends)
-                if not two or not ends[0] < ends[1]:
-                    raise ConfigurationError(
-                        f"Goal: {what}['{name}'] must be (least, largest) with least < largest; "
-                        f"got {ends}."
-                    )
-        for name, price in self.price.items():
-            if not (_finite(price)):
-                raise ConfigurationError(f"Goal: price['{name}'] must be a number; got {price!r}.")
         if not (np.isfinite(self.beyond) and self.beyond >= 0.0):
             raise ConfigurationError(f"Goal: penalty must be at least 0; got {self.penalty}.")
 

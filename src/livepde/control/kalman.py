@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -63,24 +63,15 @@ class Kalman:
             raise ConfigurationError(
                 "Kalman needs the noise of the sensors: give noise= to the observation."
             )
-        for name in {**drive, **(offset or {})}:
-            if name not in model.channels:
-                raise ConfigurationError(
-                    f"Kalman: there is no channel '{name}'; the model has {list(model.channels)}."
-                )
-            size = {**drive, **(offset or {})}[name]
-            if not (np.isfinite(size) and size >= 0.0):
-                raise ConfigurationError(
-                    f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
-                    f"got {size}."
-                )
+        offset = offset or {}
+        _check_noise({**drive, **offset}, model.channels)
         if not (np.isfinite(period) and period > 0.0):
             raise ConfigurationError(f"Kalman: period must be a positive number; got {period}.")
         self.model = model
         self.period = period
         self.drive = np.array([float(drive.get(name, 0.0)) for name in model.channels])
-        self._moving = model.columns(list(offset or {}))
-        self._walk = np.array(list((offset or {}).values()))
+        self._moving = model.columns(list(offset))
+        self._walk = np.array(list(offset.values()))
         self._noise = np.asarray(model.sensors.noise)
         self._t = np.nan
         self.set(q or {})
@@ -143,21 +134,9 @@ class Kalman:
                 raise TimeOrderError(
                     f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}."
                 )
-            usual = abs(h - self.period) <= SAME * self.period
-            move, A, gained = self._usual if usual else self._over(h)
-            self._x = A @ self._x
-            self._x[:r] += move.B @ self.model.values(inputs) + move.f
-            self._P = A @ self._P @ A.T + gained
+            self._predict(h, inputs)
         self._t = t
-        expected, H = self.model.seen(self._x[:r], self._q, inputs)
-        H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
-        used = np.isfinite(seen) & np.isfinite(expected)
-        H, missed = H[used], (seen - expected)[used]
-        S = H @ self._P @ H.T + np.diag(noise[used] ** 2)
-        gain = np.linalg.solve(S, H @ self._P).T
-        self._x = self._x + gain @ missed
-        left = np.eye(len(self._x)) - gain @ H  # Joseph's form stays symmetric and positive
-        self._P = left @ self._P @ left.T + (gain * noise[used] ** 2) @ gain.T
+        self._update(seen, noise, inputs)
         offset = np.zeros(len(self.model.channels))
         offset[self._moving] = self._x[r:]
         return Known(
@@ -166,6 +145,28 @@ class Kalman:
             np.zeros((len(self._q), 0)),
             offset=offset if r < len(self._x) else None,
         )
+
+    def _predict(self, h: float, inputs: Mapping[str, float]) -> None:
+        """Propagate the mean (x, offset) and its covariance P over a time h."""
+        usual = abs(h - self.period) <= SAME * self.period
+        move, A, gained = self._usual if usual else self._over(h)
+        self._x = A @ self._x
+        self._x[: self.model.size] += move.B @ self.model.values(inputs) + move.f
+        self._P = A @ self._P @ A.T + gained
+
+    def _update(self, seen: Array, noise: Array, inputs: Mapping[str, float]) -> None:
+        """Correct mean and covariance by the readings of a sample; NaN: missing."""
+        expected, H = self.model.seen(self._x[: self.model.size], self._q, inputs)
+        # Sensors see an offset only through the state that it drives.
+        H = np.hstack([H, np.zeros((len(H), len(self._moving)))])
+        used = np.isfinite(seen) & np.isfinite(expected)
+        H, missed = H[used], (seen - expected)[used]
+        S = H @ self._P @ H.T + np.diag(noise[used] ** 2)
+        gain = np.linalg.solve(S, H @ self._P).T
+        self._x = self._x + gain @ missed
+        # Joseph's form (I - K H) P (I - K H)^T + K R K^T stays symmetric and positive.
+        left = np.eye(len(self._x)) - gain @ H
+        self._P = left @ self._P @ left.T + (gain * noise[used] ** 2) @ gain.T
 
     def dump(self) -> bytes:
         """Return the state as bytes."""
@@ -179,3 +180,16 @@ class Kalman:
             raise RunError(f"{where} is of another reduced model: build it as it was then.")
         self.set(dict(zip(self.model.unknowns, leaves["q"].tolist(), strict=True)))
         self._x, self._P, self._t = leaves["x"], leaves["P"], float(leaves["t"])
+
+
+def _check_noise(sizes: Mapping[str, float], channels: Sequence[str]) -> None:
+    for name, size in sizes.items():
+        if name not in channels:
+            raise ConfigurationError(
+                f"Kalman: there is no channel '{name}'; the model has {list(channels)}."
+            )
+        if not (np.isfinite(size) and size >= 0.0):
+            raise ConfigurationError(
+                f"Kalman: the standard deviation of '{name}' must be a number, at least 0; "
+                f"got {size}."
+            )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -166,25 +166,15 @@ class Loop:
             none.
         """
         controller, model = self.controller, self.controller.model
-        z = labelled(z)
-        if isinstance(z, Mapping):
-            inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs or {})
-            z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
-        given = {name: number(v, f"input '{name}'") for name, v in (inputs or {}).items()}
-        unknown = [name for name in given if name not in model.channels]
-        if unknown:
-            raise SampleError(f"unknown input '{unknown[0]}'; there are {list(model.channels)}.")
-        given = {name: value for name, value in given.items() if not np.isnan(value)}
-        applied = np.array(
-            [given.get(n, v) for n, v in zip(model.controls, self._before, strict=True)]
-        )
-        held = zip(model.disturbances, self._disturbances, strict=True)
-        now = np.array([given.get(name, value) for name, value in held])
-        if np.isnan(now).any():
-            name = model.disturbances[int(np.flatnonzero(np.isnan(now))[0])]
-            raise SampleError(f"input '{name}' has no value yet; send it with the first sample.")
-        channels = dict(zip(model.controls, applied.tolist(), strict=True))
-        channels |= dict(zip(model.disturbances, now.tolist(), strict=True))
+        z, given = self._separated(labelled(z), inputs or {})
+        applied = _held(model.controls, self._before, given)
+        now = _held(model.disturbances, self._disturbances, given)
+        if missing := [n for n, v in zip(model.disturbances, now, strict=True) if np.isnan(v)]:
+            raise SampleError(
+                f"input '{missing[0]}' has no value yet; send it with the first sample."
+            )
+        names, values = (*model.controls, *model.disturbances), np.concatenate([applied, now])
+        channels = dict(zip(names, values.tolist(), strict=True))
         plan = self._plan(reference or {}, forecast or {}, now, limits or {})
         # All arguments are validated before the estimator is stepped, so that an invalid sample
         # changes nothing.
@@ -201,6 +191,19 @@ class Loop:
             decision.status,
             getattr(self.estimator, "estimate", None),
         )
+
+    def _separated(self, z: Any, inputs: Mapping[str, float]) -> tuple[Any, dict[str, float]]:
+        """Return the measurements, and the inputs, which a sample with names may contain."""
+        model = self.controller.model
+        if isinstance(z, Mapping):
+            inputs = {name: z[name] for name in model.channels if name in z} | dict(inputs)
+            # A channel may be measured by a sensor of the same name: it is both then.
+            z = {k: v for k, v in z.items() if k not in model.channels or k in model.sensors.names}
+        given = {name: number(v, f"input '{name}'") for name, v in inputs.items()}
+        for name in given:
+            if name not in model.channels:
+                raise SampleError(f"unknown input '{name}'; there are {list(model.channels)}.")
+        return z, given
 
     def _possible(self, decision: Decision, applied: Array) -> Decision:
         """Return a decision within the actuator ranges, whatever the controller returned."""
@@ -236,6 +239,7 @@ class Loop:
             held = np.array([ends[k] for ends in goal.limits.values()])
             given = {name: ends[k] for name, ends in limits.items()}
             values = _ahead(given, tuple(goal.limits), held, count, "limits")
+            # A controller has slack variables only for the limits that the goal has.
             new = np.isinf(held) & np.isfinite(values).any(axis=0)
             if new.any():
                 name = list(goal.limits)[int(np.flatnonzero(new)[0])]
@@ -285,6 +289,12 @@ class Loop:
         self._disturbances = leaves["disturbances"]
 
 
+def _held(names: Sequence[str], last: Array, given: Mapping[str, float]) -> Array:
+    """Return the given values; inputs without one (NaN, absent) hold their last value."""
+    new = np.array([given.get(name, np.nan) for name in names])
+    return np.where(np.isnan(new), last, new)
+
+
 def _mapping(given: Any, what: str) -> Mapping[str, Any]:
     if not isinstance(given, Mapping):
         raise SampleError(f"{what} must be a mapping from names to values; got {given!r}.")
@@ -302,7 +312,7 @@ def _ahead(
     for k, name in enumerate(names):
         if name in given:
             values = np.atleast_1d(numbers(given[name], f"{what}['{name}']"))
-            wrong = np.isnan(values) if what == "limits" else ~np.isfinite(values)
+            wrong = np.isnan(values) | (np.isinf(values) & (what != "limits"))
             if values.ndim > 1 or not len(values) or wrong.any():
                 raise SampleError(
                     f"{what}['{name}'] must be a number, or one for each period; got "
@@ -312,6 +322,6 @@ def _ahead(
             raise SampleError(f"{what}: '{name}' has none; give a number, or one for each period.")
         else:
             values = default[k : k + 1]
-        flat = values[:horizon]
-        columns.append(np.concatenate([flat, np.full(horizon - len(flat), flat[-1])]))
+        # The last value holds to the end of the horizon; values beyond it are not used.
+        columns.append(values[np.minimum(np.arange(horizon), len(values) - 1)])
     return np.column_stack(columns) if columns else np.zeros((horizon, 0))

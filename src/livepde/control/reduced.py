@@ -11,7 +11,7 @@ from scipy.linalg import expm
 
 from livepde.control.affine import Discrete, Output
 from livepde.control.basis import basis
-from livepde.control.galerkin import GalerkinReduction, likely
+from livepde.control.galerkin import GalerkinReduction
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
@@ -349,8 +349,8 @@ def reduce(
     ConfigurationError
         A control is not a channel of the model.
     """
-    unknown = [name for name in controls if name not in model.channels]
-    if isinstance(controls, str) or unknown or not 0 < len(controls) == len(set(controls)):
+    chosen = [name for name in model.channels if name in controls]
+    if isinstance(controls, str) or not 0 < len(controls) == len(chosen):
         raise ConfigurationError(
             f"reduce: controls={controls!r}; the channels of the model are "
             f"{list(model.channels)}: give a list of one or more of them, each once."
@@ -359,37 +359,14 @@ def reduce(
     if modes != int(modes) or modes < 0:
         raise ConfigurationError(f"reduce: modes must be a whole number, at least 0; got {modes}.")
     for rate in rates:
-        if not (np.isfinite(rate) and rate > 0.0):
+        if not 0.0 < rate < np.inf:
             raise ConfigurationError(f"reduce: rates must be positive numbers; got {rate}.")
-    given = dict.fromkeys(model.channels, 0.0) | dict(inputs or {})
-    physical = model.latent.value(model.initial_parameter(q))
-    start = model.initial(0.0 if u is None else u, Moment(0.0, Inputs(given)))
-    if not np.isfinite(start).all():
-        raise ConfigurationError("reduce: u is not finite; give the state where it is linearised.")
-    spaces = (model.state_space, model.X, model.parameter_space)
-    seen = outputs.bind(*spaces)
-    frame = GalerkinReduction(
-        model,
-        seen,
-        seen if sensors is None else sensors.bind(*spaces),
-        np.zeros((model.X.dim, 0)),
-        np.zeros((0, model.X.dim)),
-        start,
-        physical,
-        given,
-    )
+    frame = GalerkinReduction.linearised(model, outputs, sensors, u, q, inputs)
     linearisation = frame.linearisation
-    linearisation.check(physical)
-    W, known = frame.boundary
-    values, space = [physical], model.parameter_space
-    for label, row in space.labels.items():
-        for end in likely(space, label):
-            other = physical.copy()
-            other[row] = end
-            values.append(other)
-    systems = [linearisation.at(value) for value in values]
-    free = np.flatnonzero(model.X.free)
-    V = basis(model.mass, free, systems, np.column_stack([W, known]), modes, rates)
+    linearisation.check(frame.q)
+    systems = [linearisation.at(value) for value in frame.extremes()]
+    lifting = np.column_stack(frame.boundary)
+    V = basis(model.mass, np.flatnonzero(model.X.free), systems, lifting, modes, rates)
     frame = replace(frame, V=V, test=V.T @ model.mass)
     frame.check()
     return ReducedModel.of(frame, tuple(controls))

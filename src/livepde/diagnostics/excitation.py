@@ -176,6 +176,7 @@ class Excitation:
         if state.last is None or state.integral is None:
             empty = sp.csr_array(now.shape)
             return replace(state, t=t, begun=t, last=now, integral=empty)
+        # Trapezoidal rule from sample to sample; the window may end a rounding error early.
         integral = sp.csr_array(state.integral + (0.5 * (t - state.t)) * (state.last + now))
         if t - state.begun < self.window * (1 - 1e-9):
             return replace(state, t=t, last=now, integral=integral)
@@ -188,6 +189,7 @@ class Excitation:
 
     def _gramian(self, integral: sp.csr_array, x: Array) -> Array:
         """Return S* S x with S = R M^{-1} integral: Q -> X, as dual vectors of Q."""
+        # Columns are taken in blocks that bound the memory of S x, shape (n, width).
         width = max(1, ENTRIES // integral.shape[0])
         if x.ndim == 2 and x.shape[1] > width:
             starts = range(0, x.shape[1], width)
@@ -212,6 +214,7 @@ class Excitation:
                 f"Excitation: no window of length {self.window:g} is complete yet; add more "
                 "samples, or take a shorter window."
             )
+        # Strengths squared are the eigenvalues of S* S in the gain-scaled inner product of Q.
         Q = self.spaces.model.Q
         free = np.flatnonzero(Q.free)
         gram = sp.csr_array(Q.tangent_gram[free][:, free]) / self.gain

@@ -257,7 +257,7 @@ class _FragileScheme(Scheme):
     order: ClassVar[int] = 2  # whatever the scheme: stages are solved to the end
 
     scheme: Scheme
-    calls: list[str]
+    calls: list[str]  # empty: not armed; shared with the law, since both are frozen
 
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         if self.calls:
@@ -287,6 +287,7 @@ def _failing(
     law: AnyLaw, build: Callable[[AnyLaw], Identifier], items: list[Sample], middle: int
 ) -> int:
     """Provoke a failure after the first of two substeps; return the number of violations."""
+    # With half of the shortest interval as dt_max every interval has two substeps or more.
     shortest = float(np.diff([item.t for item in items]).min())
     fragile = _Fragile(law, dt_max=0.5 * shortest)
     identifier = build(fragile)

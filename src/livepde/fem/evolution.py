@@ -73,6 +73,7 @@ class RandomWalk(Evolution):
         _positive("RandomWalk: rate", self.rate)
 
     def growth(self, h: float, std: float) -> Array:
+        # The variance rate^2 h, relative to std^2.
         return np.array([self.rate**2 * h / std**2])
 
 
@@ -93,6 +94,7 @@ class MeanReverting(Evolution):
         return np.array([[np.exp(-h / self.time)]])
 
     def growth(self, h: float, std: float) -> Array:
+        # exp(-2 h/time) of the variance is left; the noise restores that of the prior.
         return np.array([-np.expm1(-2.0 * h / self.time)])
 
 
@@ -118,6 +120,7 @@ class Periodic(Evolution):
 
     @property
     def visible(self) -> Array:
+        # A harmonic is a pair (a cos, a sin) that rotates: q contains its first component.
         return np.array([1.0] + self.harmonics * [1.0, 0.0])
 
     @property

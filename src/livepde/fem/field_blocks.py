@@ -389,41 +389,47 @@ class FieldBlock(Block):
         mass = self._mass()
         return analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
 
+    def _dofs_on(self, name: str, names: list[str] | None) -> IntArray:
+        """Return the coefficients on a boundary; names None: also those of derivatives."""
+        dofs = self.at(None if name == "boundary" else name, names)
+        found: IntArray = np.unique(self._tied(dofs))
+        return found
+
     def _value_dofs(self, name: str) -> IntArray:
         # Essential conditions fix values only; derivative degrees of freedom (u_x, u_n, ...) stay
         # free unless the field is clamped.
         values = [n for n in (self.field.element.dofnames or []) if "_" not in n]
-        names = None if self.field.clamped else values
-        found: IntArray = np.unique(
-            self._tied(self.at(None if name == "boundary" else name, names))
-        )
-        return found
+        return self._dofs_on(name, None if self.field.clamped else values)
 
-    def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
-        """Return the Dirichlet conditions of a boundary, one per component of a vector."""
-        dofs = self._value_dofs(name)
-        if not (isinstance(value, tuple) or (callable(value) and self.vector)):
-            return [(dofs, value)]
+    def _axes(self, where: str) -> list[int]:
+        """Return the axes whose component of a vector is a coefficient."""
         names = self.field.element.dofnames or []
         axes = [k for k in range(3) if f"u^{k + 1}" in names]
-        facets = None if name == "boundary" else name
-        where = f"dirichlet: '{name}'"
         if not (self.vector and axes):
             what = "has no components" if self.vector else "is no vector"
             raise SpaceError(
                 f"{where} has a value for each component, and the field {what}: give a number."
             )
-        if isinstance(value, tuple) and len(value) != len(axes):
+        return axes
+
+    def _valued(self, name: str, value: Any) -> list[tuple[IntArray, Any]]:
+        """Return the Dirichlet conditions of a boundary, one per component of a vector."""
+        if not (isinstance(value, tuple) or (callable(value) and self.vector)):
+            return [(self._value_dofs(name), value)]
+        where = f"dirichlet: '{name}'"
+        axes = self._axes(where)
+        if callable(value):
+            value = [_Component(value, k, len(axes), where) for k in axes]
+        if len(value) != len(axes):
             raise SpaceError(
                 f"{where} has {len(value)} values; expected {len(axes)}, one for each component, "
                 "None where it is free."
             )
-        found = []
-        for k in axes:
-            part = value[k] if isinstance(value, tuple) else _Component(value, k, len(axes), where)
-            if part is not None:
-                found.append((np.unique(self._tied(self.at(facets, [f"u^{k + 1}"]))), part))
-        return found
+        return [
+            (self._dofs_on(name, [f"u^{k + 1}"]), part)
+            for k, part in zip(axes, value, strict=True)
+            if part is not None
+        ]
 
     def _slope_dofs(self, name: str, axis: int) -> IntArray:
         """Return the tangential-derivative coefficients on boundary sides parallel to an axis."""

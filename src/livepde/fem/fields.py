@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import chain
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -272,6 +273,22 @@ class Field(_Declared):
                 "form (u, v, x)."
             )
         known = set(self.mesh.boundaries or {}) | {"boundary"}
+        self._check_dirichlet(known)
+        # Arrays are stored as tuples, because the equality of frozen dataclasses would compare them
+        # entry by entry.
+        given: Mapping[str, Any] = self.dirichlet
+        plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
+        object.__setattr__(self, "dirichlet", plain)
+        if self.clamped and (not plain or any(value != 0.0 for value in plain.values())):
+            raise SpaceError(
+                'clamped=True fixes values and slopes to zero: give dirichlet={"boundary": 0.0}, '
+                "and no other value."
+            )
+        self._check_periodic(known)
+        self._check()
+        self._check_pointwise()
+
+    def _check_dirichlet(self, known: set[str]) -> None:
         for name, value in self.dirichlet.items():
             if name not in known:
                 raise SpaceError(
@@ -282,18 +299,9 @@ class Field(_Declared):
                     f"dirichlet: the value on '{name}' is unknown; let it enter weakly, by a "
                     f"penalty: On('{name}', lambda q, u, v, x: 100 * D / x.h * (u - q.value) * v)."
                 )
-        # Arrays are stored as tuples, because the equality of frozen dataclasses would compare them
-        # entry by entry.
-        given: Mapping[str, Any] = self.dirichlet
-        plain = {name: v if _is_plain(v) else tuple(v) for name, v in given.items()}
-        object.__setattr__(self, "dirichlet", plain)
-        values = list(plain.values())
-        if self.clamped and (not values or any(value != 0.0 for value in values)):
-            raise SpaceError(
-                'clamped=True fixes values and slopes to zero: give dirichlet={"boundary": 0.0}, '
-                "and no other value."
-            )
-        for name in [name for pair in self.periodic for name in pair]:
+
+    def _check_periodic(self, known: set[str]) -> None:
+        for name in chain.from_iterable(self.periodic):
             if name not in known - {"boundary"}:
                 raise SpaceError(
                     f"periodic: the mesh has no boundary '{name}'; it has {sorted(known)}."
@@ -303,7 +311,9 @@ class Field(_Declared):
                     f"'{name}' is periodic and has a Dirichlet value: leave one of both out, and "
                     'name the other boundaries instead of "boundary".'
                 )
-        self._check()
+
+    def _check_pointwise(self) -> None:
+        # A bound on q(x) holds everywhere only if the coefficients are the values at the nodes.
         if isinstance(self.prior, Normal):
             if not self.prior.symmetric:
                 raise SpaceError("Field: bounds need a LogNormal or LogitNormal, which keeps them.")

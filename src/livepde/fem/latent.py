@@ -213,6 +213,7 @@ class Latent:
         for p in self.parts.values():
             if p.name in self.space.fields:
                 fixed = self.space.fields[p.name].fixed
+                # All components of a harmonic obey the boundary conditions of the field.
                 found += [fixed + p.part.start + c * p.size for c in range(p.evolution.copies)]
         return np.concatenate(found) if found else np.zeros(0, dtype=np.int64)
 
@@ -290,6 +291,7 @@ class Composed(FormMatrices):
             right = V if cols == "q" else sp.eye_array(inner.shape[1])
             i, j, weights = sandwich(left, inner, right)
             shape = (left.shape[0], right.shape[1])
+            # The second derivative in a has entries on the diagonal that the form in q may lack.
             more = np.arange(dim if rows == cols == "q" else 0)
             pattern = Pattern.from_entries(np.append(i, more), np.append(j, more), shape)
             self._maps[rows, cols] = (pattern, sp.csr_array(pattern.gather(i, j) @ weights))
@@ -305,6 +307,7 @@ class Composed(FormMatrices):
         if "q" not in (rows, cols):
             return data
         a = coefficients.get("q", np.zeros(self.latent.dim))
+        # Chain rule: T' scales the rows and columns of q.
         if not self.latent.linear:
             slopes = self.latent.slopes(a)
             if rows == "q":
@@ -312,6 +315,7 @@ class Composed(FormMatrices):
             if cols == "q":
                 data = data * slopes[pattern.indices]
         if rows == cols == "q":
+            # Chain rule: T'' times the derivative of the form in q, which is zero for a linear T.
             test = {key: value for key, value in physical.items() if key != "v"}
             force = self.form.matrix("v", "q", moment, **test).T @ physical["v"]
             at = np.arange(self.latent.dim)

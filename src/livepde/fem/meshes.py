@@ -217,13 +217,14 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         mesh = mesh.remove_unused_nodes()
     if scale != 1.0:
         mesh = mesh.scaled(float(scale))
-    boundaries = {k: v for k, v in (mesh.boundaries or {}).items() if _is_name(k) and len(v)}
-    subdomains = {k: v for k, v in (mesh.subdomains or {}).items() if _is_name(k) and len(v)}
-    return replace(mesh, _boundaries=boundaries or None, _subdomains=subdomains or None)
+    boundaries, subdomains = _groups(mesh.boundaries), _groups(mesh.subdomains)
+    return replace(mesh, _boundaries=boundaries, _subdomains=subdomains)
 
 
-def _is_name(name: Any) -> bool:
-    return bool(name) and not str(name).startswith("gmsh:")
+def _groups(found: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Return the groups that have members and a name; "gmsh:..." are those of the format itself."""
+    named = {k: v for k, v in (found or {}).items() if k and not str(k).startswith("gmsh:")}
+    return {name: members for name, members in named.items() if len(members)} or None
 
 
 @contextmanager

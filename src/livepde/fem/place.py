@@ -115,6 +115,7 @@ class _Constants(Mapping[str, float]):
         self._constants = constants
 
     def __getitem__(self, name: str) -> float:
+        # A form that reads constants alone stays constant in time: the place records no read.
         return self._constants[name] if name in self._constants else self._place.inputs[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -182,31 +183,36 @@ class FleetResult:
                 "withheld": list(layout.withheld or ()),
             }
         )
-
-        def table(values: Any, *more: int) -> Array:
-            shape = (len(rows), len(self.members), *more)
-            return np.swapaxes(np.reshape(values, shape), 0, 1)
-
         for label in layout.scalars:
             pairs = [row.parameters[label] for row in rows]
             for k, name in enumerate((label, f"{label}_std")):
-                data[name] = (both, table([pair[k] for pair in pairs]), dict(layout.numbers[name]))
+                values = self._table([pair[k] for pair in pairs])
+                data[name] = (both, values, dict(layout.numbers[name]))
         unit = {"units": layout.sensor_unit}
-        innovations = table([row.innovation for row in rows], len(layout.sensors))
+        innovations = self._series("innovation", len(layout.sensors))
         data["innovation"] = ((*both, "sensor"), innovations, unit)
         if layout.withheld is not None:
-            errors = table([row.withheld_error for row in rows], len(layout.withheld))
+            errors = self._series("withheld_error", len(layout.withheld))
             data["withheld_error"] = ((*both, "withheld"), errors, unit)
         flags = {
             "flag_values": list(range(len(STATUS_CODES))),
             "flag_meanings": " ".join(STATUS_CODES),
         }
-        data["status"] = (both, table([row.status for row in rows]), flags)
-        steps = table([row.steps for row in rows])
+        data["status"] = (both, self._series("status"), flags)
+        steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         nothing = np.full(len(self.members), np.nan)
-        for name in dict.fromkeys(name for row in rows for name in row.diagnostics):
+        for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in rows)):
+            # A diagnostic may have the name of an unknown, which comes first.
             key = f"{NOTE}{name}" if name in data else name
-            data[key] = (both, table([row.diagnostics.get(name, nothing) for row in rows]))
+            values = self._table([row.diagnostics.get(name, nothing) for row in rows])
+            data[key] = (both, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
+
+    def _series(self, name: str, *more: int) -> Array:
+        return self._table([getattr(row, name) for row in self._rows], *more)
+
+    def _table(self, values: Any, *more: int) -> Array:
+        """Return values of shape (times, members, *more) as (members, times, *more)."""
+        return np.swapaxes(np.reshape(values, (len(self._rows), len(self.members), *more)), 0, 1)

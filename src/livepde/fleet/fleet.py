@@ -93,14 +93,9 @@ class Fleet:
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
     ) -> None:
-        names = [str(k) for k in range(members)] if isinstance(members, int) else list(members)
-        if not names:
-            raise ConfigurationError("a fleet needs at least one member.")
-        if len(set(names)) < len(names):
-            raise ConfigurationError("the names of the members of a fleet must differ.")
+        self.members = _named(members)
         if isinstance(law, SensitivityLaw):  # the sums of each member would cost more than its step
             law = replace(law, verdict=False)
-        self.members = tuple(names)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         made_of = [one or {} for one in self._each("u0_from", u0_from)]
         self._one = Identifier(
@@ -121,22 +116,15 @@ class Fleet:
         self.model = model = self._one.model
         self.law = law
         self.problem = self._one.problem
+        # Laws evaluate this description on other meshes: it has to be that of all members.
         if any(u0 is not u0s[0] for u0 in u0s):
             self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
-        self._engine: FleetEngine = Separately(law, self._work, self.problem)
         self.note = law.stepped_alone(self._work)
-        if not self.note:
-            readings = [self._one.initial_readings(one) for one in made_of]
-            self._engine = Together(law, self._work, readings, u0s)
-        elif any(one.keys() != made_of[0].keys() for one in made_of):
-            raise ConfigurationError(
-                "u0_from differs between members, which are stepped separately, as "
-                f"{self.note}: give all the same."
-            )
-        count = len(names)
+        self._engine = self._stepper(made_of, u0s)
+        count = len(self)
         self._state: Any = None
         self._t = np.full(count, float(t0))
         self._z = np.full((count, self.observed.size), np.nan)
@@ -145,6 +133,18 @@ class Fleet:
         self._samples = 0
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
+        """Return the engine that steps members as blocks if the law can, else one by one."""
+        if not self.note:
+            readings = [self._one.initial_readings(one) for one in made_of]
+            return Together(self.law, self._work, readings, u0s)
+        if any(one.keys() != made_of[0].keys() for one in made_of):
+            raise ConfigurationError(
+                "u0_from differs between members, which are stepped separately, as "
+                f"{self.note}: give all the same."
+            )
+        return Separately(self.law, self._work, self.problem)
 
     def _each(self, what: str, value: Any) -> list[Any]:
         """Return a value for each member: a list has one for each."""
@@ -230,12 +230,9 @@ class Fleet:
             raise SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, withheld, named = self._parsed(z, inputs or {})
         self._one.check_weighs(noise)
+        # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
-        if t < last or (t == last and self._samples):
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
-                "sort the stream, and drop repeated samples."
-            )
+        self._check_order(t, last)
         values, held = self._filled(named)
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
@@ -260,6 +257,7 @@ class Fleet:
             span = Span(self._t, t, self.inputs, *ends, noise=noise, gaps=some)
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
+        # A member whose step failed keeps its time and values: its next step covers both intervals.
         good = np.array([status.ok for status in report.statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing
         self._held = np.where(good[:, None], lasting, self._held)
@@ -267,6 +265,13 @@ class Fleet:
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
         return self._estimate(span, measured, withheld, report, held)
+
+    def _check_order(self, t: float, last: float) -> None:
+        if t < last or (t == last and self._samples):
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
+                "sort the stream, and drop repeated samples."
+            )
 
     def _expected(self, span: Span) -> MemberReports:
         """Return the predicted readings at the start."""
@@ -389,36 +394,8 @@ class Fleet:
         self, z: Values, inputs: Mapping[str, ArrayLike]
     ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         """Return assimilated values and their noise, withheld values and inputs, all checked."""
-        hidden = self.withheld.names if self.withheld else ()
-        named: dict[str, Array] = {}
-        if isinstance(z, Mapping):
-            channels = self._one.channels
-            noisy = {noise_channel(name): name for name in (*self.observed.names, *hidden)}
-            for name in z:
-                if name not in channels and name not in noisy:
-                    raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
-            columns = {name: self._column(name, values) for name, values in z.items()}
-            nothing = np.full(len(self), np.nan)
-            shape = (len(self), -1)
-
-            def table(names: Sequence[str]) -> Array:
-                rows = [columns.get(name, nothing) for name in names]
-                return np.array(rows).T.reshape(*shape) if rows else np.zeros((len(self), 0))
-
-            for name in noisy.keys() & columns.keys():
-                _check_positive(noisy[name], columns[name])
-            measured, withheld = table(self.observed.names), table(hidden)
-            noise = table([noise_channel(name) for name in self.observed.names])
-            named = {name: columns[name] for name in self.inputs if name in columns}
-        else:
-            array = _numbers("z", z)
-            noise = np.full((len(self), self.observed.size), np.nan)
-            if array.shape == (*noise.shape, 2):
-                array, noise = array[:, :, 0], array[:, :, 1]
-            measured = self._measured(array)
-            for name, column in zip(self.observed.names, noise.T, strict=True):
-                _check_positive(name, column)
-            withheld = np.full((len(self), len(hidden)), np.nan)
+        parse = self._by_name if isinstance(z, Mapping) else self._by_place
+        measured, noise, withheld, named = parse(z)
         for name, values in inputs.items():
             if name not in self.inputs:
                 raise SampleError(
@@ -426,6 +403,38 @@ class Fleet:
                 )
             named[name] = self._column(name, values)
         return measured, own_noise(noise), withheld, named
+
+    def _by_name(self, z: Any) -> tuple[Array, Array, Array, dict[str, Array]]:
+        hidden = self.withheld.names if self.withheld else ()
+        channels, sensors = self._one.channels, (*self.observed.names, *hidden)
+        noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
+        for name in z:
+            if name not in channels and name not in noisy:
+                raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
+        columns = {name: self._column(name, values) for name, values in z.items()}
+        nothing = np.full(len(self), np.nan)
+
+        def table(names: Sequence[str]) -> Array:
+            rows = [columns.get(name, nothing) for name in names]
+            return np.reshape(rows, (len(names), len(self))).T
+
+        for name in noisy.keys() & columns.keys():
+            _check_positive(noisy[name], columns[name])
+        noise = table([noise_channel(name) for name in self.observed.names])
+        named = {name: columns[name] for name in self.inputs if name in columns}
+        return table(self.observed.names), noise, table(hidden), named
+
+    def _by_place(self, z: Any) -> tuple[Array, Array, Array, dict[str, Array]]:
+        array = _numbers("z", z)
+        noise = np.full((len(self), self.observed.size), np.nan)
+        if array.shape == (*noise.shape, 2):
+            array, noise = array[:, :, 0], array[:, :, 1]
+        measured = self._measured(array)
+        for name, column in zip(self.observed.names, noise.T, strict=True):
+            _check_positive(name, column)
+        # Without names a sample has no withheld values.
+        withheld = np.full((len(self), len(self.withheld.names) if self.withheld else 0), np.nan)
+        return measured, noise, withheld, {}
 
     def _measured(self, array: Array) -> Array:
         expected = (len(self), self.observed.size)
@@ -545,6 +554,16 @@ class Fleet:
         self._state = state
         if state is None and not self.inputs:
             self._begin(self._inputs)
+
+
+def _named(members: int | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the members: numbers from 0 if only their count is given."""
+    names = tuple(map(str, range(members)) if isinstance(members, int) else members)
+    if not names:
+        raise ConfigurationError("a fleet needs at least one member.")
+    if len(set(names)) < len(names):
+        raise ConfigurationError("the names of the members of a fleet must differ.")
+    return names
 
 
 def _check_positive(name: str, noise: Array) -> None:

@@ -136,6 +136,7 @@ def _model(
     unit: str,
 ) -> Model:
     held = dict(dirichlet or {})
+    # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
     terms: list[Any] = [
         lambda q, u, v, x: getattr(q, conductivity) * dot(grad(u), grad(v)),

@@ -65,6 +65,8 @@ def advection_dispersion(
     _check("advection_dispersion", inlet, R)
     state = _column(mesh, inlet, element, unit)
 
+    # Advection and dispersion are integrated by parts together, so that the natural condition is
+    # the third type: a given total flux v c - D c_x.
     def flux(q: Any, c: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(c)[0] - q.v * c) * grad(w)[0]
 
@@ -119,6 +121,7 @@ def mobile_immobile(
     """
     _check("mobile_immobile", inlet)
 
+    # The equations are divided by phi and 1 - phi: the mass form is free of unknowns.
     def transport(q: Any, u: Any, w: Any, x: Any) -> Any:
         return (q.D * grad(u.c)[0] - q.v / q.phi * u.c) * grad(w.c)[0]
 
@@ -152,6 +155,7 @@ def _column(mesh: Any, inlet: str, element: Any, unit: str) -> Field:
 
 def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
     """Return the boundary terms of inflow on the left and outflow on the right."""
+    # With c_x = 0 the total flux on the right is v c; that on the left is v c_in.
     out = On("right", lambda q, u, w, x: velocity(q) * solute(u) * solute(w))
     into = On("left", lambda q, u, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
     return [out, into] if inlet == "flux" else [out]

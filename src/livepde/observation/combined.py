@@ -231,6 +231,7 @@ class CalibratedObserved(Observed):
         return False
 
     def _read(self, y: Any, q: Any, moment: Moment) -> Any:
+        # A calibration sees time and inputs, and no coordinates.
         place = Place(np.zeros((0,)), None, moment)
         z = np.asarray(self.observation.function(y, numbers(self.parameter, q), place))
         if z.shape != (self.size,):
@@ -246,6 +247,7 @@ class CalibratedObserved(Observed):
         return z
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        # H_u = (dz/dy) (dy/du) and H_q = dz/dq + (dz/dy) (dy/dq), column by column.
         y = self.base.predict(u, q, moment)
         seen = self.available(moment)
         inner_u, inner_q = self.base.jacobian(u, q, moment)

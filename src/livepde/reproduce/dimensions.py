@@ -83,6 +83,7 @@ def source(d: int) -> Callable[[Any, float], Any]:
 
     def f(place: Any, t: float) -> Any:
         x = np.array([place[k] for k in range(d)])
+        # Each of the d second derivatives of the product of sines is -pi^2 times it.
         laplace = -d * np.pi**2 * (1.0 + t) / 2 * _bump(x)
         return (x[0] + _bump(x)) / 2 - laplace + q_true(x) * u_true(x, t)
 
@@ -255,39 +256,16 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         ]
         for name, setting in SETTINGS.items()
     }
-    table = Table(
-        f"relative L2 errors at t = {END:g}, truth = {truth}",
-        ["setting", "cells", "unknowns", "error of u", "error of q on omega", "error of q"],
-        [
-            [name, n, found.n + found.m, found.u, found.q, found.everywhere]
-            for name, setting in SETTINGS.items()
-            for n, found in zip(setting.cells, errors[name], strict=True)
-        ],
-    )
-    orders = {
-        name: tuple(
-            order(setting.cells, [getattr(found, what) for found in errors[name]]) for what in "uq"
-        )
-        for name, setting in SETTINGS.items()
-    }
-    rates = Table(
-        "orders of convergence, from the coarsest to the finest mesh",
-        ["setting", "u", "q on omega"],
-        [[name, *pair] for name, pair in orders.items()],
-    )
-    if truth == "discrete":
-        bounds = {name: (s.u_order, s.q_order) for name, s in SETTINGS.items()}
-    else:
-        bounds = {name: (None, bound) for name, bound in ANALYTIC.items()}
+    orders = _orders(errors)
+    tables = _tables(errors, orders, truth)
     checks = [
         Check(f"order of {what}, {name}", value, bound, ">=")
-        for name, pair in bounds.items()
+        for name, pair in ORDERS[truth].items()
         for what, value, bound in zip("uq", orders[name], pair, strict=True)
         if bound is not None
     ]
     failed = sum(found.failed for group in errors.values() for found in group)
     checks.append(Check("failed steps", float(failed), 0.0, "<="))
-    tables = [table, rates]
     if truth == "discrete":
         late, more = _in_time(errors["1D Hermite"][-1], progress)
         tables.append(late)
@@ -299,16 +277,38 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     return Outcome(
         tables=tables,
         checks=checks,
-        notes=[
-            "Data of the exact u* pass through two derivatives: that costs q one order."
-            if truth == "analytic"
-            else "Data of the same discretisation: the errors of u are those of the elements, but "
-            "for cubic ones on a line, where the law has not settled by t = 1.5. Those of q are "
-            "what the data do not show of it, outside of omega and next to the boundary, where the "
-            "test functions vanish: there the law only extends q smoothly."
-        ],
+        notes=[NOTES[truth]],
         figures={"convergence": partial(_figure, errors)},
     )
+
+
+def _orders(errors: dict[str, list[MeshErrors]]) -> dict[str, list[float]]:
+    """Return the orders of convergence of u and q of each family."""
+    return {
+        name: [order(SETTINGS[name].cells, [getattr(e, what) for e in group]) for what in "uq"]
+        for name, group in errors.items()
+    }
+
+
+def _tables(
+    errors: dict[str, list[MeshErrors]], orders: dict[str, list[float]], truth: str
+) -> list[Table]:
+    return [
+        Table(
+            f"relative L2 errors at t = {END:g}, truth = {truth}",
+            ["setting", "cells", "unknowns", "error of u", "error of q on omega", "error of q"],
+            [
+                [name, n, found.n + found.m, found.u, found.q, found.everywhere]
+                for name, group in errors.items()
+                for n, found in zip(SETTINGS[name].cells, group, strict=True)
+            ],
+        ),
+        Table(
+            "orders of convergence, from the coarsest to the finest mesh",
+            ["setting", "u", "q on omega"],
+            [[name, *pair] for name, pair in orders.items()],
+        ),
+    ]
 
 
 def _in_time(first: MeshErrors, progress: bool) -> tuple[Table, list[Check]]:
@@ -356,6 +356,17 @@ DIMENSIONS = Experiment(
 # Expected results: error of q on omega on the finest mesh; orders of q with analytic data.
 EXPECTED = {"2D P1": 0.002, "2D P1, ball": 0.004, "2D P1, L-shape": 0.004, "3D P1": 0.03}
 ANALYTIC = {"1D Hermite": 1.6, "2D P1": 0.8, "2D Bogner-Fox-Schmit": 1.6, "3D P1": 0.8}
+ORDERS: dict[str, dict[str, tuple[float | None, float | None]]] = {  # of (u, q)
+    "discrete": {name: (setting.u_order, setting.q_order) for name, setting in SETTINGS.items()},
+    "analytic": {name: (None, q_order) for name, q_order in ANALYTIC.items()},
+}
+NOTES = {
+    "discrete": "Data of the same discretisation: the errors of u are those of the elements, but "
+    "for cubic ones on a line, where the law has not settled by t = 1.5. Those of q are what the "
+    "data do not show of it, outside of omega and next to the boundary, where the test functions "
+    "vanish: there the law only extends q smoothly.",
+    "analytic": "Data of the exact u* pass through two derivatives: that costs q one order.",
+}
 # In time: error of u over the projection error of cubic elements on a line; measured 55, 1.11,
 # 1.004.
 SETTLED = 6.0

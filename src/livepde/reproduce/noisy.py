@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -57,6 +57,7 @@ class WhiteNoise:
     def __iter__(self) -> Iterator[Sample]:
         rng = np.random.default_rng(self.seed)
         gram = self.twin.weights
+        # E (S^{-1/2} xi)^T S (S^{-1/2} xi) = channels, hence the division by its root.
         root = np.linalg.inv(np.linalg.cholesky(gram)).T / np.sqrt(len(gram))
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             size = np.sqrt(z @ gram @ z)
@@ -85,6 +86,10 @@ class NoisyRun:
     def error(self) -> float:
         """The error of q at the end."""
         return float(self.errors[-1])
+
+
+Runs: TypeAlias = dict[tuple[float, Kind, bool], list[NoisyRun]]
+"""(level, kind, with smoothing) -> the runs of all seeds."""
 
 
 @cache
@@ -176,7 +181,6 @@ class _Noisy:
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run all levels and seeds with and without smoothing."""
     _, twin = _problem()
-    baseline = twin.baseline(0.0)
     runs = {
         (level, kind, smoothing): [
             noisy_run(level, seed, smoothing, kind=kind, progress=progress) for seed in SEEDS
@@ -184,27 +188,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         for level, kind in CASES
         for smoothing in (True, False)
     }
-    rows: list[list[Any]] = []
-    for (level, kind, smoothing), found in runs.items():
-        errors = np.array([one.error for one in found])
-        rates = [one.d_rate for one in found]
-        rows.append(
-            [
-                f"{level:.0%}",
-                kind,
-                "on" if smoothing else "off",
-                baseline,
-                float(errors.mean()),
-                float(errors.std(ddof=1)),
-                float(errors.max()),
-                float(np.mean(rates)) if smoothing else None,
-            ]
-        )
-    table = Table(
-        f"relative L2 error of q at t = 60, {len(SEEDS)} seeds, gain {GAIN:g}, c1 = {C1:g}",
-        ["noise", "model", "smoothing", "q = 0", "mean", "spread", "largest", "sup |d~|"],
-        rows,
-    )
+    table = _table(runs, twin.baseline(0.0))
     tuned = _hindsight(progress)
     mean = {key: float(np.mean([one.error for one in found])) for key, found in runs.items()}
     worse = {level: mean[level, kind, False] / mean[level, kind, True] for level, kind in WHITE}
@@ -226,6 +210,30 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         checks=checks,
         notes=[*NOTES, _words(tuned)],
         figures={"error": partial(_figure, runs)},
+    )
+
+
+def _table(runs: Runs, baseline: float) -> Table:
+    rows: list[list[Any]] = []
+    for (level, kind, smoothing), found in runs.items():
+        errors = np.array([one.error for one in found])
+        rates = [one.d_rate for one in found]
+        rows.append(
+            [
+                f"{level:.0%}",
+                kind,
+                "on" if smoothing else "off",
+                baseline,
+                float(errors.mean()),
+                float(errors.std(ddof=1)),
+                float(errors.max()),
+                float(np.mean(rates)) if smoothing else None,
+            ]
+        )
+    return Table(
+        f"relative L2 error of q at t = 60, {len(SEEDS)} seeds, gain {GAIN:g}, c1 = {C1:g}",
+        ["noise", "model", "smoothing", "q = 0", "mean", "spread", "largest", "sup |d~|"],
+        rows,
     )
 
 
@@ -260,7 +268,7 @@ def _words(tuned: Table) -> str:
     )
 
 
-def _figure(runs: dict[tuple[float, Kind, bool], list[NoisyRun]]) -> Any:
+def _figure(runs: Runs) -> Any:
     """Draw the mean error over time of all levels, with and without smoothing."""
     series = {
         f"{level:.0%}, {'smoothed' if smoothing else 'raw'}": (
