@@ -761,7 +761,7 @@ channels.a = { role = "sensor", column = "a", at = [0.5, 0.5] }
         ("{ a = [0, 1, 0, 1], b = [0, 2, 0, 1] }", "lies in 2 regions"),
         ("{ a = [0, 1] }", "expected [x0, x1, y0, y1]"),
         ("{ a = [5, 6, 0, 1] }", "holds no cell of the mesh, which spans 0 to 2 x 0 to 1"),
-        ('{ a = "steel" }', "the mesh has no subdomain 'steel'"),
+        ('{ a = "steel" }', "no subdomain 'steel'; it has none: name them in its file"),
     ],
 )
 def test_regions_of_a_rectangle(tmp_path, regions, named):

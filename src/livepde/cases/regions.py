@@ -17,8 +17,10 @@ def subdomain(frame: Frame, mesh: Any, name: str, key: str) -> str:
     """Return the name of a subdomain, which the mesh has to have."""
     known = mesh.subdomains or {}
     if name not in known:
-        text = f"the mesh has no subdomain '{name}'; {did_you_mean(name, known)}"
-        raise frame.error(key, text)
+        remedy = "it has none: name them in its file, or give the sides of this one."
+        if known:
+            remedy = did_you_mean(name, known)
+        raise frame.error(key, f"the mesh has no subdomain '{name}'; {remedy}")
     return name
 
 
