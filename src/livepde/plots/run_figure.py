@@ -13,6 +13,7 @@ from livepde.linalg import Array
 from livepde.plots.curves import profiles
 from livepde.plots.dataset import (
     MOST_LINES,
+    field_names,
     groups,
     interval_95,
     labelled,
@@ -59,7 +60,7 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     for name, labels in groups(data).items():
         panels.append(lambda ax, name=name, labels=labels: _scalar_panel(data, name, labels, ax))
     state = [name for name in str(data.attrs.get("state", "")).split() if name in data]
-    for name in [*str(data.attrs.get("fields", "")).split(), *state]:
+    for name in [*field_names(data), *state]:
         panels += _field_panels(data, name, times)
     for variable, dimension, what in (
         ("innovation", "sensor", "innovation"),
