@@ -331,7 +331,7 @@ def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
     value, left
         Its value, and the share of its prior standard deviation that is left.
     """
-    # Laws project onto the bounds, so a number at its bound has exactly the value of the bound.
+    # Laws clip to the bounds, so a number at its bound has exactly the value of the bound.
     bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
     moves = "prior_std" not in attrs  # only numbers without an evolution have one prior to compare
     known = InformationGain("", left, bound=bounds[0] if bounds else math.nan, moves=moves)
