@@ -154,11 +154,7 @@ def fleet(
 
 
 def _report(
-    folder: Path,
-    ended: Sequence[Ended],
-    told: Sequence[str],
-    summary: pd.DataFrame,
-    as_json: bool,
+    folder: Path, ended: Sequence[Ended], told: Sequence[str], summary: pd.DataFrame, as_json: bool
 ) -> None:
     """Print the outcomes of all members; a member that failed ends the command with an error."""
     wrong = [item for item in ended if item.status == "failed" or item.failed]
@@ -315,11 +311,7 @@ class Runs:
         return found, apart | dict.fromkeys(begun, GOES_ON)
 
     def left(
-        self,
-        rows: Sequence[Member],
-        ended: Mapping[str, Ended],
-        status: str,
-        why: str,
+        self, rows: Sequence[Member], ended: Mapping[str, Ended], status: str, why: str
     ) -> dict[str, Ended]:
         """Return how runs ended that no process follows any more, marked so in their records.
 
