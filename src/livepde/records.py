@@ -379,22 +379,10 @@ class Layout:
         self, rows: RecordArrays, last: Snapshot | None
     ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         """Return variables, coordinates and attributes of the dataset."""
-        times = rows.t
-        kept = [(times[k], snapshot) for k, snapshot in rows.snapshots()]
+        times, kept = rows.t, [*rows.snapshots()]
         if last is not None:
-            kept.append((times[-1], last))
-        coords: dict[str, Any] = {
-            "time": ("time", times, {"units": self.time_unit}),
-            "snapshot": ("snapshot", np.array([t for t, _ in kept])),
-            "sensor": ("sensor", list(self.sensors)),
-            "withheld": ("withheld", list(self.withheld or ())),
-            **{
-                axis: ("vertex", np.array(x), {"units": self.length_unit})
-                for axis, x in self.coordinates.items()
-            },
-            **self._places("sensor", self.sensors),
-            **self._places("withheld", self.withheld or ()),
-        }
+            kept.append((-1, last))
+        coords = self._coordinates(times, times[[k for k, _ in kept]])
         data: dict[str, Any] = {
             kind: (("cell", "corner"), np.array(corners, dtype=np.int32))
             for kind, corners in self.cells.items()
@@ -422,6 +410,19 @@ class Layout:
             "state": " ".join(self.state),
         }
         return data, coords, about
+
+    def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
+        """Return the coordinates of the dataset: times of samples and of fields, and places."""
+        unit, withheld = {"units": self.length_unit}, self.withheld or ()
+        return {
+            "time": ("time", times, {"units": self.time_unit}),
+            "snapshot": ("snapshot", snapshots),
+            "sensor": ("sensor", list(self.sensors)),
+            "withheld": ("withheld", list(withheld)),
+            **{axis: ("vertex", np.array(x), unit) for axis, x in self.coordinates.items()},
+            **self._places("sensor", self.sensors),
+            **self._places("withheld", withheld),
+        }
 
     def _places(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
         """Return the coordinates of sensors, NaN for those that are not at one point."""
@@ -513,17 +514,22 @@ def name_clashes(
     )
     for names, kind, ends in kinds:
         for name in names:
-            uses.setdefault(name, []).append(f"{kind} '{name}'")
-            if name.startswith(NOTE):
-                uses[name].append("a note of the law")
-            for end, meaning in ends.items():
-                uses.setdefault(f"{name}{end}", []).append(f"{meaning} of '{name}'")
-            for end in ("", *STATE_ENDS, *INTERVAL_ENDS):
-                smoothed = uses.setdefault(f"{name}{SMOOTHED}{end}", [])
-                smoothed.append(f"a smoothed variable of '{name}'")
+            for variable, use in _uses(name, kind, ends):
+                uses.setdefault(variable, []).append(use)
     return [
         f"in tables and datasets of a run '{name}' would be {' and '.join(both)}: give the "
         f"{'unknown' if any('unknown' in use for use in both) else 'component'} another name."
         for name, both in uses.items()
         if len(both) > 1
     ]
+
+
+def _uses(name: str, kind: str, ends: Mapping[str, str]) -> Iterator[tuple[str, str]]:
+    """Iterate over the variables that belong to one of a model's quantities, and their meanings."""
+    yield name, f"{kind} '{name}'"
+    if name.startswith(NOTE):
+        yield name, "a note of the law"
+    for end, meaning in ends.items():
+        yield f"{name}{end}", f"{meaning} of '{name}'"
+    for end in ("", *STATE_ENDS, *INTERVAL_ENDS):
+        yield f"{name}{SMOOTHED}{end}", f"a smoothed variable of '{name}'"

@@ -11,14 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 
 from livepde.cli.options import names_in
-from livepde.cli.printing import (
-    named,
-    print_table,
-    terminal,
-)
+from livepde.cli.printing import named, print_table, terminal
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
+    from livepde.cases.from_table import FoundChannel
     from livepde.cases.measured import Measured
     from livepde.models import Equation
 
@@ -149,24 +146,10 @@ def _show_written(
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     """Print a summary of the tables: times, and columns with roles, units and ranges."""
-    import numpy as np
-
     from livepde.cases.from_table import channels_in
     from livepde.runs import Table
 
-    rows: list[tuple[Any, ...]] = []
-    values = read.columns
-    for item in channels_in(read, equation):
-        role, given = item.given["role"], item.given.get("unit", "")
-        state = equation.inputs[item.name] if role == "input" else equation.state
-        block = np.array([values[name] for name in item.columns])
-        present = block[np.isfinite(block)]
-        ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
-        columns = item.columns[0] if item.columns else "?"
-        if len(item.columns) > 1:
-            columns += f" ... {item.columns[-1]}"
-        gaps = "" if not item.columns else block.size - present.size
-        rows.append((columns, role, item.name, given or state.unit, *ends, gaps))
+    rows = [_channel_row(item, read, equation) for item in channels_in(read, equation)]
     for table in read.tables:
         rows += [(name, "row number", "", "", "", "", "") for name in table.row_numbers]
         rows += [(name, "text", "", "", "", "", "") for name in table.texts]
@@ -174,6 +157,21 @@ def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     for table in read.tables:
         console.print(f"{escape(f'{table.path}: {table.span}')}.", soft_wrap=True)
     print_table(console, Table(f"Times in {' and '.join(read.time)}", headings, rows))
+
+
+def _channel_row(item: FoundChannel, read: Measured, equation: Equation) -> tuple[Any, ...]:
+    """Return columns, role, name, unit, range and number of missing values of a channel."""
+    import numpy as np
+
+    role, given = item.given["role"], item.given.get("unit", "")
+    state = equation.inputs[item.name] if role == "input" else equation.state
+    block = np.array([read.columns[name] for name in item.columns])
+    present = block[np.isfinite(block)]
+    ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
+    first, *rest = item.columns or ("?",)
+    columns = f"{first} ... {rest[-1]}" if rest else first
+    gaps = block.size - present.size if item.columns else ""
+    return columns, role, item.name, given or state.unit, *ends, gaps
 
 
 def equations(
@@ -200,17 +198,23 @@ def equations(
     found = named(name, EQUATIONS, "equation")
     console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
     console.print(escape(found.formula), soft_wrap=True)
-    rows = [("state", "u", found.state.text, found.state.unit, "")]
+    columns = ("where", "name", "what", "unit", "default")
+    print_table(console, Table("What a case says about it", columns, _entries(found)))
+    console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
+
+
+def _entries(found: Equation) -> list[tuple[str, ...]]:
+    """Return what a case says about an equation: table, key, meaning, unit and default of each."""
+    unit = found.state.unit
+    rows: list[tuple[str, ...]] = [("state", "u", found.state.text, unit, "")]
     for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):
         rows += [(table, key, item.text, item.unit, "") for key, item in known.items()]
     for key, option in found.options.items():
         default = "needed" if option.default is None else str(option.default)
         choices = f" ({', '.join(option.choices)})" if option.choices else ""
         rows.append(("[options]", key, option.text + choices, option.unit, default))
-    unit = found.state.unit
-    rows += [
-        ("[channels], quantity", key, item.text, unit, "") for key, item in found.quantities.items()
-    ]
+    for key, item in found.quantities.items():
+        rows.append(("[channels], quantity", key, item.text, unit, ""))
     if found.fluxes is not None:
         flux, transfer, source = found.fluxes
         rows += [
@@ -219,6 +223,4 @@ def equations(
             ("[boundary.NAME]", "ambient", "of that exchange", unit, ""),
             ("[sources.NAME]", "value", "gained in a region", source, ""),
         ]
-    columns = ("where", "name", "what", "unit", "default")
-    print_table(console, Table("What a case says about it", columns, rows))
-    console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
+    return rows

@@ -10,17 +10,8 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from livepde.cli.options import (
-    CaseArgument,
-    CodeOption,
-    SetOption,
-    load_case,
-)
-from livepde.cli.printing import (
-    CHECK_FAILED,
-    print_table,
-    terminal,
-)
+from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case
+from livepde.cli.printing import CHECK_FAILED, print_table, terminal
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
@@ -154,7 +145,7 @@ def _show_wiring(console: Console, case: Case) -> None:
                 "noise" if column.noise_of else spec.role,
                 ", ".join(column.names),
                 "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.frame.unit(name)}",
-                f"{max(policy.wait, habit.wait):g} {unit}".rstrip(),
+                f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "go on",
             )
@@ -193,12 +184,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
         text += f"; step {np.median(steps):g} {unit}, longest {steps.max():g} {unit}"
     console.print(text + ".", soft_wrap=True)
     rows: list[tuple[Any, ...]] = []
-    many = len(samples.names) > MOST_CHANNELS
-    for name, values in zip(samples.names, samples.values.T, strict=True):
-        if many and len(rows) == MOST_CHANNELS:
-            more = len(samples.names) - MOST_CHANNELS
-            rows.append((f"and {more} more", "", "", "", "", "", ""))
-            break
+    for name, values in list(zip(samples.names, samples.values.T, strict=True))[:MOST_CHANNELS]:
         present = values[np.isfinite(values)]
         least, largest = (
             (f"{present.min():.4g}", f"{present.max():.4g}") if len(present) else ("–", "–")
@@ -215,16 +201,18 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
                 _longest_gap(np.isfinite(values)),
             )
         )
+    if (more := len(samples.names) - MOST_CHANNELS) > 0:
+        rows.append((f"and {more} more", "", "", "", "", "", ""))
     columns = ("channel", "role", "least", "largest", "unit", "missing", "longest gap")
     print_table(console, Table("Channels", columns, rows))
 
 
 def _longest_gap(present: Any) -> int:
-    longest = here = 0
-    for value in present.tolist():
-        here = 0 if value else here + 1
-        longest = max(longest, here)
-    return longest
+    """Return the largest number of missing values in a row."""
+    import numpy as np
+
+    known = np.flatnonzero(np.concatenate([[True], present, [True]]))
+    return int(np.diff(known).max()) - 1
 
 
 def _show_checks(console: Console, prepared: Prepared) -> bool:

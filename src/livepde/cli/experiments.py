@@ -10,18 +10,8 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.options import (
-    JsonOption,
-    OutOption,
-    names_in,
-)
-from livepde.cli.printing import (
-    can_draw,
-    named,
-    report_outcome,
-    show,
-    terminal,
-)
+from livepde.cli.options import JsonOption, OutOption, names_in
+from livepde.cli.printing import can_draw, named, report_outcome, show, terminal
 
 if TYPE_CHECKING:
     from rich.console import Console

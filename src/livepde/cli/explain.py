@@ -25,8 +25,7 @@ __all__ = ["explain"]
 def explain(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
     cause: Annotated[
-        int | None,
-        typer.Argument(min=1, help="Number of the cause to test.", show_default=False),
+        int | None, typer.Argument(min=1, help="Number of the cause to test.", show_default=False)
     ] = None,
     data: Annotated[
         str | None, typer.Option(help="The run's data, if its case was moved.", show_default=False)

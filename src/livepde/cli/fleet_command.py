@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -147,20 +147,18 @@ def fleet(
     rows = _read(members)
     name = load_case(case, allow_code, settings).name
     folder = out or free_path(Path("runs") / name)
-    for row in rows:
-        if not resume and (folder / row.name).exists():
-            refuse_taken(folder / row.name)
+    for row in () if resume else rows:
+        refuse_taken(folder / row.name)
     run = Runs(case, folder, allow_code, tuple(settings or ()), resume, separately)
-    ended, told, summary = _each(run, rows, jobs, backend)
+    _report(folder, *_each(run, rows, jobs, backend), as_json=as_json)
+
+
+def _report(
+    folder: Path, ended: Sequence[Ended], told: Sequence[str], summary: pd.DataFrame, as_json: bool
+) -> None:
+    """Print the outcomes of all members; a member that failed ends the command with an error."""
     wrong = [item for item in ended if item.status == "failed" or item.failed]
-    notes = [*([how] if (how := _how(ended)) else []), *told]
-    notes += [f"{item.name}: {item.error}" for item in ended if item.error]
-    notes += [
-        f"{item.name}: {count} of {item.samples} steps failed: {why}"
-        for item in ended
-        for why, count in item.lost.items()
-    ]
-    notes += [f"{item.name}: check failed: {check}" for item in ended for check in item.failed]
+    notes = [*_how(ended), *told, *_complaints(ended)]
     if as_json:
         print_json([_table(summary)], [], notes, run=str(folder), failed=len(wrong))
     else:
@@ -191,19 +189,25 @@ def _read(path: Path) -> list[Member]:
             f"{path} has the columns {list(table.columns)}: one called '{NAME}' is needed, which "
             "names the run directories."
         )
-    rows: list[Member] = []
+    members: dict[str, Member] = {}
     for content in table.to_dict("records"):
-        texts = {str(key).strip(): str(value).strip() for key, value in content.items()}
-        name, data = texts.pop(NAME), texts.pop(DATA, "")
-        if not name or name.startswith(".") or UNFIT & set(name):
-            raise DataError(f"{path}: the name {name!r} does not do for a folder.")
-        if name in {row.name for row in rows} or name == SUMMARY:
-            raise DataError(f"{path}: the name '{name}' is taken; each run needs its own.")
-        given = tuple(f"{key}={value}" for key, value in texts.items() if value)
-        rows.append(Member(name, str(path.parent / data) if data else "", given))
-    if not rows:
+        member = _member(content, path)
+        if member.name in members or member.name == SUMMARY:
+            raise DataError(f"{path}: the name '{member.name}' is taken; each run needs its own.")
+        members[member.name] = member
+    if not members:
         raise DataError(f"{path} has no rows.")
-    return rows
+    return list(members.values())
+
+
+def _member(content: Mapping[Hashable, str], path: Path) -> Member:
+    """Return the member that a row of the table at `path` describes."""
+    texts = {str(key).strip(): str(value).strip() for key, value in content.items()}
+    name, data = texts.pop(NAME), texts.pop(DATA, "")
+    if not name or name.startswith(".") or UNFIT & set(name):
+        raise DataError(f"{path}: the name {name!r} does not do for a folder.")
+    given = tuple(f"{key}={value}" for key, value in texts.items() if value)
+    return Member(name, str(path.parent / data) if data else "", given)
 
 
 def _each(
@@ -217,19 +221,17 @@ def _each(
     told: list[str] = []
 
     def summed_up() -> pd.DataFrame:
-        summary = _summary([ended[row.name] for row in rows if row.name in ended])
+        summary = _summary(_in_order(rows, ended))
         run.folder.mkdir(parents=True, exist_ok=True)
         summary.to_csv(run.folder / SUMMARY, index=False)
         return summary
 
     try:
-        if jobs == 1 and backend is None:
-            ended |= {item.name: item for item in run(rows)}
-        else:
-            # A backend may run a part again by itself, so each part goes on with what is there.
-            parallel = replace(run, resume=True, home=Path.cwd())
-            for found in in_parts(parallel, rows, jobs, backend, told):
-                ended |= {item.name: item for item in found}
+        here = jobs == 1 and backend is None
+        # A backend may run a part again by itself, so each part goes on with what is there.
+        parallel = replace(run, resume=True, home=Path.cwd())
+        for found in [run(rows)] if here else in_parts(parallel, rows, jobs, backend, told):
+            ended |= {item.name: item for item in found}
     except ConfigurationError:
         raise
     except RunError as error:  # workers died again and again
@@ -241,7 +243,12 @@ def _each(
         ended |= run.left(rows, ended, status, "The command was ended: go on with --resume.")
         summed_up()
         raise
-    return [ended[row.name] for row in rows if row.name in ended], told, summed_up()
+    return _in_order(rows, ended), told, summed_up()
+
+
+def _in_order(rows: Sequence[Member], ended: Mapping[str, Ended]) -> list[Ended]:
+    """Return the outcomes that there are, in the order of the table."""
+    return [ended[row.name] for row in rows if row.name in ended]
 
 
 @dataclass(frozen=True)
@@ -266,12 +273,21 @@ class Runs:
 
     def __call__(self, rows: Sequence[Member]) -> list[Ended]:
         """Run members as `livepde run` would, as blocks where they can."""
-        from livepde.cases.members_together import blocks
-        from livepde.runs import JOURNAL
-
         members = {row.name: row for row in rows}
+        ready, ended = self._prepared(rows)
+        together, apart = self._plan(ready)
+        for block in together:
+            ended |= self._together(block, members) if not _interrupted(ended) else {}
+        for name, why in apart.items():
+            if not _interrupted(ended):
+                ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
+        return _in_order(rows, ended)
+
+    def _prepared(self, rows: Sequence[Member]) -> tuple[dict[str, Prepared], dict[str, Ended]]:
+        """Return the members whose case and data could be read, and how the others ended."""
         ended: dict[str, Ended] = {}
         ready: dict[str, Prepared] = {}
+        # Members with the same settings share a case, which is then read and checked only once.
         loaded: dict[tuple[str, ...], Case] = {}
         for row in rows:
             try:
@@ -282,23 +298,20 @@ class Runs:
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
             except LivepdeError as error:
                 ended[row.name] = Ended(row.name, "failed", error=str(error))
+        return ready, ended
+
+    def _plan(self, ready: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
+        """Return the blocks to step together, and why each other member runs on its own."""
+        from livepde.cases.members_together import blocks
+        from livepde.runs import JOURNAL
+
         begun = {name for name in ready if (self._target(name) / JOURNAL).exists()}
         new = {name: one for name, one in ready.items() if name not in begun}
         found, apart = ([], dict.fromkeys(new, ASKED)) if self.separately else blocks(new)
-        apart |= dict.fromkeys(begun, GOES_ON)
-        for block in found:
-            ended |= self._together(block, members) if not _interrupted(ended) else {}
-        for name, why in apart.items():
-            if not _interrupted(ended):
-                ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
-        return [ended[row.name] for row in rows if row.name in ended]
+        return found, apart | dict.fromkeys(begun, GOES_ON)
 
     def left(
-        self,
-        rows: Sequence[Member],
-        ended: Mapping[str, Ended],
-        status: str,
-        why: str,
+        self, rows: Sequence[Member], ended: Mapping[str, Ended], status: str, why: str
     ) -> dict[str, Ended]:
         """Return how runs ended that no process follows any more, marked so in their records.
 
@@ -430,15 +443,25 @@ def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[C
     return Ended(name, run.status, samples, unknowns, failed, lost, str(error) if error else "")
 
 
-def _how(ended: Sequence[Ended]) -> str:
-    """Return a sentence on the members stepped together, and on the reasons of the others."""
+def _complaints(ended: Sequence[Ended]) -> list[str]:
+    """Return sentences on what went wrong: errors first, then failed steps, then failed checks."""
+    steps = [(item, why, count) for item in ended for why, count in item.lost.items()]
+    return [
+        *(f"{item.name}: {item.error}" for item in ended if item.error),
+        *(f"{one.name}: {n} of {one.samples} steps failed: {why}" for one, why, n in steps),
+        *(f"{item.name}: check failed: {check}" for item in ended for check in item.failed),
+    ]
+
+
+def _how(ended: Sequence[Ended]) -> list[str]:
+    """Return a sentence, if any, on members stepped together, and on reasons of the others."""
     apart = Counter(item.apart for item in ended if item.apart)
     count = sum(apart.values())
     together = sum(not item.apart and item.samples > 0 for item in ended)
     parts = [f"{together} were stepped together"] if together else []
     reasons = "; ".join(f"{why} ({number})" for why, number in apart.items())
     parts += [f"{count} separately: {reasons}"] if apart else []
-    return f"Of {len(ended)} members {', '.join(parts)}." if parts else ""
+    return [f"Of {len(ended)} members {', '.join(parts)}."] if parts else []
 
 
 def _summary(ended: Sequence[Ended]) -> pd.DataFrame:

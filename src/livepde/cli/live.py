@@ -15,6 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import typer
+
+from livepde.cli.printing import INTERRUPTED
 from livepde.errors import DataError
 
 if TYPE_CHECKING:
@@ -39,8 +42,11 @@ class Beside:
     ----------
     data
         A file, or lines of JSON, instead of the case's own source.
+    goes_on
+        Whether the source goes on by itself, at its own pace.
     speed
-        Speed of the replay of a finished file, relative to real time.
+        Speed of the replay of a finished file, relative to real time; None: that of the option's
+        default.
     listen, page
         Addresses of /health and /metrics, and of the page; None: not served.
     token
@@ -50,16 +56,24 @@ class Beside:
     """
 
     data: str | Iterable[str] | None = None
-    speed: float = math.inf
+    goes_on: bool = False
+    speed: float | None = None
     listen: str | None = None
     page: str | None = None
     token: str = ""
     estimates: bool = False
 
+    @property
+    def pace(self) -> float:
+        """Speed of the samples relative to real time; inf: each is taken as soon as it is there."""
+        if self.goes_on:
+            return math.inf
+        return 1.0 if self.speed is None else self.speed
+
 
 def beside(
     case: Case, how: Beside, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
-) -> tuple[RunWriter, tuple[Prepared, Driven] | None]:
+) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case in its run directory until its source ends or a signal comes.
 
     Parameters
@@ -72,13 +86,17 @@ def beside(
     Returns
     -------
     writer, taken
-        Writer of the run directory; the case with its result, None if the run ended before the
-        first sample.
+        Writer of the run directory; the case with its result.
+
+    Raises
+    ------
+    Exit
+        The run was interrupted before the first sample.
     """
     from livepde.cases.live_case import Wiring
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
-    wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.speed))
+    wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.pace))
     health, stopping = _LiveHealth(wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
@@ -90,10 +108,11 @@ def beside(
         except DataError as error:
             writer.finish(status="failed", notes=[str(error)])
             raise
-        if live is None or wiring.prepared is None:
-            return writer, None
-        health.live = live
-        return writer, (wiring.prepared, conduct(live, patient=True))
+        if live is not None and wiring.prepared is not None:
+            health.live = live
+            return writer, (wiring.prepared, conduct(live, patient=True))
+    writer.finish(status="interrupted", notes=["Ended before the first sample."])
+    raise typer.Exit(INTERRUPTED)
 
 
 class _LiveHealth:

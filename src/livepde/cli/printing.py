@@ -130,17 +130,23 @@ def print_table(console: Console, table: Table) -> None:
     )
     needed = 2
     for k, column in enumerate(table.columns):
-        cells = [_cell(row[k]) for row in table.rows]
-        numbers = k > 0 and all(_numeric(row[k]) for row in table.rows)
-        words = [word for cell in cells for word in ([cell] if numbers else cell.split())]
-        width = max((len(word) for word in [*words, *column.split()]), default=0)
-        needed += width + 2
+        values = [row[k] for row in table.rows]
+        numbers = k > 0 and all(map(_numeric, values))
+        width = _least_width(column, values, numbers)
+        needed += width + 2  # two blanks between columns
         grid.add_column(
             escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
         )
     for row in table.rows:
         grid.add_row(*(escape(_cell(value)) for value in row))
     console.print(grid, width=max(console.width, needed), crop=False)
+
+
+def _least_width(column: str, values: Iterable[Any], numbers: bool) -> int:
+    """Return the width that a column needs: the title and text can be folded between words."""
+    cells = [_cell(value) for value in values]
+    words = cells if numbers else " ".join(cells).split()
+    return max(map(len, [*words, *column.split()]), default=0)
 
 
 def _numeric(value: Any) -> bool:

@@ -54,6 +54,7 @@ def _ask(text: str, blank: Blank, equation: Equation, columns: Sequence[str], wh
         given = typer.prompt(_question(blank, equation), default="", show_default=False).strip()
         if not given:
             return text
+        # An input with the name of a column is measured: a channel, and no constant.
         if blank.path[0] == "inputs" and given in columns:
             channel = {"role": "input", "column": given}
             return with_channel(filled(text, {blank.key: None}, where), blank.path[1], channel)
@@ -87,26 +88,37 @@ def _settings(
     blank: Blank, given: str, equation: Equation, columns: Sequence[str]
 ) -> Mapping[str, Any]:
     """Return the settings of the case that an answer means."""
-    channel = ".".join(blank.path[:-1])
-    if _is_place(blank):
-        if given == "-":
-            return {channel: None}
-        if given in equation.quantities:
-            return {f"{channel}.at": None, f"{channel}.quantity": given}
-        if given in ENDS and equation.takes_values:
-            return {f"{channel}.role": "boundary", f"{channel}.at": given}
+    if _is_place(blank) and (place := _place(blank, given, equation)):
+        return place
+    if blank.path[-1] == "column" and given not in columns:
+        raise CaseError(f"There is no column '{given}' among {', '.join(columns)}.")
     if blank.path[-1] in TEXTS:
-        if blank.path[-1] == "column" and given not in columns:
-            raise CaseError(f"There is no column '{given}' among {', '.join(columns)}.")
         return {blank.key: given}
     if isinstance(blank.value, list):
-        parts = [part.strip() for part in given.split(",")]
-        count = sum(isinstance(value, str) for value in blank.value)
-        if len(parts) != count:
-            raise CaseError(f"Got {len(parts)} values; expected {count}, as 0, 1.")
-        rest = [value for value in blank.value if not isinstance(value, str)]
-        return {blank.key: [*(_quantity(part, blank) for part in parts), *rest]}
+        return {blank.key: _quantities(given, blank)}
     return {blank.key: _quantity(given, blank)}
+
+
+def _place(blank: Blank, given: str, equation: Equation) -> Mapping[str, Any]:
+    """Return the settings of a place that is no point: none, a quantity or an end; else nothing."""
+    channel = ".".join(blank.path[:-1])
+    if given == "-":
+        return {channel: None}
+    if given in equation.quantities:
+        return {f"{channel}.at": None, f"{channel}.quantity": given}
+    if given in ENDS and equation.takes_values:
+        return {f"{channel}.role": "boundary", f"{channel}.at": given}
+    return {}
+
+
+def _quantities(given: str, blank: Blank) -> list[Any]:
+    """Return a list with the answer's quantities in the place of its texts, which stand first."""
+    parts = [part.strip() for part in given.split(",")]
+    rest = [value for value in blank.value if not isinstance(value, str)]
+    count = len(blank.value) - len(rest)
+    if len(parts) != count:
+        raise CaseError(f"Got {len(parts)} values; expected {count}, as 0, 1.")
+    return [*(_quantity(part, blank) for part in parts), *rest]
 
 
 def _quantity(given: str, blank: Blank) -> Any:

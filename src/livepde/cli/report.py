@@ -8,19 +8,8 @@ from typing import Annotated, Any
 import typer
 from rich.markup import escape
 
-from livepde.cli.options import (
-    CodeOption,
-    JsonOption,
-    prepare_again,
-)
-from livepde.cli.printing import (
-    CHECK_FAILED,
-    can_draw,
-    figures_of,
-    print_json,
-    show,
-    terminal,
-)
+from livepde.cli.options import CodeOption, JsonOption, prepare_again
+from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, print_json, show, terminal
 
 __all__ = ["report"]
 
@@ -36,8 +25,7 @@ def report(
         ),
     ] = False,
     data: Annotated[
-        str | None,
-        typer.Option(help="With --theory: the run's data, if its case was moved."),
+        str | None, typer.Option(help="With --theory: the run's data, if its case was moved.")
     ] = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,

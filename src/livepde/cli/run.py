@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
@@ -132,7 +131,6 @@ def run(
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs import free_path
     from livepde.runs.logs import configure
 
     loaded = load_case(case, allow_code, settings)
@@ -141,64 +139,79 @@ def run(
     goes_on = own or source is sys.stdin
     # What is sent to a run that is gone on with begins anywhere: times count from the first start.
     live = own or realtime or (resume and source is sys.stdin)
-    only = {
-        "--speed": speed is not None,
-        "--listen": listen,
-        "--watch": watch,
-        "--estimates": estimates,
-    }
-    _refuse(out, resume, live, only, as_json)
-    if goes_on and speed is not None:
-        raise ConfigurationError(
-            "--speed replays a finished file: a source that goes on has its own."
-        )
-    folder = out or free_path(Path("runs") / loaded.name)
+    how = Beside(source, goes_on, speed, listen, watch, token, estimates)
+    folder = _run_directory(loaded, out, resume)
+    _refuse(how, live, as_json)
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
     with ExitStack() as stack:
         if live:
             configure(log.value)
-            usual = math.inf if goes_on else 1.0
-            pace = usual if speed is None else speed
-            how = Beside(source, pace, listen, watch, token, estimates)
             writer, taken = beside(loaded, how, folder, write, stack)
         else:
             writer, taken = batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
-        if taken is None:
-            writer.finish(status="interrupted", notes=["Ended before the first sample."])
-            raise typer.Exit(INTERRUPTED)
         prepared, driven = taken
-        dataset, shown, checks, notes = concluded(prepared, prepared.identifier, driven, writer)
+        found = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
         raise driven.error
-    if as_json:
-        print_json(shown, checks, notes, run=str(folder), status=driven.status, dataset=dataset)
-    elif not estimates:
-        console = terminal()
-        console.print(f"[bold]{escape(loaded.title)}[/]  {len(driven.result)} samples")
-        show(console, shown, checks, notes)
-        console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
-        console.print(f"Look at it: livepde watch {escape(str(folder))}", soft_wrap=True)
+    if not estimates:  # which are all that standard output is for then
+        _report(loaded.title, folder, driven, found, as_json)
+    _exit(driven, found.checks, live, as_json)
+
+
+def _exit(driven: Driven, checks: Sequence[Check], live: bool, as_json: bool) -> None:
+    """End the command with an exit code if the run was interrupted or, with JSON, a check failed.
+
+    A run beside a process usually ends by a signal, which is no interruption then.
+    """
     if driven.status == "interrupted" and not live:
         raise typer.Exit(INTERRUPTED)
     if as_json and not all(item.ok for item in checks):
         raise typer.Exit(CHECK_FAILED)
 
 
-def _refuse(
-    out: Path | None, resume: bool, live: bool, beside_only: Mapping[str, object], as_json: bool
-) -> None:
-    """Refuse options that do not belong together, before anything is read."""
-    from livepde.runs import refuse_taken
+def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
+    """Return the folder of the run: the given one, which must be free for a new run, or another."""
+    from livepde.runs import free_path, refuse_taken
 
-    if resume and out is None:
-        raise ConfigurationError("--resume needs --out: the folder of the run to go on with.")
-    if out is not None and out.exists() and not resume:
+    if out is None:
+        if resume:
+            raise ConfigurationError("--resume needs --out: the folder of the run to go on with.")
+        return free_path(Path("runs") / loaded.name)
+    if not resume:
         refuse_taken(out)
+    return out
+
+
+def _refuse(how: Beside, live: bool, as_json: bool) -> None:
+    """Refuse options that do not belong together, before anything is read."""
+    beside_only = {
+        "--speed": how.speed is not None,
+        "--listen": how.listen,
+        "--watch": how.page,
+        "--estimates": how.estimates,
+    }
     for name, given in beside_only.items():
         if given and not live:
             raise ConfigurationError(f"{name} belongs to a run beside a process: add --realtime.")
-    if as_json and beside_only["--estimates"]:
+    if as_json and how.estimates:
         raise ConfigurationError("--json and --estimates both print to standard output: keep one.")
+    if how.goes_on and how.speed is not None:
+        raise ConfigurationError(
+            "--speed replays a finished file: a source that goes on has its own."
+        )
+
+
+def _report(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: bool) -> None:
+    """Print the results of a run, and where they are."""
+    dataset, shown, checks, notes = found
+    if as_json:
+        print_json(shown, checks, notes, run=str(folder), status=driven.status, dataset=dataset)
+        return
+    console = terminal()
+    console.print(f"[bold]{escape(title)}[/]  {len(driven.result)} samples")
+    show(console, shown, checks, notes)
+    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+    console.print(f"Look at it: livepde watch {escape(str(folder))}", soft_wrap=True)
 
 
 def writer_of(
@@ -254,6 +267,15 @@ def batch(
     return writer, (prepared, driven)
 
 
+class Conclusion(NamedTuple):
+    """Dataset of a run, and the tables, checks and notes that are printed."""
+
+    dataset: xr.Dataset
+    tables: list[Table]
+    checks: list[Check]
+    notes: list[str]
+
+
 def concluded(
     prepared: Prepared,
     identifier: Identifier,
@@ -261,8 +283,8 @@ def concluded(
     writer: RunWriter,
     *,
     draw: bool = True,
-) -> tuple[xr.Dataset, list[Table], list[Check], list[str]]:
-    """Write the results of a run; return its dataset, tables, checks and notes.
+) -> Conclusion:
+    """Write the results of a run, and return them.
 
     Parameters
     ----------
@@ -312,7 +334,7 @@ def concluded(
         notes=notes,
         figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
     )
-    return dataset, shown, checks, notes
+    return Conclusion(dataset, shown, checks, notes)
 
 
 def _with_smoothed(

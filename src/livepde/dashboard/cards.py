@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,12 +17,19 @@ from dash import html
 
 from livepde.dashboard.times import at_time, when_axis
 from livepde.dashboard.view import RunView
-from livepde.diagnostics.identifiability import InformationGain
-from livepde.plots.dataset import groups, interval_95, labelled, scalars
+from livepde.plots.dataset import (
+    field_names,
+    groups,
+    interval_95,
+    labelled,
+    modes_told,
+    prior_left,
+    scalars,
+)
 from livepde.records import STATUS_CODES
 from livepde.runs import severities
 from livepde.runs.directory import bound_text
-from livepde.runs.summary import channel_errors, digits
+from livepde.runs.summary import channel_errors, determination, digits
 from livepde.verdict import Severity
 
 __all__ = [
@@ -118,7 +125,7 @@ def summary(seen: RunView) -> str:
     names = []
     for name, labels in groups(data).items():
         names.append(name if labels == [name] else f"{name} ({len(labels)} values)")
-    names += [f"{name} (field)" for name in str(data.attrs.get("fields", "")).split()]
+    names += [f"{name} (field)" for name in field_names(data)]
     sensors, withheld = (data.sizes.get(size, 0) for size in ("sensor", "withheld"))
     found = f"Estimates {', '.join(names) or 'the state only'} from {sensors} sensor"
     found += "s" * (sensors != 1)
@@ -145,40 +152,49 @@ def verdict(seen: RunView) -> list[Any]:
 
 def _found(seen: RunView) -> list[tuple[Level, str]]:
     """Return the findings on a run: level and sentence."""
-    found: list[tuple[Level, str]] = []
-    if seen.problem:
-        found.append(("bad", seen.problem))
-    if seen.status == "stopped":
-        text = "The run did not end, but nobody writes it any more: it was killed. Go on with it"
-        found.append(("bad", f"{text}: livepde run CASE --out RUN --resume."))
-    if seen.status == "silent":
-        last = [event for event in seen.events if event.kind == "silent"][-1]
-        found.append(("bad", f"The source is silent: {last.message}."))
-    if seen.unwell:
-        found.append(("bad", f"Not well: {seen.unwell}."))
     data = seen.dataset
-    if data is not None and data.sizes["time"]:
-        code = STATUS_CODES[int(data["status"].values[-1])]
-        if code != "ok":
-            text = f"The last step failed ({code.replace('_', ' ')})"
-            found.append(("bad", f"{text}: the estimate is that of the last good step."))
+    found: list[tuple[Level, str]] = [("bad", text) for text in _failures(seen)]
     found += [("bad", f"Expected {c.name} {c.sense} {bound_text(c)}, but it is {c.value:.4g}.")
               for c in seen.checks if not c.ok]  # fmt: skip
+    # The notes of a thinned run that ended stand in the place of doubts, without a severity.
     graves = {} if data is None else severities(data)
     found += [(SEVERITY[graves.get(sentence, "caution")], sentence) for sentence in seen.doubts]
+    if data is not None and {"bad", "warn"}.isdisjoint(level for level, _ in found):
+        text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
+        found.insert(0, ("good", text))
+    return found + [("info", text) for text in _remarks(seen)]
+
+
+def _failures(seen: RunView) -> Iterator[str]:
+    """Yield sentences on what failed: reading, the process, the source, health, the last step."""
+    if seen.problem:
+        yield seen.problem
+    if seen.status == "stopped":
+        text = "The run did not end, but nobody writes it any more: it was killed. Go on with it"
+        yield f"{text}: livepde run CASE --out RUN --resume."
+    if seen.status == "silent":
+        last = [event for event in seen.events if event.kind == "silent"][-1]
+        yield f"The source is silent: {last.message}."
+    if seen.unwell:
+        yield f"Not well: {seen.unwell}."
+    if seen.dataset is not None and seen.dataset.sizes["time"]:
+        code = STATUS_CODES[int(seen.dataset["status"].values[-1])]
+        if code != "ok":
+            text = f"The last step failed ({code.replace('_', ' ')})"
+            yield f"{text}: the estimate is that of the last good step."
+
+
+def _remarks(seen: RunView) -> Iterator[str]:
+    """Yield sentences that only inform: irregular rows, thinned estimates, notes of the run."""
     if seen.counts:
         reasons: Counter[str] = Counter()
         for (kind, _), number in seen.counts.items():
             reasons[kind] += number
         said = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
-        found.append(("info", f"Irregular rows or values: {said}. See Events."))
-    if data is not None and not any(level in ("bad", "warn") for level, _ in found):
-        text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
-        found.insert(0, ("good", text))
+        yield f"Irregular rows or values: {said}. See Events."
     if seen.gap > 1 and seen.doubts and not seen.ended:
-        text = f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
-        found.append(("info", text))
-    return found + [("info", note) for note in seen.notes]
+        yield f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
+    yield from seen.notes
 
 
 def sign(level: Level) -> Any:
@@ -195,7 +211,7 @@ def cards(data: xr.Dataset | None, at: float | None) -> list[Any]:
     if data is None or not data.sizes["time"]:
         return []
     labels = scalars(data)
-    fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
+    fields = [name for name in field_names(data) if name in data]
     found = [_field_card(data, name, at) for name in fields]
     k = at_time(data, "time", at)
     found += [_card(data, label, k) for label in labels[: max(MOST_CARDS - len(fields), 0)]]
@@ -217,7 +233,7 @@ def _card(data: xr.Dataset, label: str, k: int) -> Any:
     if "reference" in data[label].attrs:
         reference = pretty(f"{float(data[label].attrs['reference']):.4g}")
         lines.append(html.P(f"reference {reference}", className="interval"))
-    left = float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
+    left = prior_left(data, label, k)
     if math.isfinite(left):
         lines.append(_known(data, label, value, left))
     number = pretty(digits(value, std)[0])
@@ -232,11 +248,7 @@ def _card(data: xr.Dataset, label: str, k: int) -> Any:
 
 
 def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
-    attrs = data[label].attrs
-    bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
-    moves = "prior_std" not in attrs
-    known = InformationGain(label, left, bound=bounds[0] if bounds else math.nan, moves=moves)
-    state = "moves" if moves and known.verdict == "partly" else known.verdict
+    state = determination(data[label].attrs, value, left)
     level, text = VERDICTS[state]
     if state in ("partly", "pinned"):
         text += f": {100 * left:.2g}\N{NO-BREAK SPACE}% of prior std. dev. left"
@@ -255,8 +267,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
         deviation = pretty(f"{float(np.mean(data[f'{name}_std'].values[k])):.2g}")
         lines.append(html.P(f"mean standard deviation {deviation}", className="interval"))
     if f"{name}_modes" in data:
-        modes = data[f"{name}_modes"]
-        count, some = int(modes.attrs["of"]), float(modes.values[k])
+        some, count, _ = modes_told(data, name, k)
         level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
         text = f"{some:.1f} of {count} modes told by the data"
         lines.append(html.P([sign(level), text], className="known"))
@@ -278,33 +289,31 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
 
 def tables(seen: RunView) -> dict[str, list[Any]]:
     """Return the tables: section -> components."""
-    found: dict[str, list[Any]] = {"sensors": [], "events": []}
     data = seen.dataset
-    if data is not None and data.sizes["time"]:
-        found["sensors"] = [_sensor_table(data)]
+    sensors = [] if data is None or not data.sizes["time"] else [_sensor_table(data)]
+    nothing = [html.P("Nothing has happened, and no row was irregular.")]
+    return {"sensors": sensors, "events": [*_event_tables(seen)] or nothing}
+
+
+def _event_tables(seen: RunView) -> Iterator[Any]:
+    """Yield the tables of events, irregular rows and checks that are not empty."""
     if seen.events:
-        rows = [
-            (_when(data, event.t), event.kind, event.channel, event.message)
+        events = [
+            (_when(seen.dataset, event.t), event.kind, event.channel, event.message)
             for event in reversed(seen.events)
         ]
-        found["events"].append(_table("Events, the newest first", EVENTS, rows))
+        columns: tuple[str, ...] = ("when", "what", "channel", "in words")
+        yield _table("Events, the newest first", columns, events)
     if seen.counts:
         counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
-        about = "Irregular rows and values"
-        found["events"].append(_table(about, ("reason", "channel", "number"), counts))
+        yield _table("Irregular rows and values", ("reason", "channel", "number"), counts)
     if seen.checks:
         checks = [
             ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {bound_text(c)}")
             for c in seen.checks
         ]
         columns = ("", "number", "value", "expected")
-        found["events"].append(_table("What was expected of this run", columns, checks))
-    if not found["events"]:
-        found["events"].append(html.P("Nothing has happened, and no row was irregular."))
-    return found
-
-
-EVENTS = ("when", "what", "channel", "in words")
+        yield _table("What was expected of this run", columns, checks)
 
 
 def _sensor_table(data: xr.Dataset) -> Any:

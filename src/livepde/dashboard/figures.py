@@ -13,7 +13,16 @@ from livepde.dashboard.canvas import MARKS, band, empty, over_time, show, text, 
 from livepde.dashboard.times import TimeAxis, at_time
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
-from livepde.plots.dataset import MOST_LINES, interval_95, note, scalars, scored_from
+from livepde.plots.dataset import (
+    MOST_LINES,
+    field_names,
+    interval_95,
+    modes_told,
+    note,
+    prior_left,
+    scalars,
+    scored_from,
+)
 from livepde.runs.summary import shown
 
 __all__ = ["correlation", "open_shares", "ratio", "residuals", "told", "unknowns"]
@@ -190,16 +199,13 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
     found: dict[str, float] = {}
     k = at_time(data, "time", at)
     for label in scalars(data):
-        left = float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
+        left = prior_left(data, label, k)
         if math.isfinite(left):
             found[label] = left
-    for name in str(data.attrs.get("fields", "")).split():
+    for name in field_names(data):
         if f"{name}_modes" in data:
-            modes = data[f"{name}_modes"]
-            count = int(modes.attrs["of"])
-            some = float(modes.values[at_time(data, "snapshot", at)])
-            open_modes = f"{name} ({some:.1f} of {count} modes told)"
-            found[open_modes] = math.sqrt(max(1.0 - some / count, 0.0)) if count else math.nan
+            some, count, left = modes_told(data, name, at_time(data, "snapshot", at))
+            found[f"{name} ({some:.1f} of {count} modes told)"] = left
     return found
 
 

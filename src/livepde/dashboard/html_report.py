@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import secrets
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from livepde import runs
 from livepde.errors import ConfigurationError, RunError
@@ -15,6 +16,9 @@ from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL, bound_text
 from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
+
+if TYPE_CHECKING:
+    from livepde.dashboard.times import TimeAxis
 
 __all__ = ["page_of", "write_report"]
 
@@ -61,7 +65,6 @@ def page_of(run: Run) -> str:
     if not data.sizes["time"]:
         raise RunError(f"{run.path} holds no estimates yet: there is nothing to report.")
     axis, drawn = when_axis(data), panels(data)
-    events, counts = _journal(run)
     case = run.path / CASE
     here = Path(__file__).parent
     environment = Environment(
@@ -77,18 +80,13 @@ def page_of(run: Run) -> str:
         samples=data.sizes["time"],
         span=[axis.text(float(data["time"][k])) for k in (0, -1)],
         verdict=_verdict(run),
-        tables=[_shown(table) for table in runs.tables(data)],
-        checks=[_checked(check) for check in run.checks],
+        tables=list(map(_shown, runs.tables(data))),
+        checks=list(map(_checked, run.checks)),
         sections={
             title: [panel for panel in drawn if panel.section == key]
             for key, title in SECTIONS.items()
         },
-        newest=f"{min(len(events), MOST_EVENTS)} of {len(events)}, the newest first",
-        events=[
-            (axis.text(event.t), event.kind, event.channel or "–", event.message)
-            for event in events[: -MOST_EVENTS - 1 : -1]
-        ],
-        counts=[(kind, channel or "–", number) for (kind, channel), number in counts.items()],
+        **_journal(run, axis),
         case=case.read_text(encoding="utf-8", errors="replace") if case.is_file() else "",
         drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
         config=CONFIG,
@@ -137,10 +135,17 @@ def _written(run: Run) -> str:
     return " · ".join([f"livepde {record.get('livepde', '')}".rstrip(), *times])
 
 
-def _journal(run: Run) -> tuple[list[Event], dict[tuple[str, str], int]]:
-    """Return the events of the run, and counts of values not used."""
+def _journal(run: Run, axis: TimeAxis) -> dict[str, Any]:
+    """Return the events of the run, and counts of values not used, as the template takes them."""
     path = run.path / JOURNAL
-    if not path.is_file():
-        return [], {}
-    with Journal.open(path) as journal:
-        return journal.events, journal.counts
+    events: list[Event] = []
+    counts: dict[tuple[str, str], int] = {}
+    if path.is_file():
+        with Journal.open(path) as journal:
+            events, counts = journal.events, journal.counts
+    newest = events[: -MOST_EVENTS - 1 : -1]
+    return {
+        "newest": f"{len(newest)} of {len(events)}, the newest first",
+        "events": [(axis.text(e.t), e.kind, e.channel or "–", e.message) for e in newest],
+        "counts": [(kind, channel or "–", number) for (kind, channel), number in counts.items()],
+    }

@@ -204,18 +204,23 @@ class View:
             title=run.title,
             status=status,
             written=latest,
-            ended=str(run.record.get("ended", "")) if run.status != "running" else "",
             problem="",
         )
-        seen = self._follow(seen, journal) if live else self._load(seen, run)
-        found = [] if seen.dataset is None else runs.doubts(seen.dataset)
-        ended = run.status != "running"
-        if ended and seen.gap > 1:  # what the run itself has said is of all its samples
-            found = run.notes if found else []
-        notes = [note for note in run.notes if note not in found] if ended else []
-        seen = replace(seen, doubts=found, notes=notes, checks=run.checks if ended else [])
-        self._mark = mark
+        seen = self._judged(self._follow(seen, journal) if live else self._load(seen, run), run)
+        self._mark = mark  # last, so that after an error all is read again
         return seen
+
+    def _judged(self, seen: RunView, run: runs.Run) -> RunView:
+        """Return the contents with findings; of an ended run with its notes and checks."""
+        found = [] if seen.dataset is None else runs.doubts(seen.dataset)
+        if run.status == "running":
+            return replace(seen, doubts=found, notes=[], checks=[], ended="")
+        # The dataset is thinned, while what the run itself has said is of all its samples.
+        if found and seen.gap > 1:
+            found = run.notes
+        notes = [note for note in run.notes if note not in found]
+        ended = str(run.record.get("ended", ""))
+        return replace(seen, doubts=found, notes=notes, checks=run.checks, ended=ended)
 
     def _load(self, seen: RunView, run: runs.Run) -> RunView:
         if run.status == "running":
@@ -233,11 +238,10 @@ class View:
         for number, record in new:
             self._add(number, record)
         status = seen.status
+        heard = [event.kind for event in events if event.kind in HEARING]
         if status == "running" and not count:
             status = "waiting"
-        elif status == "running" and [e.kind for e in events if e.kind in HEARING][-1:] == [
-            "silent"
-        ]:
+        elif status == "running" and heard[-1:] == ["silent"]:
             status = "silent"
         return replace(
             seen,

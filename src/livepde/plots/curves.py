@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
+from livepde.linalg import Array
 from livepde.plots.dataset import NORMAL_95, interval_95, labelled, time_scale, time_text
 from livepde.plots.style import GREY, PALETTE, empty, finish, panel, shades_of
 
@@ -20,6 +21,13 @@ if TYPE_CHECKING:
 __all__ = ["ensemble", "history", "loops", "profiles"]
 
 MARKERS = "osD^vP*X"
+# End of a name -> meaning, style and colour of its line in a panel of `loops`.
+LOOP_LINES = {
+    "reference": ("reference", "--", PALETTE[-1]),
+    "truth": ("truth", "-", PALETTE[-1]),
+    "low": ("limit", ":", PALETTE[1]),
+    "high": ("limit", ":", PALETTE[1]),
+}
 
 
 def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
@@ -72,44 +80,44 @@ def profiles(
     ConfigurationError
         The field does not exist, has more than one space dimension, or Matplotlib is not installed.
     """
-    if name not in data or data[name].dims != ("snapshot", "vertex"):
-        fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
-        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
-    if "y" in data.coords:
-        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
+    _refuse_others(data, name)
     ax = panel(ax)
     chosen = _snapshots(data, times)
     x = data["x"].values
     if observed is not None:
         ax.axvspan(*observed, color=GREY, alpha=0.12, linewidth=0, label="observed")
-    truth = None if exact is None else np.asarray(exact, dtype=float)
+    truth = np.asarray([] if exact is None else exact, dtype=float)
     shades = shades_of(len(chosen))
     for order, (k, colour) in enumerate(zip(chosen, shades, strict=True)):
-        values = data[name].values[k]
-        label = time_text(data, data["snapshot"].values[k])
-        style = {"marker": MARKERS[order % len(MARKERS)], "markersize": 3.5} if markers else {}
-        if truth is not None and truth.ndim == 2:
+        style: dict[str, Any] = {"linewidth": 1.4}
+        if markers:
+            style = {"linewidth": 0.7, "marker": MARKERS[order % len(MARKERS)], "markersize": 3.5}
+        if truth.ndim == 2:
+            # Each time has an exact line in its own shade; the legend has one entry for all.
             ax.plot(x, truth[order], color=colour, linewidth=1.0, label="_exact")
-        ax.plot(
-            x,
-            values,
-            color=colour,
-            linewidth=0.7 if markers else 1.4,
-            linestyle="--" if truth is not None and truth.ndim == 2 else "-",
-            label=label,
-            **style,  # type: ignore[arg-type]
-        )
+            style["linestyle"] = "--"
+        label = time_text(data, data["snapshot"].values[k])
+        ax.plot(x, data[name].values[k], color=colour, label=label, **style)
     if f"{name}_std" in data:
-        low, high = (end[chosen[-1]] for end in interval_95(data, name))
+        low, high = np.array(interval_95(data, name))[:, chosen[-1]]
         ax.fill_between(x, low, high, color=shades[-1], alpha=0.25, linewidth=0, label="95 %")
-    if truth is not None and truth.ndim == 1:
-        ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
-    elif truth is not None:
+    if truth.ndim == 2:
         ax.plot([], [], color=GREY, linewidth=1.0, label="exact")
+    elif exact is not None:
+        ax.plot(x, truth, color="black", linewidth=2.0, zorder=1.5, label="exact")
     ax.set_xlabel(labelled("x", str(data["x"].attrs.get("units", ""))))
     ax.set_ylabel(labelled(name, str(data[name].attrs.get("units", ""))))
     ax.margins(x=0.02)
     return finish(ax, legend=legend, outside=True)
+
+
+def _refuse_others(data: xr.Dataset, name: str) -> None:
+    """Refuse what is not a field on an interval."""
+    fields = [str(key) for key in data if data[key].dims == ("snapshot", "vertex")]
+    if name not in fields:
+        raise ConfigurationError(f"the dataset has no field '{name}'; it has {fields}.")
+    if "y" in data.coords:
+        raise ConfigurationError("profiles are for one space dimension; use overview for maps.")
 
 
 def history(
@@ -168,25 +176,8 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
         factor, clock = time_scale(data)
         t = data["time"].values / factor
         for row, name in enumerate(rows):
-            ax, values = grid[row][column], data[name].values
-            for end, style in (("reference", "--"), ("truth", "-"), ("low", ":"), ("high", ":")):
-                if f"{name}_{end}" in data:
-                    limit = end in ("low", "high")
-                    said = ax.get_legend_handles_labels()[1]
-                    meaning = "limit" if limit else end
-                    ax.plot(
-                        t,
-                        data[f"{name}_{end}"].values,
-                        style,
-                        color=PALETTE[1] if limit else PALETTE[-1],
-                        linewidth=1.0,
-                        label="" if meaning in said else meaning,
-                    )
-            if f"{name}_std" in data:
-                half = NORMAL_95 * data[f"{name}_std"].values
-                ax.fill_between(t, values - half, values + half, color=PALETTE[0], alpha=0.25)
-            drawstyle: Any = "steps-post" if "held" in data[name].attrs else "default"
-            ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
+            ax = grid[row][column]
+            _loop_panel(ax, data, name, t)
             if row == 0:
                 ax.set_title(label, fontsize="medium")
             if column == 0:
@@ -195,6 +186,22 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
                 ax.set_xlabel(labelled("t", clock))
             finish(ax, legend=column == 0)
     return drawn
+
+
+def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
+    """Draw one quantity of a closed loop, and what belongs to it, over times of shape (times,)."""
+    for end, (meaning, style, colour) in LOOP_LINES.items():
+        if f"{name}_{end}" in data:
+            said = ax.get_legend_handles_labels()[1]
+            label = "" if meaning in said else meaning  # both limits are one entry of the legend
+            line = data[f"{name}_{end}"].values
+            ax.plot(t, line, style, color=colour, linewidth=1.0, label=label)
+    values = data[name].values
+    if f"{name}_std" in data:
+        half = NORMAL_95 * data[f"{name}_std"].values
+        ax.fill_between(t, values - half, values + half, color=PALETTE[0], alpha=0.25)
+    drawstyle: Any = "steps-post" if "held" in data[name].attrs else "default"
+    ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
 
 
 def ensemble(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,10 +19,13 @@ __all__ = [
     "MOST_LINES",
     "NORMAL_95",
     "SensorPlaces",
+    "field_names",
     "groups",
     "interval_95",
     "labelled",
+    "modes_told",
     "note",
+    "prior_left",
     "scalars",
     "scored_from",
     "sensor_places",
@@ -41,6 +45,30 @@ CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
 def scalars(data: xr.Dataset) -> list[str]:
     """Return the labels of the scalar unknowns."""
     return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
+
+
+def field_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the unknown fields."""
+    return str(data.attrs.get("fields", "")).split()
+
+
+def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
+    """Return the share of its prior standard deviation that a number has left at sample k, or NaN.
+
+    Laws without a covariance do not know it.
+    """
+    return float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
+
+
+def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
+    """Return how many modes of a field the data have told at snapshot k, their number, and `left`.
+
+    `left` is the root mean square over all modes of the remaining share of the prior standard
+    deviation: a mode with the share s counts 1 - s^2 among those that were told.
+    """
+    modes = data[f"{name}_modes"]
+    count, told = int(modes.attrs["of"]), float(modes.values[k])
+    return told, count, math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
 
 
 def note(data: xr.Dataset, name: str) -> Array | None:

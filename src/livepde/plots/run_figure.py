@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from livepde.linalg import Array
 from livepde.plots.curves import profiles
 from livepde.plots.dataset import (
     MOST_LINES,
+    field_names,
     groups,
     interval_95,
     labelled,
@@ -32,6 +34,10 @@ if TYPE_CHECKING:
 __all__ = ["overview"]
 
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
+RESIDUALS = (  # variable, its dimension, title of its panel
+    ("innovation", "sensor", "innovation"),
+    ("withheld_error", "withheld", "error of withheld channels"),
+)
 SLENDER = 6.0  # length over width from which a map has an axis of its own for each
 
 
@@ -55,20 +61,7 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     figure_class()
     if not data.sizes.get("time"):
         raise ConfigurationError("the run holds no samples yet, so there is nothing to draw.")
-    panels: list[Any] = []
-    for name, labels in groups(data).items():
-        panels.append(lambda ax, name=name, labels=labels: _scalar_panel(data, name, labels, ax))
-    state = [name for name in str(data.attrs.get("state", "")).split() if name in data]
-    for name in [*str(data.attrs.get("fields", "")).split(), *state]:
-        panels += _field_panels(data, name, times)
-    for variable, dimension, what in (
-        ("innovation", "sensor", "innovation"),
-        ("withheld_error", "withheld", "error of withheld channels"),
-    ):
-        if variable in data and data.sizes.get(dimension):
-            panels.append(
-                lambda ax, v=variable, d=dimension, w=what: _residual_panel(data, v, d, w, ax)
-            )
+    panels = _panels(data, times)
     columns = 1 if len(panels) == 1 else 2
     rows = math.ceil(len(panels) / columns)
     drawn = empty(rows, columns, title)
@@ -77,6 +70,20 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
         alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
         panel(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
     return drawn
+
+
+def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Axes], Axes]]:
+    """Return a function for each panel that draws it on given axes."""
+    panels: list[Callable[[Axes], Axes]] = [
+        partial(_scalar_panel, data, name, labels) for name, labels in groups(data).items()
+    ]
+    state = [name for name in str(data.attrs.get("state", "")).split() if name in data]
+    for name in [*field_names(data), *state]:
+        panels += _field_panels(data, name, times)
+    for variable, dimension, what in RESIDUALS:
+        if variable in data and data.sizes.get(dimension):
+            panels.append(partial(_residual_panel, data, variable, dimension, what))
+    return panels
 
 
 def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) -> Axes:
@@ -100,21 +107,28 @@ def _scalar_panel(data: xr.Dataset, name: str, labels: Sequence[str], ax: Axes) 
         if known:
             ax.fill_between(t, low, high, color=colour, alpha=0.2, linewidth=0)
             reach += [low[late], high[late]]
-    finite = np.concatenate(reach)
-    finite = finite[np.isfinite(finite)]
-    if len(finite) and finite.min() > 0.0 and finite.max() > WIDE * finite.min():
-        ax.set_yscale("log")
-        margin = (finite.max() / finite.min()) ** 0.06
-        ax.set_ylim(finite.min() / margin, finite.max() * margin)
-    elif len(finite) and finite.max() > finite.min():
-        margin = 0.06 * (finite.max() - finite.min())
-        ax.set_ylim(finite.min() - margin, finite.max() + margin)
+    _limit_values(np.concatenate(reach), ax)
     _mark_failures(data, ax)
     _mark_jumps(data, ax)
     time_axis(ax, data)
     ax.set_ylabel(labelled(name, unit))
     ax.set_title(f"{name}: estimate and 95 % band" if len(reach) > len(labels) else name)
     return finish(ax)
+
+
+def _limit_values(values: Array, ax: Axes) -> None:
+    """Fit the value axis to values with a margin of 6 %; a wide range has a logarithmic axis."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return
+    low, high = finite.min(), finite.max()
+    if low > 0.0 and high > WIDE * low:
+        ax.set_yscale("log")
+        margin = (high / low) ** 0.06
+        ax.set_ylim(low / margin, high * margin)
+    elif high > low:
+        margin = 0.06 * (high - low)
+        ax.set_ylim(low - margin, high + margin)
 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
@@ -145,7 +159,9 @@ def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
         ax.axvline(t, label=label, color=PALETTE[1], linestyle="--", linewidth=1.0)
 
 
-def _field_panels(data: xr.Dataset, name: str, times: Sequence[float] | int) -> list[Any]:
+def _field_panels(
+    data: xr.Dataset, name: str, times: Sequence[float] | int
+) -> list[Callable[[Axes], Axes]]:
     """Return functions that draw a field: profiles, maps, or its range over time in 3D."""
     if "y" not in data.coords:
 
@@ -155,9 +171,9 @@ def _field_panels(data: xr.Dataset, name: str, times: Sequence[float] | int) -> 
 
         return [profile]
     if "z" in data.coords:
-        return [lambda ax: _range_panel(data, name, ax)]
-    names = [name, *([f"{name}_std"] if f"{name}_std" in data else [])]
-    return [lambda ax, n=n: _map_panel(data, n, ax) for n in names]
+        return [partial(_range_panel, data, name)]
+    maps = (name, f"{name}_std")
+    return [partial(_map_panel, data, variable) for variable in maps if variable in data]
 
 
 def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from tokenize import TokenError
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from livepde.plots.dataset import interval_95, scalars
+from livepde.plots.dataset import field_names, interval_95, scalars
 from livepde.runs.directory import plain
 
 __all__ = ["DIFFERENCES", "bounded", "cf", "free_names", "kinds_of", "oriented", "udunits"]
@@ -137,26 +137,16 @@ def cf(
     """
     found = bounded(data)
     names = free_names(str(name) for name in found.variables)
-    clock, origin = str(data["time"].attrs.get("units", "")), data.attrs.get("origin")
-    times = [found[name] for name in ("time", "snapshot") if name in found]
-    for time in times:
-        time.attrs |= {"units": clock} | ({"standard_name": "time"} if clock else {})
+    clock = _clock_attrs(str(data["time"].attrs.get("units", "")), data.attrs.get("origin"))
     for name in names:
-        _describe(found, name)
+        _describe(found, name, clock)
         beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
         if beside:
             found[name].attrs["ancillary_variables"] = " ".join(beside)
-    if origin is not None and clock in CLOCKS:
-        since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
-        for time in times:
-            time.attrs |= since | {"units_metadata": "leap_seconds: none"}
-    found.attrs = {key: plain(value) for key, value in data.attrs.items()}
-    lists = {key: str(data.attrs.get(key, "")).split() for key in ("fields", "state")}
-    for key, some in {"scalars": scalars(data), **lists}.items():
-        found.attrs[key] = " ".join(names[name] for name in some if name in names)
+    found.attrs = plain(data.attrs) | _name_lists(data, names)
     found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
     found.attrs["title"] = str(data.attrs.get("title", "")) or title
-    found = found.rename({old: new for old, new in names.items() if old != new})
+    found = found.rename(names)
     for kind in kinds_of(found):
         _add_topology(found, kind)
     return found
@@ -188,8 +178,44 @@ def free_names(wanted: Iterable[str]) -> dict[str, str]:
     return found
 
 
-def _describe(data: xr.Dataset, name: str) -> None:
-    """Set the CF attributes of a variable: long name, unit, axis and type of flags."""
+def _name_lists(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
+    """Return the attributes that list variables, by their new names."""
+    state = str(data.attrs.get("state", "")).split()
+    lists = {"scalars": scalars(data), "fields": field_names(data), "state": state}
+    return {
+        key: " ".join(names[name] for name in some if name in names) for key, some in lists.items()
+    }
+
+
+def _clock_attrs(clock: str, origin: str | None) -> dict[str, str]:
+    """Return the CF attributes of times in a unit, counted from a date where the run has one."""
+    attrs = {"standard_name": "time"} if clock else {}
+    if origin is None or clock not in CLOCKS:
+        return attrs | _unit_attrs("time", clock)
+    since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
+    return attrs | since | {"units_metadata": "leap_seconds: none"}
+
+
+def _unit_attrs(name: str, own: str) -> dict[str, str]:
+    """Return the CF attributes of a variable in this unit."""
+    unit = udunits(own)
+    if unit is None:
+        return {"comment": f"unit: {own}"}
+    if unit not in SCALES:
+        return {"units": unit}
+    # A difference of 5 degC is 5 K, but a temperature of 5 degC is 278.15 K.
+    apart = name.endswith("_std") or name in DIFFERENCES
+    return {
+        "units": unit,
+        "units_metadata": f"temperature: {'difference' if apart else 'on_scale'}",
+    }
+
+
+def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
+    """Set the CF attributes of a variable: long name, unit, axis and type of flags.
+
+    `clock`: attributes of times.
+    """
     variable = data[name]
     attrs = variable.attrs
     attrs.setdefault("long_name", LONG_NAMES.get(name, name))
@@ -202,13 +228,11 @@ def _describe(data: xr.Dataset, name: str) -> None:
         attrs["axis"] = AXES[name]
     if name in data.coords:
         variable.encoding["_FillValue"] = None  # a coordinate is never missing
-    if "units" in attrs:
-        own = str(attrs.pop("units"))
-        unit = udunits(own)
-        attrs |= {"comment": f"unit: {own}"} if unit is None else {"units": unit}
-        if unit in SCALES:
-            apart = name.endswith("_std") or name in DIFFERENCES
-            attrs["units_metadata"] = f"temperature: {'difference' if apart else 'on_scale'}"
+    own = attrs.pop("units", None)
+    if AXES.get(name) == "T":
+        attrs |= clock
+    elif own is not None:
+        attrs |= _unit_attrs(name, str(own))
     if "flag_values" in attrs:
         attrs["flag_values"] = np.array(attrs["flag_values"], dtype=variable.dtype)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.dates import when
-from livepde.plots.dataset import note, scalars
+from livepde.plots.dataset import field_names, note, prior_left, scalars
 from livepde.runs.summary import digits, jumps
 from livepde.verdict import FLAT, REFINE, Finding, Severity, Shifts, at_bound, discretised, flat
 
@@ -150,7 +150,7 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
         value = float(data[label][-1])
         if value in (attrs.get("lower_bound"), attrs.get("upper_bound")):
             found.append(at_bound(label, value))
-        left = float(data[f"{label}_left"][-1]) if f"{label}_left" in data else math.nan
+        left = prior_left(data, label)
         if left > FLAT and "prior_std" in attrs:
             found.append(flat(label, left))
     return found
@@ -173,7 +173,7 @@ def _held(data: xr.Dataset) -> list[str]:
 def _left_out(data: xr.Dataset) -> list[str]:
     """Return fields whose variance is to a large part that of modes the law leaves out."""
     found = []
-    for name in str(data.attrs.get("fields", "")).split():
+    for name in field_names(data):
         if f"{name}_left_out" not in data:
             continue
         share, count = float(data[f"{name}_left_out"][-1]), int(data[f"{name}_modes"].attrs["of"])
@@ -335,7 +335,7 @@ def _gain(data: xr.Dataset) -> list[str]:
     """Return the findings on a law with a fixed gain, which has no covariance."""
     if note(data, "residual") is None or note(data, "gain") is not None:
         return []
-    names = [*scalars(data), *str(data.attrs.get("fields", "")).split()]
+    names = [*scalars(data), *field_names(data)]
     wandering = [name for name in names if name in data and _wanders(data[name].values)]
     if not wandering:
         return []

@@ -11,7 +11,7 @@ import numpy as np
 
 from livepde.dates import when
 from livepde.diagnostics.identifiability import TRADED, InformationGain
-from livepde.plots.dataset import interval_95, note, scalars
+from livepde.plots.dataset import field_names, interval_95, modes_told, note, prior_left, scalars
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
@@ -25,6 +25,7 @@ __all__ = [
     "Jump",
     "channel_errors",
     "checks_of",
+    "determination",
     "digits",
     "jumps",
     "measures",
@@ -191,22 +192,13 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
     """
     found: dict[str, float] = {}
-    if data.sizes["time"]:
-        for label in scalars(data):
-            found[label] = float(data[label][-1])
-            found[f"{label}.std"] = float(data[f"{label}_std"][-1])
-            if "reference" in data[label].attrs:
-                found[f"{label}.error"] = _error(data, label)
-                found[f"{label}.deviations"] = _deviations(data, label)
-    channels = channel_errors(data)
-    parts = [item.errors for item in channels.values()]
-    found["rmse"] = rmse(np.concatenate(parts)) if parts else math.nan
-    for role in ROLES:
-        some = [item.errors for item in channels.values() if item.role == role]
-        if some:
-            found[f"rmse.{role}"] = rmse(np.concatenate(some))
-    for name, item in channels.items():
-        found[f"rmse.{name}"] = rmse(item.errors)
+    for label in scalars(data) if data.sizes["time"] else ():
+        found[label] = float(data[label][-1])
+        found[f"{label}.std"] = float(data[f"{label}_std"][-1])
+        if "reference" in data[label].attrs:
+            found[f"{label}.error"] = _error(data, label)
+            found[f"{label}.deviations"] = _deviations(data, label)
+    found |= _channel_measures(data)
     ratios = note(data, "innovation_ratio")
     if ratios is not None and len(ratios):
         found["innovation_ratio"] = float(ratios[-1])
@@ -214,6 +206,18 @@ def measures(data: xr.Dataset) -> dict[str, float]:
         found["jumps"] = float(len(jumps(data)))
     found["failed_steps"] = float((data["status"].values != 0).sum())
     return found
+
+
+def _channel_measures(data: xr.Dataset) -> dict[str, float]:
+    """Return the one-step root mean square errors: of all channels, of each role, of each one."""
+    channels = channel_errors(data)
+    pools = {"rmse": ROLES} | {f"rmse.{role}": (role,) for role in ROLES}
+    found = {}
+    for name, roles in pools.items():
+        parts = [item.errors for item in channels.values() if item.role in roles]
+        if parts or name == "rmse":
+            found[name] = rmse(np.concatenate(parts or [np.empty(0)]))
+    return found | {f"rmse.{name}": rmse(item.errors) for name, item in channels.items()}
 
 
 def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> list[Check]:
@@ -232,38 +236,49 @@ def tables(data: xr.Dataset) -> list[Table]:
     data, and jumps. Errors over all samples include the initial transient of learning; those of the
     second half can be compared with the noise.
     """
-    result: list[Table] = []
     labels = scalars(data) if data.sizes["time"] else []
+    channels = _channels(data)
+    found = [_estimates(data, labels), _fields(data), channels, _told(data, labels), _jumped(data)]
+    return [table for table in found if table.rows or table is channels]
+
+
+def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
+    """Return the table of the last estimates, with references where any is given."""
+    compared = any("reference" in data[label].attrs for label in labels)
     rows: list[tuple[Any, ...]] = []
-    if labels:
-        compared = any("reference" in data[label].attrs for label in labels)
-        for label in labels:
-            value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
-            cells = [*digits(value, std), _interval(data, label)]
-            cells.append(data[label].attrs.get("units", ""))
-            if compared:
-                cells.append(shown(float(data[label].attrs.get("reference", math.nan)), ".5g"))
-                cells.append(shown(100 * _error(data, label), ".2g", " %"))
-            rows.append((label, *cells))
-        columns: tuple[str, ...] = ("unknown", "value", "± std. dev.", "95 %", "unit")
-        title = "Estimates"
+    for label in labels:
+        attrs, std = data[label].attrs, float(data[f"{label}_std"][-1])
+        cells = (*digits(float(data[label][-1]), std), _interval(data, label))
+        rows.append((label, *cells, attrs.get("units", "")))
         if compared:
-            columns += ("reference", "error")
-            source = str(data.attrs.get("reference_source", ""))
-            title += f"; reference: {source}" if source else ""
-        result.append(Table(title, columns, rows))
-    fields = [name for name in str(data.attrs.get("fields", "")).split() if name in data]
-    if fields:
-        rows = []
-        for name in fields:
-            last = data[name].values[-1]
-            known = f"{name}_std" in data
-            deviation = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
-            numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
-            unit = data[name].attrs.get("units", "")
-            rows.append((name, *numbers, shown(deviation, ".2g"), _left_out(data, name), unit))
-        columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
-        result.append(Table("Estimated fields", columns, rows))
+            reference = shown(float(attrs.get("reference", math.nan)), ".5g")
+            rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
+    columns = ("unknown", "value", "± std. dev.", "95 %", "unit")
+    if not compared:
+        return Table("Estimates", columns, rows)
+    source = str(data.attrs.get("reference_source", ""))
+    title = f"Estimates; reference: {source}" if source else "Estimates"
+    return Table(title, (*columns, "reference", "error"), rows)
+
+
+def _fields(data: xr.Dataset) -> Table:
+    """Return the table of the last snapshots of the unknown fields."""
+    rows: list[tuple[Any, ...]] = []
+    for name in field_names(data):
+        if name not in data:
+            continue
+        last = data[name].values[-1]
+        known = f"{name}_std" in data
+        std = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
+        numbers = [f"{number:.4g}" for number in (last.min(), last.mean(), last.max())]
+        unit = data[name].attrs.get("units", "")
+        rows.append((name, *numbers, shown(std, ".2g"), _left_out(data, name), unit))
+    columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
+    return Table("Estimated fields", columns, rows)
+
+
+def _channels(data: xr.Dataset) -> Table:
+    """Return the table of one-step errors of each channel."""
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
         (
@@ -278,8 +293,7 @@ def tables(data: xr.Dataset) -> list[Table]:
         for name, (role, errors, later) in _grouped(channel_errors(data)).items()
     ]
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", "unit")
-    result.append(Table("Measured minus predicted, one step ahead", columns, rows))
-    return result + [table for table in (_told(data, labels), _jumped(data)) if table.rows]
+    return Table("Measured minus predicted, one step ahead", columns, rows)
 
 
 def _left_out(data: xr.Dataset, name: str) -> str:
@@ -292,27 +306,36 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
     """Return the table of remaining shares of the prior standard deviation of each unknown."""
     rows: list[tuple[Any, ...]] = []
     for label in labels:
-        attrs, left = data[label].attrs, data.get(f"{label}_left")
-        if left is None or not math.isfinite(share := float(left[-1])):
+        left = prior_left(data, label)
+        if not math.isfinite(left):
             continue
-        value = float(data[label][-1])
-        bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
-        known = InformationGain(
-            label, share, bound=bounds[0] if bounds else math.nan, moves="prior_std" not in attrs
-        )
-        state = "moves" if known.moves and known.verdict == "partly" else known.verdict
+        state = determination(data[label].attrs, float(data[label][-1]), left)
         others = _traded(data, label)
-        if others and known.verdict != "pinned":
+        if others and state != "pinned":
             state += f", traded off with {', '.join(others)}"
-        rows.append((label, _share(share), state))
-    for name in str(data.attrs.get("fields", "")).split():
-        if f"{name}_modes" not in data:
-            continue
-        modes = data[f"{name}_modes"]
-        count, told = int(modes.attrs["of"]), float(modes[-1])
-        share = math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
-        rows.append((name, _share(share), f"{told:.1f} of {count} modes told"))
+        rows.append((label, _share(left), state))
+    for name in field_names(data):
+        if f"{name}_modes" in data:
+            told, count, left = modes_told(data, name)
+            rows.append((name, _share(left), f"{told:.1f} of {count} modes told"))
     return Table("What the data have told", ("unknown", "prior std. dev. left", "state"), rows)
+
+
+def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
+    """Return how well the data determine a number: a verdict of `InformationGain`, or "moves".
+
+    Parameters
+    ----------
+    attrs
+        Attributes of the number in the dataset.
+    value, left
+        Its value, and the share of its prior standard deviation that is left.
+    """
+    # Laws clip to the bounds, so a number at its bound has exactly the value of the bound.
+    bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
+    moves = "prior_std" not in attrs  # only numbers without an evolution have one prior to compare
+    known = InformationGain("", left, bound=bounds[0] if bounds else math.nan, moves=moves)
+    return "moves" if moves and known.verdict == "partly" else known.verdict
 
 
 def _share(left: float) -> str:

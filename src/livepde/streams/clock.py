@@ -207,27 +207,29 @@ def date_formats(cells: Sequence[str]) -> list[str]:
     >>> date_formats(["06/28/2016 11:45 PM", "06/29/2016 12:00 AM"])
     ['%m/%d/%Y %I:%M %p']
     """
-    found: dict[str, Array] = {}
-    clock, begin = Clock(""), cells[:FIRST_CELLS]
-    guessed = dict.fromkeys(guessed_format(cell) for cell in begin)
-    for form in dict.fromkeys(["", *_known_formats(), *guessed]):
-        if all(clock.stamp(cell, form) is None for cell in begin):
-            continue
-        stamps = [clock.stamp(cell, form) for cell in cells]
-        given = np.array([stamp for stamp in stamps if stamp is not None])
-        if len(given) > MOST * len(cells):
-            found[form] = given
-    if "" in found:
+    forms = dict.fromkeys(["", *_known_formats(), *map(guessed_format, cells[:FIRST_CELLS])])
+    steps = {form: np.diff(given) for form in forms if len(given := _stamps(cells, form))}
+    if "" in steps:
         return [""]
-    steps = {form: np.diff(given) for form, given in found.items()}
     steps = {form: step for form, step in steps.items() if (step >= 0).all()} or steps
-    even = [form for form, step in steps.items() if len(step) > 1 and _are_even(step)]
+    even = [form for form, step in steps.items() if _are_even(step)]
     return even if len(even) == 1 else list(steps)
 
 
+def _stamps(cells: Sequence[str], form: str) -> Array:
+    """Return the dates among cells in seconds since 1970; none unless most cells fit a format."""
+    clock = Clock("")
+    # Hardly any of the formats fits the first cells; for the others, no more cells are parsed.
+    if all(clock.stamp(cell, form) is None for cell in cells[:FIRST_CELLS]):
+        return np.empty(0)
+    stamps = (clock.stamp(cell, form) for cell in cells)
+    given = np.array([stamp for stamp in stamps if stamp is not None])
+    return given if len(given) > MOST * len(cells) else np.empty(0)
+
+
 def _are_even(steps: Array) -> bool:
-    """Return whether the longest step is hardly longer than the median."""
-    return bool(0 < steps.max() <= 1.5 * np.median(steps))
+    """Return whether the longest of several steps is hardly longer than their median."""
+    return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
 
 
 def _known_formats() -> Iterator[str]:

@@ -24,7 +24,14 @@ from livepde.streams.clock import (
     read_times,
 )
 from livepde.streams.names import check_columns, is_data, no_file
-from livepde.streams.table import MISSING, Column, DataTable, cell_number, to_table
+from livepde.streams.table import (
+    MISSING,
+    Column,
+    DataTable,
+    cell_number,
+    decimal_marks,
+    to_table,
+)
 
 __all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
 
@@ -101,9 +108,8 @@ def read_csv(
         message names file, row (the header is row 1) and column.
     """
     path = Path(path)
-    needed = list(
-        dict.fromkeys([*clock.names, *(n for column in columns.values() for n in column.names)])
-    )
+    decimals = decimal_marks(columns)
+    needed = list(dict.fromkeys([*clock.names, *decimals]))
     try:
         _check_text(path)
         rows, cells = _cells(path, needed, separator, encoding, clock, skip)
@@ -117,7 +123,6 @@ def read_csv(
         raise DataError(f"{path}: holds no rows beside its header.")
     stamps = [" ".join(parts) for parts in zip(*(cells[name] for name in clock.names), strict=True)]
     times, dates = read_times(stamps, clock, lambda k: f"{path}, row {rows[k]}, column")
-    decimals = {name: column.decimal for column in columns.values() for name in column.names}
 
     def numbers(name: str, use: Any) -> Array:
         chosen = use.tolist()
@@ -152,9 +157,11 @@ def _check_header(
     path: Path, header: list[str], separator: str, encoding: str, clock: Clock, skip: int
 ) -> None:
     """Refuse a header that another separator would divide, or a title in its place."""
-    others = [other for other in SEPARATORS if other != separator and other in header[0]]
+    if not header:
+        raise csv.Error("it is empty")
     if len(header) > 1:
         return
+    others = [other for other in SEPARATORS if other != separator and other in header[0]]
     seems = how_written(path, encoding)
     if seems.skip > skip and seems.separator == separator:
         raise SampleError(
@@ -184,7 +191,20 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
     DataError
         No such file, or a workbook.
     """
-    path = Path(path)
+    lines, encoding = _first_lines(Path(path), encoding)
+    separator = _separator(lines[skip or 0 :])
+    if skip is None:
+        skip = _titles(lines, separator)
+    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
+    header, *rows = [row for row in found if row] or [[]]
+    cells = [cell for row in rows for cell in row]
+    decimal = "," if any(map(has_decimal_comma, cells)) else "."
+    formats = _time_formats(header, rows, decimal)
+    return Written(separator, decimal, encoding, skip, formats, header, rows)
+
+
+def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
+    """Return the first lines of a file, and its encoding: the given one, or a likely one."""
     try:
         _check_text(path)
         encoding = encoding or _likely(path.read_bytes(), UTF_8)
@@ -194,24 +214,20 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
         raise no_file(path) from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
+    # The last line may be cut off.
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
-    lines = whole.splitlines()
-    separator = _separator(lines[skip or 0 :])
-    if skip is None:
-        skip = _titles(lines, separator)
-    found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
-    header, *rows = [row for row in found if row] or [[]]
-    cells = [cell for row in rows for cell in row]
-    decimal = "," if any(map(has_decimal_comma, cells)) else "."
-    formats = (_formats([row[k] for row in rows if k < len(row)], decimal) for k in _places(header))
-    return Written(
-        separator, decimal, encoding, skip, next(filter(None, formats), ()), header, rows
-    )
+    return whole.splitlines(), encoding
 
 
-def _places(header: Sequence[str]) -> Iterator[int]:
-    """Yield the places of the columns that have a name."""
-    return (k for k, name in enumerate(header) if name)
+def _time_formats(
+    header: Sequence[str], rows: Sequence[Sequence[str]], decimal: str
+) -> tuple[str, ...]:
+    """Return the formats of the first named column that may hold dates; none without one."""
+    for k, name in enumerate(header):
+        cells = [row[k] for row in rows if k < len(row)]
+        if name and (formats := _formats(cells, decimal)):
+            return formats
+    return ()
 
 
 def _separator(lines: Sequence[str]) -> str:
@@ -262,16 +278,16 @@ def _as_written(
 ) -> str:
     """Return the options that a file seems to need, as text: the known one, and further ones."""
     seems = how_written(path, encoding)
-    said = [known] if known else []
-    others = "separator" not in known and len(seems.header) > 1
-    if seems.skip > skip:
-        said.append(f"skip = {seems.skip}")
-    if others and seems.separator != separator and separator not in "".join(seems.header):
-        said.append(f"separator = {seems.separator!r}")
-    if clock.decimal == "." and seems.decimal == ",":
-        said.append("decimal = ','")
-    if seems.time_format and not clock.format:
-        said.append(f"time_format = {seems.time_format!r}")
+    divided = "separator" not in known and len(seems.header) > 1
+    unlike = seems.separator != separator and separator not in "".join(seems.header)
+    options = (
+        (known, known),
+        (f"skip = {seems.skip}", seems.skip > skip),
+        (f"separator = {seems.separator!r}", divided and unlike),
+        ("decimal = ','", clock.decimal == "." and seems.decimal == ","),
+        (f"time_format = {seems.time_format!r}", seems.time_format and not clock.format),
+    )
+    said = [option for option, needed in options if needed]
     return " and ".join(filter(None, (", ".join(said[:-1]), said[-1])))
 
 
@@ -297,14 +313,9 @@ def _cells(
         whole = chain(islice(file, skip, None), [f"{END}\n"])
         lines = csv.reader(whole, delimiter=separator, skipinitialspace=True)
         numbered = _whole(lines, skip + 1)
-        header = next((row for _, row in numbered if row), None)
-        if header is None:
-            raise csv.Error("it is empty")
+        header = next((row for _, row in numbered if row), [])
         _check_header(path, header, separator, encoding, clock, skip)
-        check_columns(str(path), needed, header, told=is_data(path))
-        for name in needed:
-            if header.count(name) > 1:
-                raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
+        _check_names(path, header, needed)
         places = [header.index(name) for name in needed]
         rows: list[int] = []
         columns: list[list[str]] = [[] for _ in needed]
@@ -314,12 +325,21 @@ def _cells(
                     f"{path}, row {number}: {len(row)} fields, but the header has "
                     f"{len(header)}; decimals need a point, and fields with a comma in them quotes."
                 )
-            texts = [row[place] if place < len(row) else "" for place in places]
+            row += [""] * (len(header) - len(row))
+            texts = [row[place] for place in places]
             if any(texts):
                 rows.append(number)
                 for column, text in zip(columns, texts, strict=True):
                     column.append(text)
     return rows, dict(zip(needed, columns, strict=True))
+
+
+def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
+    """Refuse a header without a needed column, or with two of its name."""
+    check_columns(str(path), needed, header, told=is_data(path))
+    for name in needed:
+        if header.count(name) > 1:
+            raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
 
 
 def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[str]]]:

@@ -47,48 +47,65 @@ def join_tables(
     DataError
         Some times are dates and some numbers; or the tables have no time in common.
     """
-    origins = [table.origin for table in tables]
-    dated = [origin for origin in origins if origin is not None]
-    if 0 < len(dated) < len(tables):
-        raise DataError(f"{where}: the times of one file are dates and of another numbers.")
-    first = min(map(since_1970, dated), default=0.0)
-    shifts = [0.0 if o is None else (since_1970(o) - first) * second for o in origins]
-    times = [table.t + shift for table, shift in zip(tables, shifts, strict=True)]
-    start, stop = max(t[0] for t in times), min(t[-1] for t in times)
-    if stop < start:
+    times, first = _on_one_clock(tables, second, where)
+    starts, ends = np.transpose([(t[0], t[-1]) for t in times])
+    start = starts.max()
+    if ends.min() < start:
         raise DataError(f"{where}: the files have no time in common; check dates and units.")
-    whole = max(t[-1] for t in times) - min(t[0] for t in times)
-    width = SAME * whole or 1.0
-    keys = [np.rint(time / width) for time in times]
-    moments = pd.concat([pd.Series(t, index=key) for t, key in zip(times, keys, strict=True)])
-    frames = [
-        pd.DataFrame(table.values, index=key, columns=list(table.names))
-        for table, key in zip(tables, keys, strict=True)
-    ]
-    joined = pd.concat(frames, axis=1).sort_index()
-    t: Array = np.asarray(moments[~moments.index.duplicated()].sort_index(), dtype=float)
-    names, values = list(joined.columns), joined.to_numpy(copy=True)
-    seen = np.array([name in sensors for name in names])
-    usable = (t >= start - width) & np.isfinite(values[:, seen]).any(axis=1)
+    width = SAME * (ends.max() - starts.min()) or 1.0
+    t, joined = _outer_join(tables, times, width)
+    sensed = joined.columns.isin(list(sensors))
+    known = np.isfinite(joined.to_numpy())
+    usable = (t >= start - width) & known[:, sensed].any(axis=1)
     if not usable.any():
         raise DataError(
             f"{where}: no sensor has a value where all files have one; check the times."
         )
     begin = int(usable.argmax())
-    for k in np.flatnonzero(~seen & np.isnan(values[begin])):
-        known = np.isfinite(values[:, k])
-        if known.any():
-            values[begin, k] = np.interp(t[begin], t[known], values[known, k])
-    values, t = values[begin:], t[begin:]
-    remarks: Counter[tuple[str, str]] = Counter()
-    for name in needed:
-        remarks["skipped", name] = int(np.isnan(values[:, names.index(name)]).sum())
-    kept = np.isfinite(values[:, [names.index(name) for name in needed]]).all(axis=1)
+    # A run needs each input at its start, where a slower logger may have no row.
+    for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
+        values, at = joined.iloc[:, k].to_numpy(), known[:, k]
+        joined.iloc[begin, k] = np.interp(t[begin], t[at], values[at])
+    inputs = joined[list(needed)].iloc[begin:]
+    kept = np.isfinite(inputs.to_numpy()).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
-    values, t = values[kept], t[kept]
-    for table in tables:
-        remarks.update(table.remarks)
-    origin = origin_at(first + float(t[0]) / second) if dated else None
-    told = {key: number for key, number in remarks.items() if number}
-    return DataTable(t - t[0] if dated else t, values, tuple(names), origin, told)
+    t, values, names = t[begin:][kept], joined.to_numpy()[begin:][kept], tuple(joined.columns)
+    remarks = Counter({("skipped", name): n for name, n in inputs.isna().sum().to_dict().items()})
+    remarks = sum((Counter(table.remarks) for table in tables), remarks)  # drops counts of zero
+    if first is None:
+        return DataTable(t, values, names, None, remarks)
+    return DataTable(t - t[0], values, names, origin_at(first + t[0] / second), remarks)
+
+
+def _on_one_clock(
+    tables: Sequence[DataTable], second: float, where: str
+) -> tuple[list[Array], float | None]:
+    """Return the times of each table, and the date from which all count: the earliest origin.
+
+    The date is in seconds since 1970, or None where times are numbers.
+    """
+    dated = [since_1970(table.origin) for table in tables if table.origin is not None]
+    if not dated:
+        return [table.t for table in tables], None
+    if len(dated) < len(tables):
+        raise DataError(f"{where}: the times of one file are dates and of another numbers.")
+    first = min(dated)
+    begun = zip(tables, dated, strict=True)
+    return [table.t + (origin - first) * second for table, origin in begun], first
+
+
+def _outer_join(
+    tables: Sequence[DataTable], times: Sequence[Array], width: float
+) -> tuple[Array, pd.DataFrame]:
+    """Return the times of all rows in order, shape (rows,), and a column for each channel.
+
+    Times that fall into one interval of this width are one row, with the first table's time.
+    """
+    keys = [np.rint(t / width) for t in times]
+    moments = pd.concat([pd.Series(t, index=key) for t, key in zip(times, keys, strict=True)])
+    frames = [
+        pd.DataFrame(table.values, index=key, columns=list(table.names))
+        for table, key in zip(tables, keys, strict=True)
+    ]
+    return moments.groupby(level=0).first().to_numpy(), pd.concat(frames, axis=1).sort_index()

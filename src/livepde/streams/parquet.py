@@ -10,7 +10,7 @@ from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
 from livepde.streams.clock import Clock
 from livepde.streams.names import check_columns, no_file
-from livepde.streams.table import Column, DataTable, tabulated
+from livepde.streams.table import Column, DataTable, decimal_marks, tabulated
 
 __all__ = ["read_parquet"]
 
@@ -43,7 +43,7 @@ def read_parquet(
         raise DataError("Parquet files need pyarrow: pip install 'livepde[parquet]'.") from None
 
     where = str(path)
-    names = dict.fromkeys(name for column in columns.values() for name in column.names)
+    names = decimal_marks(columns)
     needed = [clock.name, *(name for name in names if name != clock.name)]
     try:
         with ParquetFile(path) as file:

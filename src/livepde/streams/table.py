@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.streams.clock import (
     COMMA,
     NO_POINT,
@@ -33,6 +35,7 @@ __all__ = [
     "JsonLines",
     "cell_number",
     "channel_value",
+    "decimal_marks",
     "read_json_lines",
     "row_time",
     "tabulated",
@@ -71,6 +74,11 @@ class Column:
     needed: bool = False
     decimal: str = "."
     noise_of: str = ""
+
+
+def decimal_marks(columns: Mapping[str, Column]) -> dict[str, str]:
+    """Return the decimal mark of each column that the channels need, by its name."""
+    return {name: column.decimal for column in columns.values() for name in column.names}
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,22 +142,20 @@ def read_json_lines(
         raise no_file(Path(path)) from None
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} cannot be read: {error}.") from error
-    places = [f"{path}, line {k}" for k, line in enumerate(lines, start=1) if line.strip()]
-    texts = [line for line in lines if line.strip()]
-    rows = [_object(text, place) for text, place in zip(texts, places, strict=True)]
+    numbered = {k: line for k, line in enumerate(lines, start=1) if line.strip()}
+    places = [f"{path}, line {k}" for k in numbered]
+    rows = list(map(_object, numbered.values(), places))
     if not rows:
         raise SampleError(f"{path}: holds no samples.")
     for row, place in zip(rows, places, strict=True):
         check_columns(place, [clock.name], list(row))
-    needed = [name for column in columns.values() for name in column.names]
-    check_columns(str(path), needed, [*dict.fromkeys(name for row in rows for name in row)])
+    decimals = decimal_marks(columns)
+    check_columns(str(path), decimals, [*dict.fromkeys(chain(*rows))])
     times, dates = read_times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
 
-    decimals = {name: column.decimal for column in columns.values() for name in column.names}
-
     def numbers(name: str, use: Any) -> Array:
-        cells = [(rows[k].get(name), f"{places[k]}, '{name}'") for k in use]
-        return np.array([cell_number(cell, place, decimals[name]) for cell, place in cells])
+        cells = ((rows[k].get(name), f"{places[k]}, '{name}'", decimals[name]) for k in use)
+        return np.array([cell_number(*cell) for cell in cells])
 
     where = (str(path), places.__getitem__)
     return to_table(times, dates, numbers, columns, clock, every, missing, where)
@@ -186,8 +192,7 @@ def tabulated(
     moments = times.tolist() if hasattr(times, "tolist") else list(times)
     if not moments:
         raise SampleError(f"{where}: holds no samples.")
-    needed = [name for column in columns.values() for name in column.names]
-    check_columns(where, needed, list(values))
+    check_columns(where, decimal_marks(columns), list(values))
     found, dates = read_times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
     def numbers(name: str, use: Any) -> Array:
@@ -224,7 +229,54 @@ def to_table(
     missing: Iterable[float],
     where: tuple[str, Callable[[int], str]],
 ) -> DataTable:
-    """Return the channels between start and stop; `numbers` gives the chosen rows of a column."""
+    """Return the channels between start and stop.
+
+    Parameters
+    ----------
+    times, dates
+        As `read_times` gives them, shape (rows,).
+    numbers
+        Returns the chosen rows of a column.
+    where
+        Name of the data, and of a row, for messages.
+    """
+    use = _chosen(times, dates, clock, every, where)
+    holes = tuple(float(number) for number in missing)
+    found = {}
+    for name in decimal_marks(columns):
+        column = numbers(name, use)
+        found[name] = np.where(np.isin(column, holes), np.nan, column)
+    # A column of the array for each channel, shape (samples, channels); there may be none.
+    values = np.column_stack(
+        [
+            column.factor * np.mean([found[name] for name in column.names], axis=0) + column.offset
+            for column in columns.values()
+        ]
+        or [np.zeros((len(use), 0))]
+    )
+    remarks = Counter(_noise_remarks(columns, values))
+    kept = np.full(len(use), True)
+    for k, (name, channel) in enumerate(columns.items()):
+        low, high = channel.valid
+        wrong = (values[:, k] < low) | (values[:, k] > high)
+        values[wrong, k] = np.nan
+        lacking = kept & np.isnan(values[:, k]) & channel.needed
+        kept &= ~lacking
+        remarks["invalid", name] += int(wrong.sum())
+        remarks["skipped", name] = int(lacking.sum())
+    if not kept.any():
+        raise DataError(f"{where[0]}: no sample has all channels that it needs.")
+    t, values, origin = times[use][kept], values[kept], None
+    if dates:
+        origin = origin_at(float(t[0]) / clock.second)
+        t = t - t[0]
+    return DataTable(t, values, tuple(columns), origin, +remarks)  # + drops counts of zero
+
+
+def _chosen(
+    times: Array, dates: bool, clock: Clock, every: int, where: tuple[str, Callable[[int], str]]
+) -> IntArray:
+    """Return every n-th of the rows between start and stop, whose times must increase."""
     source, row = where
     low, high = clock.bounds(dates, source)
     use = np.flatnonzero((times >= low) & (times <= high))
@@ -235,36 +287,7 @@ def to_table(
     if len(late):
         last, t = times[use[late[0] : late[0] + 2]]
         raise _disorder(row(int(use[late[0] + 1])), bool(t == last), dates and clock.set_back(t))
-    holes = tuple(float(number) for number in missing)
-    names = dict.fromkeys(name for column in columns.values() for name in column.names)
-    found = {name: numbers(name, use) for name in names}
-    for name, column in found.items():
-        found[name] = np.where(np.isin(column, holes), np.nan, column)
-    values = np.column_stack(
-        [
-            column.factor * np.mean([found[name] for name in column.names], axis=0) + column.offset
-            for column in columns.values()
-        ]
-        or [np.zeros((len(use), 0))]
-    )
-    remarks = _noise_remarks(columns, values)
-    kept = np.full(len(use), True)
-    for k, (name, channel) in enumerate(columns.items()):
-        low, high = channel.valid
-        wrong = (values[:, k] < low) | (values[:, k] > high)
-        values[wrong, k] = np.nan
-        lacking = kept & np.isnan(values[:, k]) & channel.needed
-        kept &= ~lacking
-        remarks["invalid", name] = remarks.get(("invalid", name), 0) + int(wrong.sum())
-        remarks["skipped", name] = int(lacking.sum())
-    if not kept.any():
-        raise DataError(f"{source}: no sample has all channels that it needs.")
-    t, values, origin = times[use][kept], values[kept], None
-    if dates:
-        origin = origin_at(float(t[0]) / clock.second)
-        t = t - t[0]
-    told = {key: number for key, number in remarks.items() if number}
-    return DataTable(t, values, tuple(columns), origin, told)
+    return use
 
 
 def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[str, str], int]:
@@ -311,42 +334,46 @@ class JsonLines:
         self.origin: datetime | None = None
 
     def __iter__(self) -> Iterator[Sample]:
-        clock, kept, last, dates = self._clock, 0, -math.inf, None
-        zero: float | None = None
+        clock, last, zero = self._clock, -math.inf, 0.0
+        needed = [channel for channel, column in self._columns.items() if column.needed]
+        for where, row, t, dates in islice(self._timed_rows(), None, None, self._every):
+            if t <= last:
+                raise _disorder(where, t == last, dates and clock.set_back(t))
+            if dates and math.isinf(last):  # the first sample is t = 0
+                zero = t
+                self.origin = origin_at(t / clock.second)
+            last = t
+            values = self._values(row, where)
+            if not any(math.isnan(values[channel]) for channel in needed):
+                yield Sample(t - zero, values)
+
+    def _values(self, row: Mapping[str, Any], where: str) -> dict[str, float]:
+        """Return the values of the channels in a row, NaN where they are missing or not valid."""
+        values = {}
+        for channel, column in self._columns.items():
+            value = channel_value(column, row, self._missing, where)
+            low, high = column.valid
+            values[channel] = value if low <= value <= high else math.nan
+        without_noise(self._columns, values)
+        return values
+
+    def _timed_rows(self) -> Iterator[tuple[str, dict[str, Any], float, bool]]:
+        """Iterate over the rows between start and stop: name, row, time, and whether it is a date.
+
+        The first row after stop ends the stream, which may have no end of its own.
+        """
+        dates = None
         for number, line in enumerate(self._lines, start=1):
             if not line.strip():
                 continue
             where = f"{STREAM}, line {number}"
             row = _object(line, where)
-            t, dates = row_time(row, clock, where, dates)
-            low, high = clock.bounds(dates, STREAM)
+            t, dates = row_time(row, self._clock, where, dates)
+            low, high = self._clock.bounds(dates, STREAM)
             if t > high:
                 return
-            if t < low:
-                continue
-            kept += 1
-            if (kept - 1) % self._every:
-                continue
-            if t <= last:
-                raise _disorder(where, t == last, dates and clock.set_back(t))
-            last = t
-            if zero is None:
-                zero = t if dates else 0.0
-                if dates:
-                    self.origin = origin_at(t / clock.second)
-            values = {
-                channel: channel_value(column, row, self._missing, where)
-                for channel, column in self._columns.items()
-            }
-            for channel, column in self._columns.items():
-                low, high = column.valid
-                if not low <= values[channel] <= high:
-                    values[channel] = math.nan
-            without_noise(self._columns, values)
-            if not any(
-                math.isnan(values[c]) for c, column in self._columns.items() if column.needed
-            ):
-                yield Sample(t - zero, values)
+            if t >= low:
+                yield where, row, t, dates
 
 
 def row_time(
