@@ -324,6 +324,7 @@ def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
     given = by_name(first.z, ())
     found = {}
     for number, one in enumerate(readings):
+        # Interpolation is linear: its derivative by a reading is that of 1 there and 0 elsewhere.
         unit = [other._replace(value=float(n == number)) for n, other in enumerate(readings)]
         weight = partial(_interpolated, *_level(unit))
         found[one.channel] = (weight, given.get(noise_channel(one.channel), np.nan))

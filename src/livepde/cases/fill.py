@@ -189,6 +189,7 @@ def _table(line: str) -> tuple[str, ...] | None:
 
 def _split(line: str) -> tuple[str, str]:
     """Return a line without its comment, and the comment."""
+    # A # within quotes begins no comment: what stands before it is not TOML by itself.
     for k, letter in enumerate(line):
         if letter == "#" and _parsed(line[:k]) is not None:
             return line[:k].rstrip(), line[k:]

@@ -62,7 +62,7 @@ def check_document(document: Mapping[str, Any], where: str) -> None:
         if depth > DEPTH:
             text = f"more than {DEPTH} tables or lists within one another"
             raise CaseError(f"{where}: {key[:LONGEST]}: {text}.")
-        if any(len(part) > LONGEST for part in key.split(".")):
+        if max(map(len, key.split("."))) > LONGEST:
             raise CaseError(f"{where}: {key[:LONGEST]}...: a name has at most {LONGEST} letters.")
         if key.startswith(FREE) or isinstance(value, bool):
             continue

@@ -180,17 +180,11 @@ class Wiring:
         """
         LOG.info("waits for the first sample")
         why = told = "no sample came"
-        heard, silence = time.monotonic(), self._limits[-1]
+        heard = time.monotonic()
         while not (stopping.is_set() or self._feed.done):
             found = list(self._feed.poll(LOOK))
-            if self._feed.heard():
-                heard, self.silent, self.why = time.monotonic(), False, ""
-            elif not self.silent and time.monotonic() - heard > silence:
-                self.silent = True
-                self.why = f"nothing has come from the source for more than {silence:g} s"
-                LOG.warning("silent: %s", self.why)
-            remarks = self._feed.remarks(found)
-            new = [one for one in remarks if (one.kind, one.channel) not in irregular]
+            heard = self._listened(heard)
+            remarks, known = self._feed.remarks(found), set(irregular)
             for remark in remarks:
                 gather(irregular, remark)
             while found:
@@ -204,31 +198,47 @@ class Wiring:
                     told = why
                     LOG.warning("cannot begin yet: %s", why)
                 self._feed.acknowledge(found.pop(0))
-            for remark in new:
-                LOG.warning("%s: %s", remark.kind, remark.message)
+            # The remarks of the poll in which the run begins are left to the run.
+            for remark in remarks:
+                if (remark.kind, remark.channel) not in known:
+                    LOG.warning("%s: %s", remark.kind, remark.message)
         if stopping.is_set():
             return None
         first = next(iter(irregular.values()), None)
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
         raise DataError(f"{self.case.frame.path}: {why}{wrong}.")
 
+    def _listened(self, heard: float) -> float:
+        """Note whether the source is silent, and return when something came from it last."""
+        silence = self._limits[-1]
+        if self._feed.heard():
+            self.silent, self.why = False, ""
+            return time.monotonic()
+        if not self.silent and time.monotonic() - heard > silence:
+            self.silent = True
+            self.why = f"nothing has come from the source for more than {silence:g} s"
+            LOG.warning("silent: %s", self.why)
+        return heard
+
     def _fed(self, data: Data) -> Feed:
-        case, journal, spec = self.case, self._journal, self.case.frame.spec.data
-        last = -math.inf if journal is None else journal.last
-        named = data if isinstance(data, str) else None
-        own = spec.file if data is None else named
-        joined, file = isinstance(own, tuple), own if isinstance(own, str) else ""
-        reader = data is None and case.frame.reader is not None
-        if spec.every > 1 and not (file or reader or joined):
-            text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
-            raise case.frame.error("data.every", text)
-        whole = joined or spec.every > 1 or spec.skip or len(spec.times) > 1
-        if reader or file.endswith(".parquet") or whole:
+        case, named = self.case, data if isinstance(data, str) else None
+        if self._reads_all(data, named):
             table = read_data(case.frame, case.columns, case.clock, named)
             self._origin = table.origin
+            last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
         self._intake, position = self._new_intake()
         return Gathered(source_of(case.frame, data, position), self._intake)
+
+    def _reads_all(self, data: Data, named: str | None) -> bool:
+        """Return whether all rows are read at once, not followed one by one."""
+        frame, spec = self.case.frame, self.case.frame.spec.data
+        file, reader = (spec.file, frame.reader) if data is None else (named, None)
+        if spec.every > 1 and not (file or reader):
+            text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
+            raise frame.error("data.every", text)
+        whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
+        return whole or spec.every > 1 or spec.skip > 0 or len(spec.times) > 1
 
     def _new_intake(self) -> tuple[Intake, str]:
         """Return an intake of rows that follow those of the journal, and the source's position."""

@@ -53,6 +53,7 @@ DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no 
 SHOWN = 60  # characters of a line that is shown
 LONGEST_SHOWN = 200  # characters of a value that is shown
 
+# Type of pydantic's error -> what the message expects.
 EXPECTED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
@@ -69,6 +70,7 @@ EXPECTED = {
     "too_short": "at least one entry",
     "string_too_short": "a name",
 }
+# Keys of a table, * for any name -> its model.
 TABLES: dict[str, type[BaseModel]] = {
     "mesh": MeshSpec,
     "data": DataSpec,

@@ -77,21 +77,18 @@ class MeshSpec(Spec):
 
     @model_validator(mode="after")
     def _one_kind(self) -> MeshSpec:
+        # Keys that the file states, without defaults.
         given = self.model_fields_set - {"spacing", "unit"}
-        pair = isinstance(self.spacing, tuple)
         if given in ({"nodes"}, {"file"}, {"x", "y"}):
             if "spacing" in self.model_fields_set:
                 raise ValueError("spacing belongs to an interval with cells")
         elif given == {"start", "stop", "cells"}:
             if not isinstance(self.cells, int):
                 raise ValueError("cells: expected one number for an interval")
-            if pair:
+            if isinstance(self.spacing, tuple):
                 raise ValueError("spacing: expected one word for an interval")
         elif given == {"x", "y", "cells"}:
-            if isinstance(self.cells, int) or (self.spacing != "uniform" and not pair):
-                raise ValueError("expected cells = [nx, ny], spacing = [of x, of y] of a rectangle")
-            if any(side is None or len(side) != 2 for side in (self.x, self.y)):
-                raise ValueError("x and y: expected [from, to] each; or nodes, and no cells")
+            self._check_rectangle()
         else:
             raise ValueError(
                 "expected from and to (an interval) or x and y (a rectangle), with cells; or nodes "
@@ -100,6 +97,13 @@ class MeshSpec(Spec):
         if self.unit is not None and self.file is None:
             raise ValueError("unit belongs to a file")
         return self
+
+    def _check_rectangle(self) -> None:
+        pair = isinstance(self.spacing, tuple)
+        if isinstance(self.cells, int) or (self.spacing != "uniform" and not pair):
+            raise ValueError("expected cells = [nx, ny], spacing = [of x, of y] of a rectangle")
+        if any(side is None or len(side) != 2 for side in (self.x, self.y)):
+            raise ValueError("x and y: expected [from, to] each; or nodes, and no cells")
 
 
 class BrokerSpec(Spec):
@@ -191,6 +195,10 @@ class DataSpec(Spec):
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
         if len(sources) > 1:
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
+        return self
+
+    @model_validator(mode="after")
+    def _source_that_goes_on(self) -> DataSpec:
         if self.follow and not isinstance(self.file, str):
             raise ValueError("follow belongs to one file that grows; several are not followed")
         if self.live and (self.skip or not isinstance(self.time, str)):
@@ -369,8 +377,8 @@ class ChannelSpec(Spec):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
         if self.positions is not None and (self.columns or "{}" not in (self.column or "{}")):
             raise ValueError('positions takes column = a name with {} for that of a row, as "T_{}"')
-        given = (self.at, self.each, self.positions)
-        if self.at_std is not None and not any(place is not None for place in given):
+        places = (self.at, self.each, self.positions)
+        if self.at_std is not None and places == (None, None, None):
             raise ValueError("at_std belongs to at = position")
         return self
 

@@ -154,5 +154,5 @@ def _value(value: Any) -> str:
             items = (toml_line(key, item) for key, item in value.items())
             return "{ " + ", ".join(items) + " }" if value else "{}"
         case list():
-            return "[" + ", ".join(_value(item) for item in value) + "]"
+            return "[" + ", ".join(map(_value, value)) + "]"
     return str(value)

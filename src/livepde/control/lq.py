@@ -86,6 +86,7 @@ class LQ:
 
     def gain(self, step: Discrete) -> Array:
         """Return the Riccati feedback gain from (x, previous v) to minus the change of v."""
+        # State (x, v before) and input dv: v = v before + dv acts during the period.
         controls, _, rows, weights = self._parts()
         r, count = len(step.A), len(controls)
         B = step.B[:, controls]
@@ -106,6 +107,8 @@ class LQ:
         controls, others, rows, weights = self._parts()
         model, low, high = self.model, *self.goal.range(self.model)
         r = len(step.A)
+        # Steady states x = A x + B v + B_d d + f: a particular one, and the null space along which
+        # the tracked outputs are fitted.
         steady = np.hstack([np.eye(r) - step.A, -step.B[:, controls]])
         one = np.linalg.lstsq(steady, step.B[:, others] @ disturbances + step.f, rcond=None)[0]
         along = null_space(steady)

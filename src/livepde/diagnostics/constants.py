@@ -318,6 +318,7 @@ def constants(
         "hidden_V_VX": hidden.embedding_V_VX(),
         "hidden_VX_X": hidden.embedding_VX_X(),
     }
+    # ||v||_X <= (embedding) ||v||_V: (AbdV) and (AbdVV) follow from the bound in X.
     reach = max(
         1.0,
         embedded["observed_V_VX"] * embedded["observed_VX_X"],
@@ -339,6 +340,7 @@ def constants(
 
 def _norm_of_A(model: Model, u: Array, moment: Moment) -> tuple[float, Array]:
     """Return ||A(u)||_{Q -> X} and the q at which it is attained."""
+    # ||A||^2 is the largest eigenvalue of A* A in the inner product of Q.
     A, Q = model.A(u, moment), model.Q
     free = np.flatnonzero(Q.free)
 
@@ -372,6 +374,7 @@ def _trilinear(model: Model, u: Array, moment: Moment) -> tuple[float, bool]:
 
     mass = sp.csr_array(model.mass[free][:, free])
     if len(free_q) * n**2 <= LARGEST_TRACE:
+        # With G_Q = L L^T the columns of L^{-T} are an orthonormal basis of Q.
         gram = model.Q.tangent_gram[free_q][:, free_q].toarray()
         basis = np.linalg.inv(np.linalg.cholesky(gram)).T
         total = np.zeros((len(free), len(free)))

@@ -97,6 +97,7 @@ class Border:
     @cached_property
     def _system(self) -> tuple[IntArray, IntArray, Map]:
         """Coefficients of the part and of its tests, and the solver of `continued`."""
+        # Saddle point system: least H^1 norm with given products with all tests.
         own, inner = np.flatnonzero(self.space.free), np.flatnonzero(self.tests.free)
         smoothness = self.smoothness[own][:, own]
         tested = self.space.gram[inner][:, own]
@@ -263,6 +264,7 @@ class Part:
         """Inverse of `gram_V`."""
         if self._V is not None:
             return HilbertSpace(self._on_basis(self._V)).riesz
+        # On the basis gram_V is M S^{-1} M with the Schur complement S of X.
         own = HilbertSpace(self.operator)
         return lambda x: own.riesz(self.schur(own.riesz(x)))
 

@@ -216,17 +216,7 @@ class OnlineTracker:
         observed, part = self.identifier.observed, self.spaces.observed_part
         given = self.noise(z) if callable(self.noise) else self.noise
         std = np.broadcast_to(np.asarray(given, dtype=float), (observed.size,))
-        # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
-        # every sample, and each matrix is dense.
-        key = round(float(np.log2(alpha))) if alpha > 0 else 0
-        if key not in self._matrices:
-            if len(self._matrices) >= MATRICES:
-                self._matrices.clear()
-                self._sizes.clear()
-            self._matrices[key] = (
-                reconstruction_matrix(observed, alpha) if alpha > 0 else observed.split().inverse
-            )
-        matrix = self._matrices[key]
+        key, matrix = self._matrix(alpha)
         noise = None if callable(self.noise) else self._sizes.get(key)
         if noise is None:
             noise = self._sizes[key] = noise_size(self.spaces, std, matrix)
@@ -234,6 +224,21 @@ class OnlineTracker:
             return noise
         lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
         return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
+
+    def _matrix(self, alpha: float) -> tuple[int, Array]:
+        """Return the matrix of G_alpha, and the key under which it is kept."""
+        # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
+        # every sample, and each matrix is dense.
+        key = round(float(np.log2(alpha))) if alpha > 0 else 0
+        if key not in self._matrices:
+            if len(self._matrices) >= MATRICES:
+                self._matrices.clear()
+                self._sizes.clear()
+            observed = self.identifier.observed
+            self._matrices[key] = (
+                reconstruction_matrix(observed, alpha) if alpha > 0 else observed.split().inverse
+            )
+        return key, self._matrices[key]
 
     @property
     def moment(self) -> Moment:

@@ -428,13 +428,7 @@ class Form(FormMatrices):
         place = term.measure.place(moment)
         if self.nonlinear not in (rows, cols):
             given = None
-        curved = [axis for axis, key in enumerate((rows, cols)) if key in self._curved]
-        if given is not None:  # the user's derivative takes the place of one complex step
-            curved = [axis for axis in curved if (rows, cols)[axis] != self.nonlinear]
-        if len(curved) == 2 and rows != cols == self.nonlinear and self.affine:
-            curved.reverse()
-        stepped = curved[-1] if curved else None
-        shifted = curved[0] if len(curved) == 2 else None
+        stepped, shifted = self._differenced(rows, cols, given)
 
         def evaluate(shift: float) -> Array:
             jets: list[Any] = []
@@ -471,6 +465,20 @@ class Form(FormMatrices):
         difference = (8.0 * near - far) / (12.0 * SHIFT)
         scaled: Array = difference / np.swapaxes(self._scale(key, local, here)[:, 0], 0, shifted)
         return scaled
+
+    def _differenced(
+        self, rows: str, cols: str, given: Integrand | None
+    ) -> tuple[int | None, int | None]:
+        """Return the axis of the complex step and that of the central difference, 0: rows."""
+        # The user's derivative takes the place of the complex step in the nonlinear argument.
+        curved = [
+            axis
+            for axis, key in enumerate((rows, cols))
+            if key in self._curved and (given is None or key != self.nonlinear)
+        ]
+        if len(curved) == 2 and rows != cols == self.nonlinear and self.affine:
+            curved.reverse()
+        return (curved[-1] if curved else None), (curved[0] if len(curved) == 2 else None)
 
     def _scale(self, key: str, local: LocalSpace, values: Array) -> Array:
         """Return the step scale of each component at each point: (components, 1, 1, E, P).

@@ -157,6 +157,8 @@ def _border(s: float, M: Any, K: Any) -> Any:
         return M if s == 0 else K
     if s == 2:
         return sp.block_array([[None, K], [K, -M]])
+    # With one auxiliary field for each pole the Schur complement E - sum F H^{-1} F is
+    # lambda^s = lambda^{s - sigma} (c + sum w lambda/(lambda + b)).
     largest = _largest(M, K)
     c, weights, poles = _balakrishnan(s % 1, largest)
     shifted = [(K + b * M) / w for w, b in zip(weights, poles, strict=True)]

@@ -174,6 +174,7 @@ class LocalSpace:
             start = stop
         if self.space.single:
             return jets[0]
+        # Regions with priors of their own, as k[soil], add up to q.k: each is zero elsewhere.
         found: dict[str, Any] = {}
         for name, jet in zip(map(base_name, self.space.blocks), jets, strict=True):
             found[name] = found[name] + jet if name in found else jet
@@ -373,13 +374,7 @@ class FunctionSpace:
         With several fields, a number is the value of all of them.
         """
         if isinstance(value, Mapping):
-            unknown = set(value) - set(self.parts)
-            if unknown:
-                raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
-            result = self.prior.copy()
-            for name, item in value.items():
-                result[self.part(name)] = self._interpolate(name, item)
-            return result
+            return self._interpolate_by_name(value)
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
         if len(self.fields) == len(self.blocks) and np.ndim(value) == 0 and not callable(value):
@@ -392,6 +387,15 @@ class FunctionSpace:
         if array.shape != (self.dim,):
             raise SpaceError(f"coefficients of shape {array.shape}; expected ({self.dim},).")
         return array.copy()
+
+    def _interpolate_by_name(self, values: Mapping[str, Any]) -> Array:
+        """Return the coefficients of the values given, those of the prior for all others."""
+        if unknown := set(values) - set(self.parts):
+            raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
+        result = self.prior.copy()
+        for name, item in values.items():
+            result[self.part(name)] = self._interpolate(name, item)
+        return result
 
     def _interpolate(self, name: str, value: Any) -> Array:
         block, part = self.blocks.get(name), self.part(name)

@@ -113,6 +113,7 @@ class FleetRecords:
         """Return `Record.numbers` of all members, shape (members, numbers)."""
         space, columns = self.model.parameter_space, []
         after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
+        # Share of the prior standard deviation that remains; NaN where the prior had none.
         shares = after / np.where(before > 0.0, before, np.nan)
         for label, k in space.labels.items():
             value, std = beliefs.q[:, k], after[:, k]
@@ -128,6 +129,7 @@ class FleetRecords:
         for name, block in self.model.state_space.fields.items():
             part, names = self.model.state_space.part(name), block.variables(name)
             columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
+            # Variances at the vertices: sums of squares of the rows of the factor there.
             squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
             deviations = np.sqrt(squares)
             for end, values in {"": block.at_vertices @ u[:, part].T, "_std": deviations}.items():

@@ -99,7 +99,7 @@ class JoinedStates:
 
     def _put_leaf(self, which: IntArray, path: str, new: Array) -> None:
         leaf = self._leaves[path]
-        if path in self._once:
+        if path in self._once:  # stored once as long as no member differs
             if leaf.shape[1:] == new.shape[1:] and np.array_equal(
                 np.broadcast_to(leaf, new.shape), new, equal_nan=leaf.dtype.kind == "f"
             ):

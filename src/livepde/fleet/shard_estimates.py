@@ -126,6 +126,7 @@ class ShardEstimates:
             columns |= {"q": list(self.q), "q_std": list(self.q_std)}
         for k, name in enumerate(self.sensors):
             columns[f"innovation {name}"] = self.innovation[:, k]
+        # Without rows Arrow cannot tell the type of a list.
         texts = dict.fromkeys(("member", "status", "message"), pa.string())
         return pa.table(
             {name: pa.array(values, texts.get(name)) for name, values in columns.items()}

@@ -266,6 +266,7 @@ class Observed:
         matrix = np.zeros((self.size, self.parameter.dim))
         zero = np.zeros(self.parameter.dim)
         place = Place(np.zeros((0,)), None, moment)
+        # Functions that are linear in q: their values at unit vectors are the columns.
         for name, direct in self.observation.directs.items():
             row = self.names.index(name)
             offset = float(direct(numbers(self.parameter, zero), place))

@@ -352,6 +352,7 @@ class Spectral(Reconstructor):
         fit = seen.T @ seen
         cost = basis.T @ (penalty @ basis)
         cost = (cost + cost.T) / 2
+        # Unit of alpha: at alpha = rho fit and penalty have the same trace.
         self.rho = float(np.trace(fit) / (np.trace(cost) or 1.0))
         s, phi = sl.eigh(fit, fit + self.rho * cost)
         # s is a divisor below, and rounding may make it zero or negative.
@@ -382,6 +383,7 @@ class Spectral(Reconstructor):
             return float(np.sqrt(rest + part @ (part / self.s)))
 
         delta, alpha = self._alpha(misfit, delta, known)
+        # v = boundary + sum c phi: each c minimises s c^2 - 2 beta c + alpha (k c^2 + 2 shift c).
         u = self.phi @ ((beta - alpha * shift) / (self.s + alpha * self.k))
         return Reconstructed(u, alpha, misfit(alpha), delta)
 

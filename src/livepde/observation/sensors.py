@@ -56,10 +56,9 @@ class Points(Observation):
         given = self.position_std
         if given is None:
             return
-        if isinstance(given, Mapping):
-            for name in given:
-                if name not in self.names(len(self.points)):
-                    raise ObservationError(f"Points: position_std: no sensor is called '{name}'.")
+        for name in self.uncertain:
+            if name not in self.names(len(self.points)):
+                raise ObservationError(f"Points: position_std: no sensor is called '{name}'.")
         levels = set(given.values()) if isinstance(given, Mapping) else {given}
         if len(levels) != 1 or not all(np.isfinite(std) and std > 0.0 for std in levels):
             raise ObservationError(

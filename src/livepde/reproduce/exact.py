@@ -126,6 +126,7 @@ class ReferenceSamples:
             "zero": {"dirichlet": {"boundary": 0.0}},
             "clamped": {"dirichlet": {"boundary": 0.0}, "clamped": True},
         }
+        # A Gauss rule of so many points is exact to this order: both integrate with the same rule.
         exact = 2 * setting.points - 1
         q: Field | Normal = Normal()
         if setting.parameter != "constant":
