@@ -187,10 +187,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         triangles = Triangulation(x, y)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
-        triangles,
-        data[name].values[-1],
-        shading="gouraud",
-        cmap="cividis" if spread else "viridis",
+        triangles, data[name].values[-1], shading="gouraud", cmap="cividis" if spread else "viridis"
     )
     for kind, sensors in sensor_places(data).items():
         inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")

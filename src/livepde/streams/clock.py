@@ -90,11 +90,13 @@ class Clock:
         if self.stop is not None:
             high = self._bound(self.stop, dates, f"{where}: stop")
             if dates and (next_day := _day_after(self.stop)) is not None:
+                # A day as stop includes its hours: up to the last number before the next day.
                 high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
         return low, high
 
     def set_back(self, t: float) -> bool:
         """Return whether the clocks of the zone show a time, given since 1970, twice."""
+        # A time that is shown twice has another offset at its second pass (fold = 1).
         here = datetime.fromtimestamp(t / self.second, self.zone)
         return here.replace(fold=0).utcoffset() != here.replace(fold=1).utcoffset()
 

@@ -256,6 +256,7 @@ def to_table(
     )
     remarks = Counter(_noise_remarks(columns, values))
     kept = np.full(len(use), True)
+    # A value that is not valid is missing; a sample is left out for its first missing channel only.
     for k, (name, channel) in enumerate(columns.items()):
         low, high = channel.valid
         wrong = (values[:, k] < low) | (values[:, k] > high)
@@ -296,6 +297,7 @@ def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[s
     for name, column in columns.items():
         if not column.noise_of:
             continue
+        # Views: what is set to NaN here is missing in `values`.
         noise, reading = values[:, places[name]], values[:, places[column.noise_of]]
         wrong = noise <= 0.0
         remarks["invalid", column.noise_of] = int((wrong & np.isfinite(reading)).sum())
