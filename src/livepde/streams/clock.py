@@ -96,9 +96,7 @@ class Clock:
 
     def set_back(self, t: float) -> bool:
         """Return whether the clocks of the zone show a time, given since 1970, twice."""
-        # A time that is shown twice has another offset at its second pass (fold = 1).
-        here = datetime.fromtimestamp(t / self.second, self.zone)
-        return here.replace(fold=0).utcoffset() != here.replace(fold=1).utcoffset()
+        return self.repeated_hour(t) != 0.0
 
     def repeated_hour(self, t: float) -> float:
         """Return how much later the clocks show a time again, given since 1970, or 0."""
@@ -106,6 +104,7 @@ class Clock:
             here = datetime.fromtimestamp(t / self.second, self.zone)
         except (ValueError, OverflowError, OSError):
             return 0.0
+        # A time that is shown twice has another offset at its second pass (fold = 1).
         first, again = here.replace(fold=0).utcoffset(), here.replace(fold=1).utcoffset()
         if first is None or again is None:
             return 0.0
@@ -114,9 +113,7 @@ class Clock:
     def stamp(self, value: Any, form: str = "") -> float | None:
         """Return seconds since 1970 of a date or a date as text, None if it is neither."""
         try:
-            if isinstance(value, str):
-                text = value.strip()
-                value = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+            value = _parsed(value, form)
             if isinstance(value, date) and not isinstance(value, datetime):
                 value = datetime(value.year, value.month, value.day)
             if not isinstance(value, datetime):
@@ -168,16 +165,18 @@ def read_times(
 def is_naive(cell: Any, clock: Clock) -> bool:
     """Return whether a cell is a date without a zone of its own."""
     try:
-        if isinstance(cell, str):
-            text = cell.strip()
-            cell = (
-                datetime.strptime(text, clock.format)
-                if clock.format
-                else datetime.fromisoformat(text)
-            )
+        cell = _parsed(cell, clock.format)
     except ValueError:
         return False
     return isinstance(cell, datetime) and cell.tzinfo is None
+
+
+def _parsed(cell: Any, form: str) -> Any:
+    """Return the date that a text holds, and anything else as it is."""
+    if not isinstance(cell, str):
+        return cell
+    text = cell.strip()
+    return datetime.strptime(text, form) if form else datetime.fromisoformat(text)
 
 
 def number_of(cell: Any, decimal: str = ".") -> float | None:

@@ -231,14 +231,7 @@ def to_table(
 ) -> DataTable:
     """Return the channels between start and stop.
 
-    Parameters
-    ----------
-    times, dates
-        As `read_times` gives them, shape (rows,).
-    numbers
-        Returns the chosen rows of a column.
-    where
-        Name of the data, and of a row, for messages.
+    `numbers` gives the chosen rows of a column; `where` names the data and a row, for messages.
     """
     use = _chosen(times, dates, clock, every, where)
     holes = tuple(float(number) for number in missing)
