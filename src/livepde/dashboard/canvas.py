@@ -25,6 +25,7 @@ __all__ = [
     "MARKS",
     "band",
     "empty",
+    "line",
     "over_time",
     "show",
     "text",
@@ -95,29 +96,27 @@ def over_time(data: xr.Dataset, ylabel: str, at: float | None) -> tuple[go.Figur
 
 
 def _upright(figure: go.Figure, t: Any, name: str, colour: str, dash: str, *, legend: bool) -> None:
-    line = {"color": colour, "width": 1.2, "dash": dash}
-    figure.add_scatter(
-        x=t,
-        y=[0.0, 1.0],
-        yaxis="y2",
-        mode="lines",
-        line=line,
-        name=name,
-        legendgroup=name,
-        showlegend=legend,
-        hoverinfo="skip",
-    )
+    about = {"name": name, "legendgroup": name, "showlegend": legend, "hoverinfo": "skip"}
+    line(figure, t, [0.0, 1.0], colour, 1.2, dash, yaxis="y2", **about)
     figure.update_layout(yaxis2=MARKS)
 
 
-def band(
+def line(
     figure: go.Figure,
     x: Any,
-    low: Array,
-    high: Array,
+    y: Any,
     colour: str,
-    name: str,
-    opacity: float = 0.2,
+    width: float,
+    dash: str | None = None,
+    **more: Any,
+) -> None:
+    """Draw a line; `more` goes to Plotly's scatter."""
+    style = {"color": colour, "width": width, "dash": dash}
+    figure.add_scatter(x=x, y=y, line=style, **{"mode": "lines", **more})
+
+
+def band(
+    figure: go.Figure, x: Any, low: Array, high: Array, colour: str, name: str, opacity: float = 0.2
 ) -> None:
     """Fill the area between two lines."""
     shared: dict[str, Any] = {

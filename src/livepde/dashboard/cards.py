@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from dash import html
 
+from livepde.dashboard.canvas import unit_label
 from livepde.dashboard.times import at_time, when_axis
 from livepde.dashboard.view import RunView
 from livepde.plots.dataset import (
@@ -223,7 +224,6 @@ def cards(data: xr.Dataset | None, at: float | None) -> list[Any]:
 
 def _card(data: xr.Dataset, label: str, k: int) -> Any:
     value, std = float(data[label].values[k]), float(data[f"{label}_std"].values[k])
-    unit = labelled("", str(data[label].attrs.get("units", ""))).strip(" []")
     lines: list[Any] = []
     if math.isfinite(std) and std > 0.0:
         low, high = (digits(float(end[k]), std)[0] for end in interval_95(data, label))
@@ -236,14 +236,14 @@ def _card(data: xr.Dataset, label: str, k: int) -> Any:
     left = prior_left(data, label, k)
     if math.isfinite(left):
         lines.append(_known(data, label, value, left))
-    number = pretty(digits(value, std)[0])
+    return _article(data, label, pretty(digits(value, std)[0]), "value", lines)
+
+
+def _article(data: xr.Dataset, name: str, value: str, kind: str, lines: list[Any]) -> Any:
+    """Return the card of an unknown: name, value with its unit, and lines below."""
+    unit = html.Span(f" {unit_label(data, name)}", className="unit")
     return html.Article(
-        [
-            html.H3(label),
-            html.P([number, html.Span(f" {unit}", className="unit")], className="value"),
-            *lines,
-        ],
-        className="card",
+        [html.H3(name), html.P([value, unit], className=kind), *lines], className="card"
     )
 
 
@@ -258,7 +258,6 @@ def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
 def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
     k = at_time(data, "snapshot", at)
     values = data[name].values[k]
-    unit = labelled("", str(data[name].attrs.get("units", ""))).strip(" []")
     low, mean, high = (
         pretty(f"{number:.3g}") for number in (values.min(), values.mean(), values.max())
     )
@@ -271,17 +270,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
         level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
         text = f"{some:.1f} of {count} modes told by the data"
         lines.append(html.P([sign(level), text], className="known"))
-    return html.Article(
-        [
-            html.H3(name),
-            html.P(
-                [f"{low} to {high}", html.Span(f" {unit}", className="unit")],
-                className="value range",
-            ),
-            *lines,
-        ],
-        className="card",
-    )
+    return _article(data, name, f"{low} to {high}", "value range", lines)
 
 
 # --- tables --------------------------------------------------------------------------------------

@@ -21,6 +21,7 @@ __all__ = ["Map", "Surface", "boundary", "plane_map", "slices"]
 
 MOST_LINES = 120  # of a map in each direction
 OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
+# A hexahedron as six tetrahedra around its diagonal from corner 0 to corner 6.
 TETRAHEDRA = ((0, 1, 2, 6), (0, 2, 3, 6), (0, 3, 7, 6), (0, 7, 4, 6), (0, 4, 5, 6), (0, 5, 1, 6))
 FACES = {
     "tetra": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)),
@@ -138,6 +139,7 @@ def _solid(data: xr.Dataset) -> _Mesh:
 def _lines(values: Array) -> Array:
     """Return the lines of a grid: through vertices, and between them while there are few."""
     lines = np.unique(values.round(12))
+    # Every other line while there are too many, but always the last; then halve the distances.
     while len(lines) > MOST_LINES:
         lines = np.unique(np.append(lines[::2], lines[-1]))
     while 2 * len(lines) - 1 <= MOST_LINES:
@@ -166,6 +168,7 @@ def _plane_map(mesh: _Mesh) -> Map:
         i, j = np.meshgrid(
             np.arange(columns[0][k], columns[1][k]), np.arange(rows[0][k], rows[1][k])
         )
+        # Barycentric coordinates of the grid points in the box of a triangle, by Cramer's rule.
         to_b, to_c = b - a, c - a
         area = to_b[0] * to_c[1] - to_b[1] * to_c[0]
         if not i.size or not area:
@@ -214,6 +217,7 @@ def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
     above = (height >= 0.0)[cells]
     order = np.argsort(~above, axis=1, kind="stable")  # corners above the plane come first
     cells, count = np.take_along_axis(cells, order, axis=1), above.sum(axis=1)
+    # The plane cuts off one corner or three (a triangle), or two (a quadrilateral: two triangles).
     edges = []  # of three edges that are cut each makes a triangle
     for number, triangles in (
         (1, (((0, 1), (0, 2), (0, 3)),)),
@@ -225,6 +229,7 @@ def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
     every = np.concatenate(edges).reshape(-1, 2)
     ends, triangles_of = np.unique(np.sort(every, axis=1), axis=0, return_inverse=True)
     first, second = height[ends[:, 0]], height[ends[:, 1]]
+    # The height is linear along an edge, and zero where the plane cuts it.
     share = first / (first - second)  # one is above the plane, the other one below it
     rows = np.arange(len(ends))
     weights = sp.csr_array(

@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 import xarray as xr
 
 from livepde.dashboard import cuts
-from livepde.dashboard.canvas import GRID, band, empty, show, text, unit_label, unit_of
+from livepde.dashboard.canvas import GRID, band, empty, line, show, text, unit_label, unit_of
 from livepde.dashboard.times import at_time
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
@@ -44,27 +44,14 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
     x, values = data["x"].values, data[name].values
     reach = [values]
     if k > 0:
-        figure.add_scatter(
-            x=x,
-            y=values[0],
-            mode="lines",
-            line={"color": GREY, "width": 1.2, "dash": "dot"},
-            name="start",
-            hovertemplate="%{y:.4g}",
-        )
+        line(figure, x, values[0], GREY, 1.2, "dot", name="start", hovertemplate="%{y:.4g}")
     if f"{name}_std" in data:
         low, high = interval_95(data, name)
+        # The wide band of the prior would determine the scale and hide all later values.
         late = slice(len(values) // 10, None)
         reach += [low[late], high[late]]
         band(figure, x, low[k], high[k], PALETTE[0], name)
-    figure.add_scatter(
-        x=x,
-        y=values[k],
-        mode="lines",
-        line={"color": PALETTE[0], "width": 2.2},
-        name="estimate",
-        hovertemplate="%{y:.4g}",
-    )
+    line(figure, x, values[k], PALETTE[0], 2.2, name="estimate", hovertemplate="%{y:.4g}")
     show(figure, reach)
     figure.update_layout(showlegend=k > 0)
     return figure

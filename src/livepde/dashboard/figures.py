@@ -9,7 +9,7 @@ import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard.canvas import MARKS, band, empty, over_time, show, text, unit_label
+from livepde.dashboard.canvas import MARKS, band, empty, line, over_time, show, text, unit_label
 from livepde.dashboard.times import TimeAxis, at_time
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
@@ -87,16 +87,9 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
         reference = data[label].attrs.get("reference")
         if reference is not None:
             reach.append(np.array([float(reference)]))
-            figure.add_scatter(
-                x=t[[0, -1]],
-                y=[float(reference)] * 2,
-                mode="lines",
-                line={"color": colour, "width": 1.2, "dash": "dash"},
-                name="reference",
-                legendgroup=label,
-                showlegend=k == 0,
-                hovertemplate="%{y:.4g}",
-            )
+            about = {"legendgroup": label, "showlegend": k == 0, "hovertemplate": "%{y:.4g}"}
+            ends = [float(reference)] * 2
+            line(figure, t[[0, -1]], ends, colour, 1.2, "dash", name="reference", **about)
     show(figure, reach)
     _mark_failures(figure, data, axis)
     return figure
@@ -140,15 +133,9 @@ def residuals(
     mode = "lines" if len(t) > 60 else "lines+markers"
     if len(names) <= MOST_LINES:
         for k, name in enumerate(names):
-            figure.add_scatter(
-                x=t,
-                y=errors[:, k],
-                mode=mode,
-                line={"color": PALETTE[k % len(PALETTE)], "width": 1.3},
-                marker={"size": 5},
-                name=text(name),
-                hovertemplate="%{y:+.3g}",
-            )
+            about = {"name": text(name), "mode": mode, "hovertemplate": "%{y:+.3g}"}
+            colour = PALETTE[k % len(PALETTE)]
+            line(figure, t, errors[:, k], colour, 1.3, marker={"size": 5}, **about)
         figure.update_layout(showlegend=True)
         return figure
     some = np.isfinite(errors).any(axis=1)
@@ -156,15 +143,9 @@ def residuals(
     if len(t):
         low, high = np.nanmin(errors, axis=1), np.nanmax(errors, axis=1)
         band(figure, t, low, high, PALETTE[0], "range")
-        figure.add_scatter(
-            x=t,
-            y=np.sqrt(np.nanmean(errors**2, axis=1)),
-            mode=mode,
-            line={"color": PALETTE[0], "width": 1.8},
-            name="root mean square",
-            showlegend=True,
-            hovertemplate="%{y:.3g}",
-        )
+        root = np.sqrt(np.nanmean(errors**2, axis=1))
+        about = {"name": "root mean square", "mode": mode, "hovertemplate": "%{y:.3g}"}
+        line(figure, t, root, PALETTE[0], 1.8, showlegend=True, **about)
     return figure
 
 
@@ -173,23 +154,10 @@ def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
     data = _bounded(data)
     figure, axis = over_time(data, "", at)
     t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
-    figure.add_scatter(
-        x=t,
-        y=values,
-        mode="lines",
-        line={"color": PALETTE[0], "width": 2},
-        name="misses to expected",
-        hovertemplate="%{y:.3g}",
-    )
+    about = {"name": "misses to expected", "hovertemplate": "%{y:.3g}"}
+    line(figure, t, values, PALETTE[0], 2, **about)
     for level, name, colour in ((1.0, "as expected", GREY), (4.0, "too large", PALETTE[1])):
-        figure.add_scatter(
-            x=t[[0, -1]],
-            y=[level, level],
-            mode="lines",
-            line={"color": colour, "width": 1.2, "dash": "dash"},
-            name=name,
-            hoverinfo="skip",
-        )
+        line(figure, t[[0, -1]], [level] * 2, colour, 1.2, "dash", name=name, hoverinfo="skip")
     figure.update_yaxes(rangemode="tozero")
     return figure
 

@@ -244,6 +244,7 @@ def _draw(app: dash.Dash, view: View) -> None:
         data = view.look().dataset
         shown = [] if data is None else panels(data, at, cut)
         names = [item["panel"] for item in there]
+        # With the same panels only figures and captions are sent: frames and focus stay.
         if names == [panel.name for panel in shown]:
             same = (no_update,) * (2 * len(SECTIONS) + 1)
             return (*same, [panel.figure for panel in shown], [panel.about for panel in shown])

@@ -13,14 +13,7 @@ import plotly.graph_objects as go
 import xarray as xr
 
 from livepde.dashboard.field_views import drawn_by, field_profile
-from livepde.dashboard.figures import (
-    correlation,
-    open_shares,
-    ratio,
-    residuals,
-    told,
-    unknowns,
-)
+from livepde.dashboard.figures import correlation, open_shares, ratio, residuals, told, unknowns
 from livepde.dashboard.times import at_time, when_axis
 from livepde.plots.dataset import MOST_LINES, groups, note
 

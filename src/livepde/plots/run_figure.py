@@ -187,10 +187,7 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
         triangles = Triangulation(x, y)
     spread = name.endswith("_std")
     drawn = ax.tripcolor(
-        triangles,
-        data[name].values[-1],
-        shading="gouraud",
-        cmap="cividis" if spread else "viridis",
+        triangles, data[name].values[-1], shading="gouraud", cmap="cividis" if spread else "viridis"
     )
     for kind, sensors in sensor_places(data).items():
         inside, edge = ("white", "black") if kind == "sensor" else ("black", "white")
@@ -232,19 +229,11 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         ax.axvline(t[first], color=GREY, linestyle=":", label="assimilated from here")
     _mark_jumps(data, ax)
     if len(names) <= MOST_LINES:
+        marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
         for k, name in enumerate(names):
             label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"
-            colour = PALETTE[k % len(PALETTE)]
-            marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
-            ax.plot(
-                t,
-                errors[:, k],
-                color=colour,
-                linewidth=width,
-                marker=marker,
-                alpha=0.8,
-                label=label,
-            )
+            style = {"color": PALETTE[k % len(PALETTE)], "marker": marker, "label": label}
+            ax.plot(t, errors[:, k], linewidth=width, alpha=0.8, **style)
     else:
         some = np.isfinite(errors).any(axis=1)
         t, seen = t[some], errors[some]

@@ -204,11 +204,8 @@ def _unit_attrs(name: str, own: str) -> dict[str, str]:
     if unit not in SCALES:
         return {"units": unit}
     # A difference of 5 degC is 5 K, but a temperature of 5 degC is 278.15 K.
-    apart = name.endswith("_std") or name in DIFFERENCES
-    return {
-        "units": unit,
-        "units_metadata": f"temperature: {'difference' if apart else 'on_scale'}",
-    }
+    kind = "difference" if name.endswith("_std") or name in DIFFERENCES else "on_scale"
+    return {"units": unit, "units_metadata": f"temperature: {kind}"}
 
 
 def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:

@@ -144,6 +144,7 @@ class Gathered:
         if not (anchors or self.intake.shift):
             return place
         first = min((number for number, _ in tokens), default=math.inf)
+        # The shift that held at the first row still to be taken.
         before = [shift for (number, _), shift in anchors if number <= first]
         shift = before[-1] if before else self._begun
         return f"{SHIFTED}{shift!r} {place}"
@@ -266,6 +267,7 @@ class Paced:
         now, first = self._clock(), self._held[0].t
         begun = self._begun or (now, first)
         self._begun = begun
+        # A sample of time t is due (t - t_0) / pace seconds after the first one.
         due = begun[0] + (first - begun[1]) / self.pace
         if due > now:
             self._sleep(min(wait, due - now))

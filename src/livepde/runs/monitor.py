@@ -42,28 +42,17 @@ class Metrics:
                 "Metrics need prometheus-client: pip install 'livepde[service]'."
             ) from None
         self.registry = CollectorRegistry()
+
+        def gauge(name: str, about: str, *labels: str) -> Gauge:
+            return Gauge(f"livepde_{name}", about, labels, registry=self.registry)
+
         self._sensors = tuple(sensors)
-        self._estimate = Gauge(
-            "livepde_estimate",
-            "Estimated unknown, in its unit",
-            ["unknown"],
-            registry=self.registry,
-        )
-        self._deviation = Gauge(
-            "livepde_deviation",
-            "Standard deviation of an unknown, in its unit",
-            ["unknown"],
-            registry=self.registry,
-        )
-        self._innovation = Gauge(
-            "livepde_innovation",
-            "Measured minus expected of the last sample, in the unit of the sensors",
-            ["sensor"],
-            registry=self.registry,
-        )
-        self._time = Gauge(
-            "livepde_time", "Time of the last sample, in the model's unit", registry=self.registry
-        )
+        self._estimate = gauge("estimate", "Estimated unknown, in its unit", "unknown")
+        about = "Standard deviation of an unknown, in its unit"
+        self._deviation = gauge("deviation", about, "unknown")
+        about = "Measured minus expected of the last sample, in the unit of the sensors"
+        self._innovation = gauge("innovation", about, "sensor")
+        self._time = gauge("time", "Time of the last sample, in the model's unit")
         self._samples = Counter("livepde_samples", "Samples taken", registry=self.registry)
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 

@@ -75,6 +75,7 @@ class PendingConnections:
     def _watch(self) -> None:
         while True:
             with self._changed:
+                # Sockets are polled only while somebody waits or is served.
                 idle = not (self._waiting or self._served)
                 self._changed.wait(None if idle and not self._closed else TICK)
                 if self._closed:
@@ -95,6 +96,7 @@ class PendingConnections:
         if content == b"":  # gone
             _close(connection)
             return True
+        # Bytes that come one by one do not move the deadline.
         if content is None or not _whole(content):
             if time.monotonic() - since > DEADLINE:
                 _close(connection)

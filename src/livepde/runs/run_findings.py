@@ -255,6 +255,7 @@ def _rests(data: xr.Dataset) -> list[str]:
     if noted is None:
         return []
     held = noted == 1.0
+    # The first sample of each period in which the unknowns were held.
     begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
     if held[-1]:
         at = when(data, float(data["time"][begin[-1]]))
@@ -351,6 +352,7 @@ def _wanders(values: np.ndarray[Any, Any]) -> bool:
     late = values[len(values) // 2 :].reshape(len(values) - len(values) // 2, -1)
     if len(late) < SHORTEST or not np.isfinite(late).all():
         return False
+    # Scatter about a straight line: an estimate that still learns does not wander.
     line = np.vander(np.linspace(-1.0, 1.0, len(late)), 2)
     left = late - line @ np.linalg.lstsq(line, late, rcond=None)[0]
     learned = np.linalg.norm(late.mean(axis=0) - values[0].ravel())

@@ -52,6 +52,7 @@ class Salvage(Journal):
             return int(self._one(f"SELECT COALESCE(MAX(id), 0) FROM {table}"))
         except RunError:
             pass
+        # Where the last page is damaged, the records before it can still be read one by one.
         top = 0
         try:
             for (number,) in self._db.execute(f"SELECT id FROM {table} ORDER BY id"):

@@ -61,6 +61,7 @@ def digits(value: float, std: float) -> tuple[str, str]:
     if value and not 1e-3 <= abs(value) < 1e5:
         power = math.floor(math.log10(abs(value)))
     scale = 10.0**power
+    # The first digit of std stands at 10^floor(log10 std); one more is shown.
     places = max(0, 1 + power - math.floor(math.log10(std)))
     if places > DIGITS or std / scale > 10.0**DIGITS:  # no digits of one in the other
         return f"{value:.5g}", f"{std:.2g}"
@@ -151,6 +152,7 @@ def jumps(data: xr.Dataset) -> list[Jump]:
         moved = {}
         for label in scalars(data):
             values, std = data[label].values, data[f"{label}_std"].values
+            # From the sample before the alarm to the last one before the next alarm.
             before = max(int(k) - 1, 0)
             spread = math.hypot(float(std[before]), float(std[end]))
             if abs(values[end] - values[before]) > MOVED * spread:

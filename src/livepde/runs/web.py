@@ -16,12 +16,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from livepde.errors import RunError
-from livepde.runs.pending_connections import (
-    LONGEST_BODY,
-    LONGEST_HEADER,
-    ROOM,
-    PendingConnections,
-)
+from livepde.runs.pending_connections import LONGEST_BODY, LONGEST_HEADER, ROOM, PendingConnections
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment

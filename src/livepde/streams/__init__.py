@@ -13,13 +13,7 @@ from livepde.streams.smoothing import (
     WindowAverage,
 )
 from livepde.streams.sources import Follow, Lines, Row, Rows, RowSource
-from livepde.streams.table import (
-    Column,
-    DataTable,
-    JsonLines,
-    read_json_lines,
-    tabulated,
-)
+from livepde.streams.table import Column, DataTable, JsonLines, read_json_lines, tabulated
 from livepde.streams.twin import AbsoluteNoise, Noise, RelativeNoise, Twin
 
 __all__ = [

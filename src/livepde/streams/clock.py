@@ -90,13 +90,13 @@ class Clock:
         if self.stop is not None:
             high = self._bound(self.stop, dates, f"{where}: stop")
             if dates and (next_day := _day_after(self.stop)) is not None:
+                # A day as stop includes its hours: up to the last number before the next day.
                 high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
         return low, high
 
     def set_back(self, t: float) -> bool:
         """Return whether the clocks of the zone show a time, given since 1970, twice."""
-        here = datetime.fromtimestamp(t / self.second, self.zone)
-        return here.replace(fold=0).utcoffset() != here.replace(fold=1).utcoffset()
+        return self.repeated_hour(t) != 0.0
 
     def repeated_hour(self, t: float) -> float:
         """Return how much later the clocks show a time again, given since 1970, or 0."""
@@ -104,6 +104,7 @@ class Clock:
             here = datetime.fromtimestamp(t / self.second, self.zone)
         except (ValueError, OverflowError, OSError):
             return 0.0
+        # A time that is shown twice has another offset at its second pass (fold = 1).
         first, again = here.replace(fold=0).utcoffset(), here.replace(fold=1).utcoffset()
         if first is None or again is None:
             return 0.0
@@ -112,9 +113,7 @@ class Clock:
     def stamp(self, value: Any, form: str = "") -> float | None:
         """Return seconds since 1970 of a date or a date as text, None if it is neither."""
         try:
-            if isinstance(value, str):
-                text = value.strip()
-                value = datetime.strptime(text, form) if form else datetime.fromisoformat(text)
+            value = _parsed(value, form)
             if isinstance(value, date) and not isinstance(value, datetime):
                 value = datetime(value.year, value.month, value.day)
             if not isinstance(value, datetime):
@@ -166,16 +165,18 @@ def read_times(
 def is_naive(cell: Any, clock: Clock) -> bool:
     """Return whether a cell is a date without a zone of its own."""
     try:
-        if isinstance(cell, str):
-            text = cell.strip()
-            cell = (
-                datetime.strptime(text, clock.format)
-                if clock.format
-                else datetime.fromisoformat(text)
-            )
+        cell = _parsed(cell, clock.format)
     except ValueError:
         return False
     return isinstance(cell, datetime) and cell.tzinfo is None
+
+
+def _parsed(cell: Any, form: str) -> Any:
+    """Return the date that a text holds, and anything else as it is."""
+    if not isinstance(cell, str):
+        return cell
+    text = cell.strip()
+    return datetime.strptime(text, form) if form else datetime.fromisoformat(text)
 
 
 def number_of(cell: Any, decimal: str = ".") -> float | None:

@@ -24,14 +24,7 @@ from livepde.streams.clock import (
     read_times,
 )
 from livepde.streams.names import check_columns, is_data, no_file
-from livepde.streams.table import (
-    MISSING,
-    Column,
-    DataTable,
-    cell_number,
-    decimal_marks,
-    to_table,
-)
+from livepde.streams.table import MISSING, Column, DataTable, cell_number, decimal_marks, to_table
 
 __all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
 
@@ -246,6 +239,7 @@ def _titles(lines: Sequence[str], separator: str) -> int:
         return max((k for k, cell in enumerate(row, start=1) if cell.strip()), default=0)
 
     widths = [width(line) for line in lines]
+    # A title has fewer cells than most lines; of equally frequent widths the smaller one counts.
     usual = min(multimode(found for found in widths if found), default=0)
     start = next((k for k, found in enumerate(widths) if found >= usual), 0)
     names = next(csv.reader(lines[start : start + 1], delimiter=separator), [])
@@ -377,6 +371,7 @@ def _numbers(
     """Return a column of text as numbers; its row is looked for only if one is wrong."""
     try:
         plain = cells if decimal == "." else [cell.translate(POINT) for cell in cells]
+        # All cells at once, which is fast; one by one only where this fails, to name the wrong one.
         found: Array = np.array([c if c else "nan" for c in plain], dtype=float)
         if any("_" in cell for cell in plain):
             raise ValueError("digits with a line between them")

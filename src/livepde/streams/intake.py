@@ -86,6 +86,10 @@ class Policy:
         """Return which of two values of a channel is kept."""
         return self.habit(channel).repeated or self.repeated
 
+    def longest(self, habit: Habit) -> float:
+        """Return the time for which a sample waits for a channel of this habit."""
+        return max(self.wait, habit.wait)
+
     def habit(self, channel: str) -> Habit:
         """Return the options of a channel."""
         return self.channels.get(channel, PLAIN)
@@ -309,7 +313,7 @@ class Intake:
         if self.past is not None and self._late(held.t):
             return self._pends(held, self.past, found)
         # A row in order interrupts a sequence of late ones, which is too short to be believed.
-        self._give_up(found)
+        self._place_pending(found)
         return self._placed(held, found)
 
     def _leaps(self, t: float) -> bool:
@@ -324,7 +328,7 @@ class Intake:
 
     def _doubt(self, held: _Held, found: IntakeOutcome) -> None:
         """Take a row that is far ahead if the row before confirms it; else let it wait."""
-        self._give_up(found)
+        self._place_pending(found)
         before = self._doubted
         if before is not None and 0.0 <= held.t - before.t <= self.policy.leap:
             self._doubted = None
@@ -357,22 +361,22 @@ class Intake:
         values = self._values(held.row, IntakeOutcome())
         near = past.between(held.t - self.policy.tolerance, held.t + self.policy.tolerance)
         if not values or any(_same(values, known) for _, known in near):
-            self._give_up(found)
+            self._place_pending(found)
             if not values:
                 return self._placed(held, found)
             text = f"t = {held.t:g} has been taken with the same values before"
             found.remark("repeated", "", text)
             return False
         if self._pending and not 0.0 <= held.t - self._pending[-1].t <= self._long:
-            self._give_up(found)
+            self._place_pending(found)
         self._pending.append(held)
         # Several rows of one moment are no more evidence than one.
         if len({one.t for one in self._pending}) >= AGREE:
             self._anchor(past, found)
         return True
 
-    def _give_up(self, found: IntakeOutcome) -> None:
-        """Refuse the late rows that wait: too few of them agree with each other."""
+    def _place_pending(self, found: IntakeOutcome) -> None:
+        """Place the late rows that wait: they are refused unless the clock was corrected."""
         pending, self._pending = self._pending, []
         for held in pending:
             if not self._placed(held, found):
@@ -404,11 +408,8 @@ class Intake:
             self.anchors.append((self._pending[0].token, self.shift))
         else:
             return
-        pending, self._pending = self._pending, []
         found.remark("clock", "", text)
-        for held in pending:
-            if not self._placed(held, found):
-                found.spent.append(held.token)
+        self._place_pending(found)
 
     @property
     def _usual(self) -> float:
@@ -443,7 +444,7 @@ class Intake:
         """Release all open samples at the end of the source."""
         found = IntakeOutcome()
         self._refuse_leap(found)
-        self._give_up(found)
+        self._place_pending(found)
         # With an infinite newest time no sample waits any longer.
         self._newest = math.inf
         self._release(found)
@@ -541,26 +542,30 @@ class Intake:
             # Samples leave in order, so one that still waits holds back those after it.
             if not self._ripe(t):
                 return
-            sample = self._open.pop(t)
             self._last = t
-            self._bridge(t, sample, found)
-            for channel in without_noise(self.columns, sample.values):
-                text = f"t = {t:g}: the noise of the reading is not positive"
-                found.remark("invalid", channel, text, sample.tokens[-1])
-            lacking = [c for c in self.columns if self._lacks(c, sample.values)]
-            for channel in lacking:
-                text = f"no value for t = {t:g}"
-                text += "; that of the sensor is taken" if self.columns[channel].noise_of else ""
-                found.remark("missing", channel, text, sample.tokens[-1])
-            needed = [channel for channel in lacking if self.columns[channel].needed]
-            if needed:
-                found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
-                found.spent += sample.tokens
-            else:
-                self._recent.append((t, sample.values))
-                self._released.append(t)
-                since, self._since = self._since, None
-                found.ready.append(Ready(t, sample.values, tuple(sample.tokens), since))
+            self._complete(t, self._open.pop(t), found)
+
+    def _complete(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
+        """Release a sample, or leave it out if a channel is missing that it needs."""
+        for channel in self.columns:
+            self._bridge(channel, t, sample, found)
+        for channel in without_noise(self.columns, sample.values):
+            text = f"t = {t:g}: the noise of the reading is not positive"
+            found.remark("invalid", channel, text, sample.tokens[-1])
+        lacking = [c for c in self.columns if self._lacks(c, sample.values)]
+        for channel in lacking:
+            text = f"no value for t = {t:g}"
+            text += "; that of the sensor is taken" if self.columns[channel].noise_of else ""
+            found.remark("missing", channel, text, sample.tokens[-1])
+        needed = [channel for channel in lacking if self.columns[channel].needed]
+        if needed:
+            found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
+            found.spent += sample.tokens
+            return
+        self._recent.append((t, sample.values))
+        self._released.append(t)
+        since, self._since = self._since, None
+        found.ready.append(Ready(t, sample.values, tuple(sample.tokens), since))
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""
@@ -568,29 +573,29 @@ class Intake:
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
 
-    def _bridge(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
-        """Interpolate gaps of a sample, and refuse its spikes, where later values are known."""
-        for channel in self.columns:
-            habit = self.policy.habit(channel)
-            # A sample that does not wait is released before any later value has come.
-            waited = max(self.policy.wait, habit.wait) > 0.0
-            if not (waited and (habit.interpolated or habit.screened)):
-                continue
-            later = self._later(t, channel)
-            past = [(s, v[channel]) for s, v in self._recent if math.isfinite(v.get(channel, NAN))]
-            given = sample.values.get(channel, NAN)
-            beyond = BEYOND if habit.screened else math.inf
-            value, kinds = decided(t, given, past, later, beyond)
-            if "spike" in kinds:
-                text = f"t = {t:g}: {given:g} is far off the values before and after"
-                found.remark("spike", channel, text, sample.tokens[-1])
-            if "interpolated" in kinds and habit.interpolated:
-                text = f"t = {t:g}: between the values before and after"
-                found.remark("interpolated", channel, text, sample.tokens[-1])
-            elif kinds:  # a spike of a channel that is not interpolated leaves a gap
-                value = NAN
-            if kinds:
-                sample.values[channel] = value
+    def _bridge(self, channel: str, t: float, sample: _Open, found: IntakeOutcome) -> None:
+        """Interpolate a gap of a sample, or refuse a spike, where later values are known."""
+        habit = self.policy.habit(channel)
+        # A sample that does not wait is released before any later value has come.
+        waited = self.policy.longest(habit) > 0.0
+        if not (waited and (habit.interpolated or habit.screened)):
+            return
+        later = self._later(t, channel)
+        past = [(s, v[channel]) for s, v in self._recent if math.isfinite(v.get(channel, NAN))]
+        given = sample.values.get(channel, NAN)
+        beyond = BEYOND if habit.screened else math.inf
+        value, kinds = decided(t, given, past, later, beyond)
+        if not kinds:
+            return
+        if "spike" in kinds:
+            text = f"t = {t:g}: {given:g} is far off the values before and after"
+            found.remark("spike", channel, text, sample.tokens[-1])
+        if "interpolated" in kinds and habit.interpolated:
+            text = f"t = {t:g}: between the values before and after"
+            found.remark("interpolated", channel, text, sample.tokens[-1])
+        else:  # a spike of a channel that is not interpolated leaves a gap
+            value = NAN
+        sample.values[channel] = value
 
     def _later(self, t: float, channel: str) -> Series:
         """Return the known values of a channel in samples that are still open."""
@@ -610,7 +615,7 @@ class Intake:
     def _awaited(self, t: float, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample waits for a channel that may still come, or be interpolated."""
         habit = self.policy.habit(channel)
-        if not (habit.interpolated and max(self.policy.wait, habit.wait) > 0.0):
+        if not (habit.interpolated and self.policy.longest(habit) > 0.0):
             return channel not in values
         return math.isnan(values.get(channel, NAN)) and not self._later(t, channel)
 

@@ -54,8 +54,9 @@ def join_tables(
         raise DataError(f"{where}: the files have no time in common; check dates and units.")
     width = SAME * (ends.max() - starts.min()) or 1.0
     t, joined = _outer_join(tables, times, width)
+    names, values = list(joined.columns), joined.to_numpy(copy=True)
     sensed = joined.columns.isin(list(sensors))
-    known = np.isfinite(joined.to_numpy())
+    known = np.isfinite(values)
     usable = (t >= start - width) & known[:, sensed].any(axis=1)
     if not usable.any():
         raise DataError(
@@ -64,18 +65,19 @@ def join_tables(
     begin = int(usable.argmax())
     # A run needs each input at its start, where a slower logger may have no row.
     for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
-        values, at = joined.iloc[:, k].to_numpy(), known[:, k]
-        joined.iloc[begin, k] = np.interp(t[begin], t[at], values[at])
-    inputs = joined[list(needed)].iloc[begin:]
-    kept = np.isfinite(inputs.to_numpy()).all(axis=1)
+        at = known[:, k]
+        values[begin, k] = np.interp(t[begin], t[at], values[at, k])
+    inputs = values[begin:, [names.index(name) for name in needed]]
+    kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
-    t, values, names = t[begin:][kept], joined.to_numpy()[begin:][kept], tuple(joined.columns)
-    remarks = Counter({("skipped", name): n for name, n in inputs.isna().sum().to_dict().items()})
+    t, values = t[begin:][kept], values[begin:][kept]
+    lacking = np.isnan(inputs).sum(axis=0).tolist()
+    remarks = Counter({("skipped", name): n for name, n in zip(needed, lacking, strict=True)})
     remarks = sum((Counter(table.remarks) for table in tables), remarks)  # drops counts of zero
     if first is None:
-        return DataTable(t, values, names, None, remarks)
-    return DataTable(t - t[0], values, names, origin_at(first + t[0] / second), remarks)
+        return DataTable(t, values, tuple(names), None, remarks)
+    return DataTable(t - t[0], values, tuple(names), origin_at(first + t[0] / second), remarks)
 
 
 def _on_one_clock(
@@ -108,4 +110,5 @@ def _outer_join(
         pd.DataFrame(table.values, index=key, columns=list(table.names))
         for table, key in zip(tables, keys, strict=True)
     ]
-    return moments.groupby(level=0).first().to_numpy(), pd.concat(frames, axis=1).sort_index()
+    t = np.asarray(moments.groupby(level=0).first(), dtype=np.float64)
+    return t, pd.concat(frames, axis=1).sort_index()

@@ -82,6 +82,7 @@ class Broker:
             from paho.mqtt.enums import CallbackAPIVersion
         except ImportError:
             raise DataError("MQTT needs paho-mqtt: pip install 'livepde[mqtt]'.") from None
+        # Acknowledged by hand: the broker keeps a message until its sample is in the journal.
         client = Client(
             CallbackAPIVersion.VERSION2,
             client_id=self.client_id + suffix,
@@ -108,6 +109,7 @@ class Broker:
         properties.ReceiveMaximum = self.ahead
         properties.MaximumPacketSize = LARGEST
         try:
+            # No clean start: the broker goes on with the session and sends what came meanwhile.
             client.connect(self.host, self.port, clean_start=False, properties=properties)
         except (OSError, ValueError) as error:
             raise DataError(f"MQTT: no broker at {self.address} ({error}).") from error
@@ -203,6 +205,7 @@ def _check_filter(topic: str) -> None:
 
 def _check_overlap(one: str, other: str) -> None:
     """Refuse two topic filters that match the same message."""
+    # No message matches both if at some level they name different words, or one of them has ended.
     for level, against in zip_longest(one.split("/"), other.split("/")):
         if "#" in (level, against):
             break
@@ -257,6 +260,7 @@ class MqttSource(_Peer):
         self._start()
 
     def _connected(self, resumed: bool) -> None:
+        # A new session has no open messages, and gives their numbers to others.
         if not resumed:
             with self._lock:
                 self._deliveries.clear()
@@ -294,11 +298,13 @@ class MqttSource(_Peer):
             if message.qos:
                 content = hash((topic, payload))
                 known = self._deliveries.get(message.mid)
+                # Sent again after a reconnect: its row is in the queue or in the journal already.
                 if message.dup and known is not None and known.content == content:
                     self._renew(known)
                     return
                 delivery = _Delivery(message.mid, content, self._connection)
                 self._deliveries[message.mid] = delivery
+            # The broker sends such messages without limit, so that the queue needs one.
             elif self._rows.qsize() >= self._broker.ahead:
                 self.dropped += 1
                 return
@@ -313,6 +319,7 @@ class MqttSource(_Peer):
 
     def _confirm(self, delivery: _Delivery) -> None:
         self._client.ack(delivery.number, 1)
+        # If the acknowledgement is lost, the message comes again, and must be recognised.
         self._confirmed.append(delivery)
         if len(self._confirmed) > CONFIRMED:
             oldest = self._confirmed.popleft()
@@ -366,6 +373,7 @@ class MqttSource(_Peer):
                 "run a client_id of its own."
             )
         with self._lock:
+            # The broker sends no more than `ahead` messages before one is acknowledged.
             here = (d for d in self._deliveries.values() if d.connection == self._connection)
             count = sum(not delivery.safe for delivery in here)
             quiet = self._rows.empty() and time.monotonic() - self._came > PATIENCE
@@ -429,6 +437,7 @@ class MqttSink(_Peer):
         self._given_up = threading.Event()
         self._free = threading.Semaphore(UNCONFIRMED)
         self._client.on_publish = self._on_publish
+        # The last will: the broker publishes it when the connection breaks.
         self._client.will_set(f"{self._topic}/status", "offline", 1, retain=True)
         self._start()
         self._sender = threading.Thread(target=self._send, daemon=True)
@@ -493,6 +502,7 @@ class MqttSink(_Peer):
             self._closing = True
             self._changed.notify()
         self._sender.join(PATIENCE)
+        # A message gives its place back when the broker has confirmed it.
         for _ in range(UNCONFIRMED):
             if not self._free.acquire(timeout=max(until - time.monotonic(), 0.0)):
                 log.warning("the broker at %s did not take all estimates", self._broker.address)

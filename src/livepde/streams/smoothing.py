@@ -214,6 +214,8 @@ class _NoiseLevel:
     def add(self, t: float, z: Array) -> Array:
         """Take one sample and return the standard deviation so far, NaN where it is unknown."""
         present = np.isfinite(z)
+        # The residual z_1 - (1 - s) z_0 - s z, with t_1 = (1 - s) t_0 + s t, has the variance
+        # sigma^2 (1 + (1 - s)^2 + s^2) for white noise; the curvature of the signal is neglected.
         share = (self.t[1] - self.t[0]) / (t - self.t[0])
         rest = self.z[1] - (1.0 - share) * self.z[0] - share * z
         told = present & np.isfinite(rest)
@@ -247,6 +249,7 @@ class _Window(Weights):
         self.times.append(t)
         self.values.append(z)
         width = self.smoother.width
+        # A sample at the very start of the window (t - width, t] is outside, whatever its rounding.
         gone = 0
         while self.times[gone] <= t - width * (1 - RESOLUTION):
             gone += 1
@@ -255,6 +258,7 @@ class _Window(Weights):
         weights = self._weights(np.array(self.times) - t, np.isfinite(values))
         change = np.full(z.shape, np.nan)
         if len(self.last):
+            # Weights change by samples in both windows, samples that left, and samples that came.
             kept = self.last[gone:]
             change = ((weights[: len(kept)] - kept) ** 2).sum(axis=0)
             change += (self.last[:gone] ** 2).sum(axis=0) + (weights[len(kept) :] ** 2).sum(axis=0)
@@ -269,6 +273,7 @@ class _Window(Weights):
         if present.all():
             weights[:] = self._of(offsets)[:, None]
             return weights
+        # Channels that lack the same samples have the same weights.
         patterns, which = np.unique(present.T, axis=0, return_inverse=True)
         for k, pattern in enumerate(patterns):
             column = np.zeros(len(offsets))
@@ -280,6 +285,7 @@ class _Window(Weights):
         return weights
 
     def _of(self, offsets: Array) -> Array:
+        # Equidistant samples give the same offsets again and again, up to rounding.
         rounded = np.round(offsets / (self.smoother.width * RESOLUTION))
         key = rounded.tobytes()
         if key not in self._memo:
@@ -364,6 +370,7 @@ class LocalPolynomial(_WindowSmoother):
     def window(self, s: Array) -> Array:
         degree = min(self.degree, len(s) - 1)
         powers = np.vander(s, degree + 1, increasing=True)
+        # The row of the constant term: the value of the polynomial at s = 0, the newest sample.
         fit: Array = np.linalg.pinv(powers)[0]
         return fit
 
@@ -392,6 +399,7 @@ class Exponential(Smoother):
 
     def noise_factor(self, h: float) -> float:
         _positive(self, "h", h)
+        # Fixed point of the recursion of the variance, v = (1 - a)^2 v + a^2.
         share = float(-np.expm1(-h / self.time))
         return float(np.sqrt(share / (2.0 - share)))
 
@@ -417,6 +425,7 @@ class _Fading(Weights):
             )
         first = present & np.isnan(smooth)
         share = -np.expm1(-(t - times) / self.time)
+        # z~_k - z~_k-1 = a (z_k - z~_k-1), and the noise of z_k is independent of that of z~_k-1.
         change = share**2 * (1.0 + variance)
         new = np.where(first, z, smooth + share * (z - smooth))
         spread = np.where(first, 1.0, (1.0 - share) ** 2 * variance + share**2)

@@ -150,6 +150,7 @@ class Follow:
         self._header: list[str] | None = None
         self._offset = 0
         self._ended = False
+        # Lines are told apart as bytes, before they are decoded.
         if b"a\n".decode(encoding, "replace") != "a\n":
             raise DataError(
                 f"{self.path}: a file in {encoding} cannot be read while it grows; write it in "
@@ -216,6 +217,7 @@ class Follow:
         self._number += 1
         start, known = self._resumed or (0, 0)
         self._resumed = None
+        # The same file if its beginning up to the position has the same checksum.
         head = file.read(HEAD)
         if start <= os.fstat(file.fileno()).st_size and zlib.crc32(head[:start]) == known:
             if not self._json and start:
@@ -244,6 +246,7 @@ class Follow:
         self._file.seek(self._offset)
         while len(rows) < BATCH:
             start = self._offset
+            # A line without its end is still being written.
             line = _line(self._file)
             if not line or (self.follow and not line.endswith(b"\n")):
                 break
@@ -269,11 +272,9 @@ class Follow:
             return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
             self._header = _names(cells)
-            twice = sorted({name for name in cells if name and cells.count(name) > 1})
-            if twice:
-                text = f"two columns are called '{twice[0]}', and none of them is taken: rename one"
-                return Row({}, token, text)
-            return None
+            twice = sorted(set(cells) - set(self._header))
+            text = "two columns are called '{}', and none of them is taken: rename one"
+            return Row({}, token, text.format(twice[0])) if twice else None
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token, text)

@@ -231,14 +231,7 @@ def to_table(
 ) -> DataTable:
     """Return the channels between start and stop.
 
-    Parameters
-    ----------
-    times, dates
-        As `read_times` gives them, shape (rows,).
-    numbers
-        Returns the chosen rows of a column.
-    where
-        Name of the data, and of a row, for messages.
+    `numbers` gives the chosen rows of a column; `where` names the data and a row, for messages.
     """
     use = _chosen(times, dates, clock, every, where)
     holes = tuple(float(number) for number in missing)
@@ -256,6 +249,7 @@ def to_table(
     )
     remarks = Counter(_noise_remarks(columns, values))
     kept = np.full(len(use), True)
+    # A value that is not valid is missing; a sample is left out for its first missing channel only.
     for k, (name, channel) in enumerate(columns.items()):
         low, high = channel.valid
         wrong = (values[:, k] < low) | (values[:, k] > high)
@@ -296,6 +290,7 @@ def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[s
     for name, column in columns.items():
         if not column.noise_of:
             continue
+        # Views: what is set to NaN here is missing in `values`.
         noise, reading = values[:, places[name]], values[:, places[column.noise_of]]
         wrong = noise <= 0.0
         remarks["invalid", column.noise_of] = int((wrong & np.isfinite(reading)).sum())

@@ -228,6 +228,7 @@ class Twin:
     def _gram(self) -> sp.csr_array:
         if not self.observation.nodal:
             return sp.csr_array(sp.eye_array(self.observed.size))
+        # ||z||_Z = ||G^+ z||_X: the Gram matrix is (G^+)^T M G^+ with the mass matrix M of X.
         inverse = self.observed.split().inverse
         return sp.csr_array(inverse.T @ self.model.mass @ inverse)
 
@@ -279,6 +280,7 @@ class Twin:
         if self.fine is None:
             return tuple(self._fine_states)
         fine = self.fine.state_space
+        # Values of the fine state at the quadrature points of the estimator, then projected.
         evaluate = {}
         for name, block in space.fields.items():
             points = block.measure.points
@@ -298,6 +300,7 @@ class Twin:
     def exact_data(self) -> Array:
         """Data without noise, shape (times, sensors)."""
         model, observed, states = self.model, self.observed, self.states
+        # Sensors at places see the fine state itself, without the error of its projection.
         if self.truth == "fine" and self.fine is not None and self.observation.portable:
             model, states = self.fine, tuple(self._fine_states)
             observed = _bound(self.observation, model)
