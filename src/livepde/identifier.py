@@ -121,6 +121,7 @@ class Identifier:
             raise ConfigurationError(
                 "the model has an initial state of its own (initial=): leave out u0."
             )
+        # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
         known = model.parameter_space.unknowns
         own = {name: item for name, item in observation.unknowns.items() if name not in known}
         model = model.with_unknowns(own) if own else model
@@ -129,6 +130,7 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
+        # The first steps after the start are short where intervals have to hold their error.
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, hold, start=start)
         noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
@@ -145,6 +147,8 @@ class Identifier:
         self._samples = 0
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
         self._gaps = InputLedger.start(len(self.inputs))
+        # Boundary values may come with the first sample; the initial state has to wait for them
+        # then.
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -274,7 +278,9 @@ class Identifier:
         values, held = self._channels.filled(named, self._inputs)
         if self._state is None:
             self._begun_by(values, t)
+        # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
+        # A first sample at the initial time has an empty interval: both ends are the sample.
         start = self._inputs if t > self._t else values
         names, gaps = self.inputs, {}
         missing = np.array([name in held for name in names], dtype=float)
@@ -382,6 +388,8 @@ class Identifier:
 
     def _reader(self) -> Callable[[], Belief]:
         """Return a function that gives the current belief of the law, of the physical parameter."""
+        # Estimates that are kept hold the small state of the law; mean and factors are computed
+        # when read.
         read, problem = self.law.reader(self._work, self._state), self.problem
         return read if self.model.latent.plain else lambda: problem.physical(read())
 
@@ -674,6 +682,7 @@ class Identifier:
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
         """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
+        # Nothing of this identifier changes before all parts of the checkpoint have been read.
         mine = self._fingerprint()
         for key, value in mine.items():
             if header.get(key) != value:
