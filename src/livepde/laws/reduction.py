@@ -38,6 +38,8 @@ class ReducedEvolution:
 
     def transition(self, h: float) -> Array:
         """Return the transition of its coordinates in a time h."""
+        # Copies, as the harmonics of a periodic unknown, move by F; every mode of a copy moves
+        # alike.
         F = self.model.transition(h)
         return np.asarray(np.kron(F, np.eye((self.part.stop - self.part.start) // len(F))))
 
@@ -49,6 +51,7 @@ class ReducedEvolution:
     def backward(self, h: float, drift: float) -> Array:
         """Return the matrix of the backward prediction of the coordinates by a time h."""
         F, growth = self.transition(h), self.growth(h)
+        # Rauch's smoother gain P F^T (F P F^T + W)^-1 for the prior P = 1.
         growth = growth if self.model.moves else growth + drift * h
         return np.asarray(np.linalg.solve(F @ F.T + np.diag(growth), F).T)
 
@@ -81,6 +84,7 @@ class Reduction:
             first = slice(item.part.start, item.part.start + item.size)
             if isinstance(item.block, FieldBlock):
                 part = model.parameter_space.part(name)
+                # Modes of N(0, G_Q^-1), the largest variance in the mean over the domain first.
                 inner = model.Q.restricted(first, item.block.fixed)
                 count = min(counts[name], int(inner.free.sum()))
                 mass = model.parameter_mass[part, part]
@@ -90,6 +94,7 @@ class Reduction:
                     phi = phi[:, : _enough(phi, weights, inner.spread(weights, phi))]
             else:
                 phi = np.eye(item.size) * item.unknown.prior.latent_std
+            # One block of modes for each copy: of a periodic unknown the mean and the harmonics.
             blocks.append(np.kron(np.eye(item.evolution.copies), phi))
             stop = start + blocks[-1].shape[1]
             std = item.unknown.prior.latent_std
@@ -193,6 +198,8 @@ class Reduction:
         each = []
         for rows, h in zip(C, age.tolist(), strict=True):
             F = self.transition(h)
+            # Variance of the prior after that time: it has moved from N(0, 1) as the evolution
+            # says.
             variances, axes = np.linalg.eigh(F @ F.T + np.diag(_growth(self.evolutions, h)))
             least = np.finfo(float).eps * variances[-1]
             each.append(rows @ axes / np.sqrt(np.maximum(variances, least)))
@@ -228,6 +235,7 @@ class Reduction:
         coefficient in the modes; a coefficient that no mode moves is free).
         """
         latent = self.problem.model.latent
+        # Prior standard deviation of each latent coefficient, as far as the modes move it.
         deviation = np.linalg.norm(self.Phi, axis=1)
         reach = np.concatenate(
             [
@@ -272,6 +280,7 @@ class Reduction:
         latent, along = self.problem.model.latent, C @ self.Phi.T
         if latent.plain:
             return along
+        # Chain rule: derivative of the transform, of the exponential for logarithms say.
         along = latent.slopes(q.T).T[:, None, :] * along
         if latent.dim == latent.space.dim:
             return along
@@ -292,6 +301,7 @@ class Reduction:
         if not (self.moves or drift):
             return q
         prior = self.problem.model.latent.prior
+        # Expected values of a at the start given those at the end, evolution by evolution.
         back = block_diag(*(evolution.backward(h, drift) for evolution in self.evolutions))
         return start + self.Phi @ (back @ self.reduced(q - prior) - self.reduced(start - prior))
 

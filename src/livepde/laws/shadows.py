@@ -195,6 +195,7 @@ class StepShadow(Shadow):
         """Return the shadow of a filter without covariance."""
         control = mean.problem.control
         finer = replace(mean.problem, control=replace(control, parts=2 * control.parts))
+        # Richardson: e(h) = c h^p, so that e(h) - e(h/2) = (1 - 2^-p) e(h).
         ratio = 2.0**control.scheme.order
         # Halved steps have matrices of their own: in a common cache both would factorise anew.
         return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
@@ -284,6 +285,7 @@ class InputShadow(Shadow):
         left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
             return Found(None, left, np.zeros(len(missed), dtype=bool))
+        # Only their sum counts, wherever in the block the inputs were missed.
         span = steps.span
         # The response is linear in the input for small errors: one interval takes the sum of all.
         off = missed / (span.t1 - span.t0)[:, None]
@@ -311,6 +313,8 @@ class HeldInputShadow(InputShadow):
 
     def read(self, s: ShadowState, span: Span) -> ShadowState:
         """Return the difference of held inputs to straight lines."""
+        # Sums of squares of successive changes, and of differences of them: the ratio tells smooth
+        # inputs from set points.
         last, before, changes, differences = s.held.transpose(1, 0, 2)
         change = np.where(np.isfinite(last), span.inputs1 - last, 0.0)
         changes = np.nan_to_num(changes) + change**2
@@ -376,6 +380,7 @@ class MeshShadow(Shadow):
         # difference to a step of the same length on the coarse mesh.
         if (steps.waited > 1).any():
             coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
+        # The fine trajectory begins at the filter's state, prolonged, and the difference so far.
         start = mesh.prolonged(s.u0) + s.fine
         u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
         failed = (failed | wrong)[:, None]
@@ -506,6 +511,7 @@ class ShadowSet:
             s = shadow.read(s, span)
         s, jumps = _watched(s, x, end, span)
         # What gaps miss counts at once: later it might cancel with that of the next one.
+        # After a jump of the drive the error of the step is another one at once.
         due = (s.count >= s.due) | jumps
         if span.gaps is not None:
             due = due | (span.gaps > 0.0).any(axis=(1, 2))

@@ -65,6 +65,7 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
         return lambda: Verdict.of((), ("innovations: verdict = False",))
     if not x.ledger.seen[member]:
         return lambda: Verdict.of([_unseen()])
+    # The answers of the process are states of the size of u, which no finding reads.
     x = changed(x, ledger=changed(x.ledger, process=x.ledger.process[:, :0]))
 
     def found() -> Verdict:
@@ -88,6 +89,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     _, C = reported_factors(filter_, x)
     std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
     std = np.where(std > 0.0, std, np.inf)
+    # C^T w is the bias of the estimate for a cause of amplitude one: see `livepde.verdict.judge`.
     moved = (reduction.Phi @ (x.C[0].T @ x.causes[0])) / std[:, None]  # (m, columns)
     shape = (len(x.ledger.age[0]), -1)
     found: dict[str, Array] = {}
