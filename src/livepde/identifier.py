@@ -113,14 +113,7 @@ class Identifier:
         _check_parts(model, observation, law)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
-        if not np.isfinite(t0):
-            raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
-        if u0_from and u0 is None:
-            raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
-        if u0 is not None and model.form_initial is not None:
-            raise ConfigurationError(
-                "the model has an initial state of its own (initial=): leave out u0."
-            )
+        _check_start(model, t0, u0, u0_from)
         # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
         known = model.parameter_space.unknowns
         own = {name: item for name, item in observation.unknowns.items() if name not in known}
@@ -726,6 +719,18 @@ def _check_parts(*parts: object) -> None:
                 "Identifier(model, observation, law): in the place of the "
                 f"{kind.__name__.lower()} stands {part!r:.80}{remedy}."
             )
+
+
+def _check_start(model: Model, t0: float, u0: Any, u0_from: Mapping[str, Any] | None) -> None:
+    """Refuse an initial time that is not finite, and an initial state that is said twice or not."""
+    if not np.isfinite(t0):
+        raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
+    if u0_from and u0 is None:
+        raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
+    if u0 is not None and model.form_initial is not None:
+        raise ConfigurationError(
+            "the model has an initial state of its own (initial=): leave out u0."
+        )
 
 
 def _quiet() -> np.errstate:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, Seen
 
@@ -146,6 +146,7 @@ def assimilate_at_once(
 def _absorbed(
     filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int
 ) -> tuple[FilterState, Assimilation]:
+    """Return the predicted filter after the measurements: gate, verdict, update, statistics."""
     predicted, Y = filter_.sensors.observe(x, span.end)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
@@ -158,11 +159,11 @@ def _absorbed(
     noise = filter_.noise_of(span)
     if options.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
+    # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
     largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
     variance = 1.0 + (Y * Y).sum(axis=1)
     e = d / np.sqrt(variance)
-    refused, count, newest = x.refused, np.zeros(len(x)), None
     shadows = filter_.shadows
     off = None if shadows is None else shadows.seen(x, span.end)
     expected, told = e, d
@@ -171,14 +172,9 @@ def _absorbed(
         # neither the gate nor the verdict may count them again.
         known = off[:, shadows.counted].sum(axis=1) / noise
         expected, told = d / np.sqrt(variance + known * known), d + known
-    far = _far(x, expected, used, options.gate)
-    if far is not None:
-        refused = np.where(far, refused + 1, np.where(used, 0, refused))
-        kept = used & ~(far & (refused <= options.patience))
-        count = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
-        # One value alone is no change of the process; a second one in a row may be.
-        newest = np.where(kept | (refused > 1), e, np.nan)
-        used, whole = kept, bool(kept.all())
+    gate = _gated(x, e, expected, used, options)
+    if gate.newest is not None:
+        used, whole = gate.used, bool(gate.used.all())
         e = np.where(used, e, np.nan)
     if not whole:  # missing values take part as zeros, which carry no information
         Y, d, told = (
@@ -190,8 +186,8 @@ def _absorbed(
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
     parts: dict[str, Any] = {
-        "innovations": x.innovations.add(e, measured, newest),
-        "refused": refused,
+        "innovations": x.innovations.add(e, measured, gate.newest),
+        "refused": gate.refused,
     }
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
@@ -201,7 +197,7 @@ def _absorbed(
     # square overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
     finite = np.isfinite(sums + largest * largest)
-    return changed(new, **parts), Assimilation(predicted, steps, OK, finite, count, largest)
+    return changed(new, **parts), Assimilation(predicted, steps, OK, finite, gate.dropped, largest)
 
 
 def _judged(
@@ -233,17 +229,43 @@ def _judged(
     return changed(x, causes=causes, ledger=ledger)
 
 
-def _far(x: FilterState, e: Array, used: Mask, gate: float) -> Mask | None:
-    """Return which normalised innovations lie beyond the gate; None if none does or has just done.
+class Gated(NamedTuple):
+    """Outcome of the gate for a sample.
 
-    It is as much wider as the innovations are usually larger than expected, so that a noise that is
-    stated too small does not close it.
+    Attributes
+    ----------
+    used, refused
+        Values that are used, and how many in a row of each sensor were refused, (members, sensors).
+    dropped
+        Number of values refused now, shape (members,).
+    newest
+        Normalised innovations for the test for jumps, (members, sensors); None: all of them.
     """
-    if gate == math.inf:
-        return None
-    limit = gate * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
-    far = used & ~(np.abs(e) <= limit[:, None])
-    return far if far.any() or x.refused.any() else None
+
+    used: Mask
+    refused: IntArray
+    dropped: Array
+    newest: Array | None
+
+
+def _gated(x: FilterState, e: Array, expected: Array, used: Mask, options: UpdateOptions) -> Gated:
+    """Return which values pass: normalised innovations e, and those by the wider `expected`.
+
+    The gate is as much wider as the innovations are usually larger than expected, so that a noise
+    that is stated too small does not close it.
+    """
+    passed = Gated(used, x.refused, np.zeros(len(x)), None)
+    if options.gate == math.inf:
+        return passed
+    limit = options.gate * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
+    far = used & ~(np.abs(expected) <= limit[:, None])
+    if not (far.any() or x.refused.any()):
+        return passed
+    refused = np.where(far, x.refused + 1, np.where(used, 0, x.refused))
+    kept = used & ~(far & (refused <= options.patience))
+    dropped = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
+    # One value alone is no change of the process; a second one in a row may be.
+    return Gated(kept, refused, dropped, np.where(kept | (refused > 1), e, np.nan))
 
 
 def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:
