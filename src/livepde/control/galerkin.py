@@ -160,13 +160,9 @@ class GalerkinReduction:
 
     def check(self) -> None:
         """Raise `ModelError` if the model is not linear in its unknown numbers."""
-        # If affine: f(q + sum_k (q_k - q)/2) = f(q) + sum_k (f(q_k) - f(q))/2.
-        values = self.values()
-        systems = [self._projected(self.linearisation.at(q)) for q in values]
-        both = self.q + 0.5 * sum((q - self.q for q in values[1:]), np.zeros_like(self.q))
-        expected = systems[0] + 0.5 * sum(
-            (system - systems[0] for system in systems[1:]), np.zeros_like(systems[0])
-        )
+        # The parts, made at the ends of single numbers, must give the system where all are halfway.
+        both = self.q + 0.5 * sum((q - self.q for q in self.values()[1:]), np.zeros_like(self.q))
+        expected = np.tensordot(np.array([1.0, *both[self.rows]]), self.parts(), axes=1)
         found = self._projected(self.linearisation.at(both))
         if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
             raise ModelError(

@@ -225,7 +225,7 @@ class OnlineTracker:
         lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
         return Norms(*(float(np.hypot(getattr(noise, n), getattr(lost, n))) for n in NORMS))
 
-    def _matrix(self, alpha: float) -> tuple[int, Array]:
+    def _matrix(self, alpha: float) -> tuple[int, Array | sp.csr_array]:
         """Return the matrix of G_alpha, and the key under which it is kept."""
         # One matrix for each octave of alpha: the discrepancy principle gives another alpha for
         # every sample, and each matrix is dense.
