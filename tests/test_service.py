@@ -306,6 +306,19 @@ def test_a_source_of_ones_own(here):
         assert run.journal.counts == {("repeated", ""): 7}
 
 
+def test_rows_that_are_sent_are_taken_though_the_file_has_titles(here):
+    Path("rows.csv").write_text("a title\n" + HEADER + table(*(row(k) for k in range(9))))
+    loaded = cases.load(case('file = "rows.csv"\nskip = 1'))
+    with Wiring(loaded, Rows(row(k) for k in range(4)), path=here / "sent.sqlite") as wiring:
+        run = wiring.live()
+        run.run()
+        assert len(run.result) == 4
+    with Wiring(loaded, path=here / "file.sqlite") as wiring:
+        run = wiring.live()
+        run.run()
+        assert len(run.result) == 9
+
+
 def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(3))))
     for zone, origin in (("UTC", "2026-11-21 00:00:00"), ("Europe/Berlin", "2026-11-20 23:00:00")):

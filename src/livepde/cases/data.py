@@ -37,6 +37,7 @@ from livepde.streams.table import JSON_LINES
 
 __all__ = [
     "assimilation_start",
+    "check_hours",
     "clock_of",
     "data_file",
     "read_data",
@@ -94,7 +95,7 @@ def read_data(
     spec = frame.spec.data
     if source is None and isinstance(spec.file, tuple):
         return _joined(frame, spec.file, columns)
-    _check_hours(frame, clock, spec.file if source is None else source)
+    check_hours(frame, clock, spec.file if source is None else source)
     if not isinstance(source, str | None):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
     if source is None and frame.reader is not None:
@@ -102,7 +103,8 @@ def read_data(
     return _read(data_file(frame) if source is None else Path(source), columns, clock, spec)
 
 
-def _check_hours(frame: Frame, clock: Clock, source: Any) -> None:
+def check_hours(frame: Frame, clock: Clock, source: Any) -> None:
+    """Refuse times in two columns of a source that is no CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from livepde.cases.case import Case, Prepared
-from livepde.cases.data import read_data
+from livepde.cases.data import check_hours, read_data
 from livepde.cases.data_sources import Data, limits_of, policy_of, publishers_of, source_of
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
@@ -234,11 +234,15 @@ class Wiring:
         """Return whether all rows are read at once, not followed one by one."""
         frame, spec = self.case.frame, self.case.frame.spec.data
         file, reader = (spec.file, frame.reader) if data is None else (named, None)
+        if not isinstance(file, tuple):
+            check_hours(frame, self.case.clock, file)
         if spec.every > 1 and not (file or reader):
             text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
             raise frame.error("data.every", text)
         whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
-        return whole or spec.every > 1 or spec.skip > 0 or len(spec.times) > 1
+        # These options are of files: lines that are sent have neither titles nor a second column.
+        listed = spec.every > 1 or spec.skip > 0 or len(spec.times) > 1
+        return whole or (bool(file) and listed)
 
     def _new_intake(self) -> tuple[Intake, str]:
         """Return an intake of rows that follow those of the journal, and the source's position."""
