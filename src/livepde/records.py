@@ -154,6 +154,7 @@ class RecordArrays:
             column = self._notes.get(name)
             if column is None:
                 column = self._notes[name] = array("d")
+            # A note that is new, or was absent for a while, is NaN until now.
             if len(column) < count:
                 column.extend([math.nan] * (count - len(column)))
             column.append(value)
@@ -297,6 +298,7 @@ class _Structure:
 
     def snapshot(self, row: Array) -> Snapshot:
         """Return the snapshot whose numbers are a row."""
+        # In this order: profiles, numbers of modes told, shares left out, correlation.
         sizes = [size for _, size in self.profiles]
         *parts, rest = np.split(row, np.cumsum(sizes, dtype=int))
         fields = len(self.told)

@@ -211,6 +211,7 @@ def _longest_gap(present: Any) -> int:
     """Return the largest number of missing values in a row."""
     import numpy as np
 
+    # Distances between known values, with one before the first and one after the last.
     known = np.flatnonzero(np.concatenate([[True], present, [True]]))
     return int(np.diff(known).max()) - 1
 

@@ -300,6 +300,7 @@ def concluded(
     nothing: list[Any] = []
     ended = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
     dataset = driven.journal.dataset() if ended is None else ended
+    # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
     driving = loaded.frame.roles("boundary", "input")
 

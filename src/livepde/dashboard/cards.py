@@ -113,6 +113,7 @@ def facts(seen: RunView) -> str:
 
 def _ago(seconds: float) -> str:
     for size, name in ((86400.0, "d"), (3600.0, "h"), (60.0, "min")):
+        # From two of a unit on, so that 90 minutes are not rounded to hours.
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {name} ago"
     return f"{max(seconds, 0.0):.0f} s ago"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,6 +13,7 @@ from werkzeug.middleware.dispatcher import DispatcherMiddleware
 
 from livepde import __version__
 from livepde.dashboard import cards
+from livepde.dashboard.canvas import unit_of
 from livepde.dashboard.page import application, harden, page
 from livepde.dashboard.times import when_axis
 from livepde.dashboard.view import RunView, View
@@ -22,6 +23,8 @@ from livepde.runs.summary import digits
 
 if TYPE_CHECKING:
     from wsgiref.types import WSGIApplication
+
+    import xarray as xr
 
 __all__ = ["overview_page", "overview_table"]
 
@@ -89,11 +92,7 @@ def overview_page(folder: Path) -> WSGIApplication:
 def overview_table(views: Mapping[str, View]) -> Any:
     """Return a table of runs, those with the gravest verdict first."""
     seen = {name: views[name].look() for name in list(views)[:MOST_RUNS]}
-    labels: dict[str, str] = {}
-    for one in seen.values():
-        if one.dataset is not None:
-            units = {k: str(one.dataset[k].attrs.get("units", "")) for k in scalars(one.dataset)}
-            labels = {label: labelled(label, unit) for label, unit in units.items()} | labels
+    labels = _labels(one.dataset for one in seen.values() if one.dataset is not None)
     shown = list(labels)[:MOST_UNKNOWNS]
     titles = ["run", "status", "verdict", "newest", *(f"{labels[k]} ± std. dev." for k in shown)]
     levels = {name: cards.gravest(one) for name, one in seen.items()}
@@ -103,6 +102,14 @@ def overview_table(views: Mapping[str, View]) -> Any:
     told = f"{len(views)} runs" + (f", of which {more} are not shown." if more > 0 else ".")
     head = html.Thead(html.Tr([html.Th(title) for title in titles]))
     return [html.P(told), html.Table([head, html.Tbody(rows)])]
+
+
+def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
+    """Return unknown -> its name with the unit; those of the last dataset come first."""
+    found: dict[str, str] = {}
+    for data in datasets:
+        found = {k: labelled(k, unit_of(data, k)) for k in scalars(data)} | found
+    return found
 
 
 def _cells(name: str, one: RunView, level: tuple[cards.Level, str], shown: list[str]) -> list[Any]:

@@ -55,6 +55,7 @@ class Spread(Generic[T]):
         """Take one, with a number that is larger than those before, or the last one again."""
         newest = next(reversed(self._items), number)
         if newest > self._settled and newest != number:
+            # The newest item is dropped if it is less than a gap after the last one that stays.
             if newest - self._settled < self.gap and len(self._items) > 1:
                 del self._items[newest]
             else:
@@ -258,6 +259,7 @@ class View:
     def _add(self, number: int, record: Record) -> None:
         self._number = number
         if record.snapshot is not None:
+            # Fields take most of the memory, so that their number depends on their size.
             size = 8 * sum(values.size for values in record.snapshot.profiles.values())
             self._fields.most = max(2, min(FIELDS, BYTES // max(size, 1)))
             self._fields.add(number, record)

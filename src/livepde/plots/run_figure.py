@@ -232,8 +232,8 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
         marker, width = ("None", 0.6) if len(t) > 100 else (".", 0.9)
         for k, name in enumerate(names):
             label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"
-            style = {"color": PALETTE[k % len(PALETTE)], "marker": marker, "label": label}
-            ax.plot(t, errors[:, k], linewidth=width, alpha=0.8, **style)
+            line = ax.plot(t, errors[:, k], color=PALETTE[k % len(PALETTE)], label=label)[0]
+            line.set(marker=marker, linewidth=width, alpha=0.8)
     else:
         some = np.isfinite(errors).any(axis=1)
         t, seen = t[some], errors[some]

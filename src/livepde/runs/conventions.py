@@ -100,6 +100,7 @@ def udunits(unit: str) -> str | None:
     if not all(power.is_integer() for power in parts.values()):
         return None
     words = []
+    # Positive powers come first: m2 s-1.
     for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
         symbol = _registry().get_symbol(name)
         symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
@@ -170,6 +171,7 @@ def free_names(wanted: Iterable[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for name in wanted:
         stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+        # In CF a name begins with a letter.
         stem = stem if stem[:1].isalpha() else f"v{stem}"
         free, number = stem, 2
         while free in found.values():

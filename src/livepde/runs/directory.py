@@ -21,7 +21,8 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
@@ -115,6 +116,18 @@ def _refuse_links(path: Path) -> None:
             raise RunError(f"{item} is a link: a run is gone on with in files of its own only.")
 
 
+@contextmanager
+def _room_to_write(folder: Path) -> Iterator[None]:
+    """Turn an `OSError` of writing into a folder into a `RunError` with the remedy."""
+    try:
+        yield
+    except RunError:
+        raise
+    except OSError as error:
+        why = f"{error.strerror or error}; make room or mend the folder."
+        raise RunError(f"{folder} cannot be written: {why}") from error
+
+
 class RunWriter:
     """Writer of a run directory: a new or empty folder, or that of a run to resume."""
 
@@ -169,6 +182,7 @@ class RunWriter:
                 record["case_sha256"] = hashlib.sha256((original or case).encode()).hexdigest()
             if settings:
                 record["settings"] = list(settings)
+            # The record comes last: a folder without one has only begun to be made.
             writer = cls(path, record)
             writer._save_record()
         except RunError:
@@ -213,7 +227,7 @@ class RunWriter:
         """Write the results of a run: dataset, checkpoint, report and record; figures last."""
         shown, checks, notes = list(shown), list(checks), list(notes)
         title = str(self.record["title"])
-        try:
+        with _room_to_write(self.path):
             if dataset is not None:
                 write_dataset(dataset, self.path / ESTIMATES)
                 self.record["samples"] = int(dataset.sizes.get("time", 0))
@@ -224,13 +238,6 @@ class RunWriter:
             drawn = drawn_into(self.path, figures or {}, notes)
             if figures:
                 self._report(markdown(title, shown, checks, notes, drawn), checks, notes)
-        except RunError:
-            raise
-        except OSError as error:
-            raise RunError(
-                f"{self.path} cannot be written: {error.strerror or error}; make room or mend the "
-                "folder."
-            ) from error
 
     def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
         """Write the report, and the record."""
@@ -240,13 +247,8 @@ class RunWriter:
 
     def _save_record(self) -> None:
         text = json.dumps(plain(self.record), indent=2, ensure_ascii=False)
-        try:
+        with _room_to_write(self.path):
             write_text(self.path / RECORD, text + "\n")
-        except OSError as error:
-            raise RunError(
-                f"{self.path} cannot be written: {error.strerror or error}; make room or mend the "
-                "folder."
-            ) from error
 
 
 class Run:

@@ -51,6 +51,7 @@ def stopped_by_signals(stopping: threading.Event, busy: Callable[[], bool]) -> I
     KeyboardInterrupt
         While no step is computed, or at the second signal.
     """
+    # Python allows handlers of signals in the main thread only.
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -147,6 +147,7 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
     dates = instants(data, times)
     if dates is not None:
         columns["date"] = dates
+    # Estimates come first; innovations and errors of withheld channels last.
     for name in ("time", *sorted(map(str, data.data_vars), key=DIFFERENCES.__contains__)):
         variable = data[name]
         own = str(variable.attrs.get("units", ""))

@@ -26,6 +26,7 @@ def packed(snapshot: Snapshot) -> bytes:
     if snapshot.correlation is not None:
         head["correlation"] = len(snapshot.correlation)
         body.append(snapshot.correlation.tobytes())
+    # JSON has no zero byte, so that the first one ends it.
     return json.dumps(head).encode() + b"\0" + b"".join(body)
 
 

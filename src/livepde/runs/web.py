@@ -71,6 +71,7 @@ class Address:
 
     def __post_init__(self) -> None:
         alone = _loopback(self.host)
+        # Whoever reaches another interface than loopback could ask, so that a token is needed.
         if not self.token and not alone:
             object.__setattr__(self, "token", secrets.token_urlsafe(24))
             object.__setattr__(self, "made", True)
@@ -86,6 +87,7 @@ class Address:
     def read(cls, text: str, port: int, token: str = "") -> Address:
         """Return the address that a user wrote: HOST, HOST:PORT, PORT or nothing at all."""
         host, _, number = text.rpartition(":") if ":" in text else ("", "", text)
+        # The last part of a name or of an IPv6 address is no port.
         if number and not number.isdigit():
             host, number = text, ""
         if number and (len(number) > 5 or int(number) > 65535):
@@ -211,6 +213,7 @@ def _given(environ: Mapping[str, Any]) -> str:
 
 def _host(environ: Mapping[str, Any]) -> str:
     host = str(environ.get("HTTP_HOST") or environ.get("SERVER_NAME", ""))
+    # An IPv6 address stands in brackets, before the port.
     if host.startswith("["):
         return host.partition("]")[0].strip("[")
     return host.partition(":")[0]

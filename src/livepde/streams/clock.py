@@ -250,6 +250,7 @@ def guessed_format(text: str) -> str:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it says which comes first, day or month: so do we
+        # With points the day comes first, as in 01.04.2025.
         return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
 
 

@@ -225,6 +225,7 @@ def _time_formats(
 
 def _separator(lines: Sequence[str]) -> str:
     """Return the separator of most lines: a tab or a semicolon, or else a comma."""
+    # Tabs and semicolons come first, because commas may also be marks of decimals.
     for mark in SEPARATORS:
         if max(multimode(line.count(mark) for line in lines if line.strip()), default=0):
             return mark
@@ -263,6 +264,7 @@ def _likely(content: bytes, encoding: str) -> str:
         content.decode(encoding)
         return encoding
     except UnicodeError:
+        # Text that is not UTF-8 mostly comes from Windows; cp1252 reads almost any bytes.
         wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
         return "utf-16" if wide else "cp1252" if encoding == UTF_8 else "utf-8"
 
@@ -319,6 +321,7 @@ def _cells(
                     f"{path}, row {number}: {len(row)} fields, but the header has "
                     f"{len(header)}; decimals need a point, and fields with a comma in them quotes."
                 )
+            # Cells that a row lacks at its end are empty.
             row += [""] * (len(header) - len(row))
             texts = [row[place] for place in places]
             if any(texts):

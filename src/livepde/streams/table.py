@@ -392,6 +392,7 @@ def channel_value(
     for name in column.names:
         value = cell_number(row.get(name), f"{where}, '{name}'", column.decimal)
         numbers.append(math.nan if value in missing else value)
+    # NaN if one of the columns is missing.
     return column.factor * sum(numbers) / len(numbers) + column.offset
 
 
