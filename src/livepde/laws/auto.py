@@ -188,17 +188,17 @@ class AutoLaw(Law[Bank, AutoState]):
                 )
             )
         return AutoState(
-            noise,
-            0.0,
-            start.log,
-            start,
-            members,
-            work.chances,
-            np.full(len(work.candidates), 2 * TRIAL),
-            0,
-            2 * TRIAL,
-            2 * TRIAL,
-            JUMPS.start(len(noise)),
+            noise=noise,
+            tick=0.0,
+            waiting=start.log,
+            start=start,
+            members=members,
+            weights=work.chances,
+            until=np.full(len(work.candidates), 2 * TRIAL),
+            count=0,
+            due=2 * TRIAL,
+            pause=2 * TRIAL,
+            watch=JUMPS.start(len(noise)),
         )
 
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
@@ -332,7 +332,6 @@ class AutoLaw(Law[Bank, AutoState]):
             weights[STAYS], weights[WIDE] = weights[WIDE], -np.inf
             leader = STAYS
         pause = TRIAL if alarm else state.pause
-        now = filter_.relinearised(best.now)
         members: list[SensitivityState] = []
         for k in range(len(work.candidates)):
             if k in awake:
@@ -343,10 +342,8 @@ class AutoLaw(Law[Bank, AutoState]):
                 continue
             if k == WIDE and not alarm:
                 continue
-            begun = filter_.inflated(now, JUMPS.size) if k == WIDE else now
-            due = self.replay.first if work.replays[k] else NEVER
-            copied = restarted(filters, begun, best)
-            members.append(numbered(copied, k, due))
+            members.append(self._copied(work, filters, best, k))
+            # A copy has the evidence of the leader, and its own chance before the first sample.
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
         return changed(
@@ -357,6 +354,15 @@ class AutoLaw(Law[Bank, AutoState]):
             due=state.count + pause,
             pause=2 * pause,
         )
+
+    def _copied(
+        self, work: Bank, filters: SensitivityWork, best: SensitivityState, k: int
+    ) -> SensitivityState:
+        """Return a member that begins as a copy of the leading one."""
+        now = filters.filter.relinearised(best.now)
+        begun = filters.filter.inflated(now, JUMPS.size) if k == WIDE else now
+        due = self.replay.first if work.replays[k] else NEVER
+        return numbered(restarted(filters, begun, best), k, due)
 
     def _report(
         self,

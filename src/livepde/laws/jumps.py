@@ -101,14 +101,16 @@ class Jumps:
     unknowns: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.probability < 1:
-            raise LawError(f"Jumps: probability must lie between 0 and 1; got {self.probability}.")
-        if self.window < 1 or self.window & (self.window - 1):
-            raise LawError(f"Jumps: window must be a power of two; got {self.window}.")
-        if not (np.isfinite(self.size) and self.size > 0):
-            raise LawError(f"Jumps: size must be a positive number; got {self.size}.")
-        if self.settle < 0:
-            raise LawError(f"Jumps: settle must be at least 0; got {self.settle}.")
+        # A power of two has a single bit, which the number below it lacks.
+        doubles = self.window >= 1 and not self.window & (self.window - 1)
+        for name, holds, rule in (
+            ("probability", 0 < self.probability < 1, "lie between 0 and 1"),
+            ("window", doubles, "be a power of two"),
+            ("size", np.isfinite(self.size) and self.size > 0, "be a positive number"),
+            ("settle", self.settle >= 0, "be at least 0"),
+        ):
+            if not holds:
+                raise LawError(f"Jumps: {name} must {rule}; got {getattr(self, name)}.")
         if self.unknowns is not None:
             names = self.unknowns
             if isinstance(names, str) or not (names and all(isinstance(n, str) for n in names)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from itertools import chain
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def _advanced(
         part, failed = _one_sample(work, part)
         for k in np.flatnonzero(part.replay.active).tolist():
             part, ended[k] = _turned(work, part, k, k in failed)
-            failures[k] = ended[k] and k in failed
+            failures[k] = k in failed
         taken += 1
     told = None
     if ended.any():
@@ -142,7 +143,8 @@ def _assimilated(
     if len(members) == 1:
         return x, members
     each = [_assimilated(work, state, [k], row) for k in members]  # one that fails stops all
-    return join(*(one for one, _ in each)), [k for _, wrong in each for k in wrong]
+    filters, wrong = zip(*each, strict=True)
+    return join(*filters), list(chain.from_iterable(wrong))
 
 
 def _turned(

@@ -109,11 +109,7 @@ def _descended(samples: _FixedInterval) -> _SmootherPass:
             "smaller dt_max, or a prior closer to what the run found."
         )
     for _ in range(ITERATIONS):
-        found = [
-            (x.C[0], _reduced(samples.work, x, x.da)) for x in _backward(best, best.points[-1].x)
-        ]
-        target = np.array([a for _, a in reversed(found)])
-        std = np.array([np.linalg.norm(C, axis=0) for C, _ in reversed(found)])
+        target, std = _smoothed_unknowns(samples.work, best)
         step = target - best.trajectory
         if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
             break
@@ -124,6 +120,17 @@ def _descended(samples: _FixedInterval) -> _SmootherPass:
             break
         best = better
     return best
+
+
+def _smoothed_unknowns(work: SensitivityWork, best: _SmootherPass) -> tuple[Array, Array]:
+    """Return reduced unknowns given all samples, and their standard deviations, as a trajectory."""
+    # One by one: the filters of all samples at once, with their states, may need much memory.
+    found = [
+        (_reduced(work, x, x.da), np.linalg.norm(x.C[0], axis=0))
+        for x in _backward(best, best.points[-1].x)
+    ]
+    a, std = zip(*reversed(found), strict=True)
+    return np.array(a), np.array(std)
 
 
 def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:

@@ -322,10 +322,10 @@ class ForwardStage:
         """
         model, begin, free = self.model, c[:, 0], self.model.X.free[:, None]
         new, end = np.empty_like(c), c.shape[1] - apart
-        groups = [part for part in (slice(1, end), slice(end, None)) if c[0, part].size]
+        groups = [part for part in (slice(1, end), slice(end, c.shape[1])) if c[0, part].size]
 
         def driven(u: Array, part: slice) -> Array:
-            along = directions[:, part.start - 1 : part.stop - 1 if part.stop else None]
+            along = directions[:, part.start - 1 : part.stop - 1]  # the state has no direction
             return self._driven(u, c[:, part], q, along, h, moment)
 
         if not self.keeps or not self.solver.price:
@@ -353,7 +353,7 @@ class ForwardStage:
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if part.stop is None:
+            if part.start == end:
                 new[:, part] = corrected.once(start, known)
             else:
                 new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
