@@ -116,6 +116,7 @@ def _iterated(
 
     for temper in range(guards.temperings + 1):
         tempered = Diagnostics(tempered=1.0) if temper else None
+        # The level is a variance, hence twice the exponent: noise TEMPER^temper times as large.
         begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
         if temper:
             x, _ = _filtered(work, begin, interval)
@@ -179,6 +180,7 @@ def _rescued(
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]
+    # The estimate of before with a wider covariance comes first, the prior is the last resort.
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
         again, found = _retaken(work, state, start, row, silent)
         if not astray(found):
@@ -241,6 +243,7 @@ def _watched(
             if not status.ok:
                 break
         start = work.filter.inflated(x, jumps.size, work.jumping)
+        # Rows of samples that this member did not take have no time: they are not counted.
         taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
         at = row + int(taken[before])
         again, found = _retaken(work, new, start, at, known[before:])

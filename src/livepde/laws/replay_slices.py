@@ -116,6 +116,7 @@ def _one_sample(
     replay, together = state.replay, defaultdict(list)
     for k in np.flatnonzero(replay.active).tolist():
         row = int(replay.row[k])
+        # Members with the same interval of time take it together, as arrays.
         together[float(state.log[k, row, 0]), following(state.log[k], row)].append(k)
     failed: set[int] = set()
     for (_, row), members in together.items():
@@ -157,6 +158,8 @@ def _turned(
         return _ended(state, k, take(state, k)), True
     if row < until:
         return state, False
+    # At the row where the replay began: go round again about the next reference, or keep this one
+    # and catch up with the samples that came meanwhile.
     if row == until and replay.rounds[k] >= 0:
         one = take(state, k)
         left = distance(work.filter, _window(work, one, one.replay.x))

@@ -156,6 +156,7 @@ def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
         shadows = changed(shadows, u=0.0 * shadows.u, fine=0.0 * shadows.fine)
         T = x.past[0]
         mu = x.dpast[0] + mu @ T
+        # A square root is one up to rotations of its rows: the triangle is enough.
         B = np.asarray(np.linalg.qr(np.vstack([B @ T, point.R]), mode="r"))
 
 
@@ -235,6 +236,7 @@ class _FixedInterval:
             shift = trajectory[0] - _reduced(self.work, start)
             q = q + filter_.reduction.Phi @ shift
         x = placed(filter_, self.window, filter_.reduction.bounded(q))
+        # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
         weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
@@ -249,6 +251,7 @@ class _FixedInterval:
         drifts = filter_.drifts(self.window.now.member)
         gained = filter_.reduction.gained(h, variance, drifts)[0]
         if jumps is not None and number in self.jumps:
+            # The jump is at the beginning of the interval, and is carried to its end.
             F = filter_.reduction.transition(h)
             gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
         return np.asarray(gained)

@@ -176,6 +176,7 @@ class ForwardStage:
     def _dual_weights(self) -> Array:
         diagonal = np.abs(self.model.mass.diagonal())
         least = diagonal.max(initial=0.0) or 1.0
+        # Algebraic components have no mass: they are weighed like the heaviest coefficient.
         weights: Array = self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
         return weights
 
@@ -419,6 +420,7 @@ class _StageEquation:
     def limited(self, at: _StateEvaluation, allowed: float) -> bool:
         stage, moment = self.stage, self.moment
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
+        # Rounding leaves a share of |S| |u|, the sum of the sizes of all terms in each row.
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
         own = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
