@@ -119,6 +119,7 @@ def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
     arrays = [np.asarray(leaf, order="C") for leaf in leaves.values()]
     described = zip(leaves, (a.dtype.str for a in arrays), (a.shape for a in arrays), strict=True)
     text = _text(json.dumps(dict(header)), tuple(described))
+    # -n % ALIGNED bytes fill n up to the next multiple.
     parts: list[Any] = [text, bytes(-len(text) % ALIGNED)]
     for array in arrays:
         parts += [array, bytes(-array.nbytes % ALIGNED)]
@@ -141,6 +142,7 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
             raise ValueError("it begins or adds up otherwise")
         text = bytes(body[:length])
         header, described = _read(text)
+        # One copy, since `content` cannot be written to: all arrays are views of it.
         numbers = bytearray(body[length + -length % ALIGNED :])
         leaves, at = {}, 0
         for name, kind, shape in described:

@@ -57,6 +57,7 @@ class Hindsight:
         elif taken:
             self._intervals.append(interval)
             self._q.append(q)
+        # NaN without an alarm, which no comparison holds for.
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
             self._jumps.add(len(self._intervals) - int(onset))
@@ -82,6 +83,7 @@ class Hindsight:
     ) -> Iterator[Record]:
         """Iterate over the records in reverse time order."""
         count = len(self._estimates)
+        # Samples that were not taken have the belief of the last one that was.
         said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
         for (_, estimates), belief in zip(said, beliefs, strict=False):  # none may be at the start
             known = problem.physical(belief)

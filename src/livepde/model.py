@@ -322,6 +322,7 @@ class Model:
             return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
         own = max(int(field.element.maxdeg) for field in states)
+        # u, its test function, and q: the degrees of the factors add up.
         return 2 * own + max([int(d) for d in degrees], default=0)
 
     @cached_property
@@ -381,6 +382,7 @@ class Model:
         if form is not None:
             gram = self._on_parameter(field, form) / variance
             return HilbertSpace(sp.csr_array(gram), "Q", block.fixed)
+        # The inner product is not a bilinear form: it is a Schur complement of a sparse matrix.
         free = np.ones(block.size)
         free[block.fixed] = 0.0
         mass, K = (self._on_parameter(field, form) for form in (mass_form, inner.operator))
@@ -483,6 +485,7 @@ class Model:
         if self.form_initial is None:
             return self.impose(np.zeros(self.X.dim), moment)
         boundary = self.impose(np.zeros(self.X.dim), moment)
+        # Projection onto functions with the Dirichlet values: what these contribute is known.
         functional = self.form_initial.vector("v", moment, q=q) - self._projection.dual(boundary)
         return boundary + self._projection.riesz(functional)
 

@@ -116,6 +116,7 @@ class Estimate:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
+            # Python calls this only for a name that is not in __dict__: it reads the belief once.
             held = self.__dict__
             read = held.get("_read") if name == "belief" else None
             if read is not None:
@@ -127,6 +128,7 @@ class Estimate:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the belief itself, for a copy."""
+        # Functions of a law cannot be pickled, and hold its arrays: what they return is stored.
         own = {"belief": self.belief, "verdict": self.verdict}
         own["diagnose"] = partial(_same, self.diagnostics)
         return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
@@ -341,6 +343,7 @@ class Result:
         for name, field in space.fields.items():
             left = estimate.belief.modes_left(space.part(name))
             if len(left):
+                # A mode counts by the share of its prior variance that the data have taken away.
                 told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
                 left_out[name] = estimate.belief.left_out(field.at_vertices, space.part(name))
         profiles = self._profiles(estimate).items()

@@ -400,6 +400,7 @@ class BorderedSpace(HilbertSpace):
         self, border: sp.csr_array, dim: int, name: str = "Q", fixed: IntArray | None = None
     ) -> None:
         fixed = np.zeros(0, dtype=np.int64) if fixed is None else fixed
+        # The base is frozen and has a field `gram`, which here is computed when it is read.
         for key, value in (("border", border), ("count", dim), ("name", name), ("fixed", fixed)):
             object.__setattr__(self, key, value)
         scale = abs(border).max() if border.nnz else 0.0
@@ -523,6 +524,7 @@ class _Root:
 
     def solve(self, b: Array) -> Array:
         """Return the Riesz representative of b, zero at fixed coefficients."""
+        # G^-1 = -F^-1 H F^-1.
         return -self.F.solve(self.H @ self.F.solve(b))
 
 
@@ -538,6 +540,7 @@ def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> Hilbe
     dim = sum(s.dim for s in spaces)
     if dim == whole.shape[0]:
         return HilbertSpace(whole, name, fixed)
+    # A Schur complement needs the coefficients of all spaces first, auxiliary unknowns last.
     order = np.concatenate([*leading, *rest])
     return BorderedSpace(sp.csr_array(whole[order][:, order]), dim, name, fixed)
 

@@ -136,6 +136,7 @@ def write_unit(
 
 def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> Path:
     """Return the path of the unit built in a folder."""
+    # The name becomes that of a class of the script.
     if not name[0].isalpha():
         name = f"unit_{name}"
     script = SCRIPT.format(exporter=EXPORTERS[fmi], fmi=fmi, name=name)

@@ -99,6 +99,7 @@ def river_regressor(identifier: Identifier, time: str = "t") -> Any:
         raise ConfigurationError("A regressor of river needs it: pip install river.") from None
     several = len(identifier.observed.names) > 1
     kind = base.MultiTargetRegressor if several else base.Regressor
+    # The class is made here: this module is imported without river, too.
     return type("RiverRegressor", (OnlineRegressor, kind), {"__doc__": OnlineRegressor.__doc__})(
         identifier, time
     )

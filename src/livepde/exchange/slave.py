@@ -110,6 +110,7 @@ class IdentifierSlave:
         root.set("variableNamingConvention", "flat")
         root.set("generationTool", f"livepde {__version__} by {root.get('generationTool')}")
         if any(self._units.values()):
+            # The schema of FMI wants the units directly after the kind of the interface.
             root.insert(1, _definitions(set(self._units.values()) - {""}))
         for variable in root.findall("ModelVariables/*"):
             real = variable.find("Real") if self.fmi == 2 else variable
@@ -121,6 +122,7 @@ class IdentifierSlave:
                 real.set("start", "NaN")  # as XML writes it
         outputs = root.find("ModelStructure/Outputs")
         if self.fmi == 2 and outputs is not None:
+            # FMI 2.0 lists outputs a second time: those that have a value after initialisation.
             unknown = Element("InitialUnknowns")
             unknown.extend(copy.deepcopy(list(outputs)))
             root.find("ModelStructure").append(unknown)  # type: ignore[union-attr]

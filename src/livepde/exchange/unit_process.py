@@ -206,6 +206,7 @@ class UnitProcess:
                 deviations = profiles.get(f"{name}_std", np.full_like(values, math.nan))
                 for pair in zip(values.tolist(), deviations.tolist(), strict=True):
                     found += self._pair(*pair)
+        # A forecast for the present has the model's values of all sensors, withheld ones too.
         now = identifier.forecast(identifier.t)
         return [*found, *(port.given(float(now[port.name][0])) for port in self.sensors)]
 

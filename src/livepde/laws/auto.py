@@ -188,17 +188,17 @@ class AutoLaw(Law[Bank, AutoState]):
                 )
             )
         return AutoState(
-            noise,
-            0.0,
-            start.log,
-            start,
-            members,
-            work.chances,
-            np.full(len(work.candidates), 2 * TRIAL),
-            0,
-            2 * TRIAL,
-            2 * TRIAL,
-            JUMPS.start(len(noise)),
+            noise=noise,
+            tick=0.0,
+            waiting=start.log,
+            start=start,
+            members=members,
+            weights=work.chances,
+            until=np.full(len(work.candidates), 2 * TRIAL),
+            count=0,
+            due=2 * TRIAL,
+            pause=2 * TRIAL,
+            watch=JUMPS.start(len(noise)),
         )
 
     def begin(self, work: Bank, state: AutoState, interval: Interval) -> AutoState:
@@ -221,11 +221,15 @@ class AutoLaw(Law[Bank, AutoState]):
         waiting = added(opened(state.waiting, span), span, one)
         noise = first_guess(waiting[0, :, 1 : 1 + len(state.noise)])
         if noise is None and waiting.shape[1] > SILENCE:
+            # So many samples told nothing of the noise: they are forgotten, so that the log does
+            # not grow without end.
             here = restarted(filters, filters.filter.relinearised(free.now), free)
             nothing = empty_log(1, len(state.noise), len(work.channels))
             return changed(state, waiting=nothing, start=here, members=here), report
         if noise is None:
             return changed(state, waiting=waiting, members=free), report
+        # The waiting samples are taken now, with the guessed noise, by all members from before the
+        # first one.
         begun = self._initial(work, state.start, noise)
         diagnose: Callable[[], Diagnostics[float]] = Diagnostics
         first = first_interval(waiting, work.channels)
@@ -256,11 +260,13 @@ class AutoLaw(Law[Bank, AutoState]):
         good: Mask = ok & np.isfinite(change)
         if not good.any():
             return state, reports.member(state.at(state.leader))
+        # Members that sleep or have failed gain minus infinity, and so have no weight.
         gained = np.full(len(work.candidates), -np.inf)
         gained[members.now.member[good]] = change[good]
         before = np.exp(state.weights)
         weights = state.weights
         if interval.present.any():
+            # Logarithms of weights relax to those before the first sample: evidence fades.
             weights = work.chances + (1.0 - 1.0 / MEMORY) * (weights - work.chances) + gained
         weights = normalised(np.where(np.isfinite(gained), weights, -np.inf))
         now = changed(
@@ -287,6 +293,8 @@ class AutoLaw(Law[Bank, AutoState]):
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
         onset = JUMPS.onset(before.watch, innovations) if alarm else 0
         stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
+        # A member that drifts takes the lead from one that does not: the process has changed, and
+        # those that sleep are to be compared again soon.
         if stayed and not stays and state.count >= 2 * TRIAL:
             soon = min(state.due, state.count + TRIAL)
             state = changed(state, due=soon, pause=TRIAL)
@@ -303,6 +311,7 @@ class AutoLaw(Law[Bank, AutoState]):
             if state.count >= state.until[k] and heavier:
                 twin = next((j for j in heavier if say_the_same(work, state, j, at)), None)
                 if twin is not None:
+                    # The heavier of two that say the same takes over the weight of the other.
                     other = numbers[twin]
                     weights[other] = np.logaddexp(weights[other], weights[k])
                 if twin is not None or weights[k] < np.log(PRUNED):
@@ -326,13 +335,14 @@ class AutoLaw(Law[Bank, AutoState]):
         weights, until, leader = state.weights.copy(), state.until.copy(), state.leader
         best = take(state.members, state.at(leader))
         awake = {int(k): take(state.members, state.at(int(k))) for k in state.members.now.member}
+        # A leader that began with the wide prior goes on as the one that stays, so that the number
+        # WIDE is free for a start from an inflated covariance.
         if leader == WIDE and STAYS not in awake:
             best = numbered(awake.pop(WIDE), STAYS, int(best.due[0]))
             awake[STAYS] = best
             weights[STAYS], weights[WIDE] = weights[WIDE], -np.inf
             leader = STAYS
         pause = TRIAL if alarm else state.pause
-        now = filter_.relinearised(best.now)
         members: list[SensitivityState] = []
         for k in range(len(work.candidates)):
             if k in awake:
@@ -343,10 +353,8 @@ class AutoLaw(Law[Bank, AutoState]):
                 continue
             if k == WIDE and not alarm:
                 continue
-            begun = filter_.inflated(now, JUMPS.size) if k == WIDE else now
-            due = self.replay.first if work.replays[k] else NEVER
-            copied = restarted(filters, begun, best)
-            members.append(numbered(copied, k, due))
+            members.append(self._copied(work, filters, best, k))
+            # A copy has the evidence of the leader, and its own chance before the first sample.
             weights[k] = weights[leader] + work.chances[k] - work.chances[leader]
             until[k] = state.count + max(TRIAL, pause // 4)
         return changed(
@@ -357,6 +365,15 @@ class AutoLaw(Law[Bank, AutoState]):
             due=state.count + pause,
             pause=2 * pause,
         )
+
+    def _copied(
+        self, work: Bank, filters: SensitivityWork, best: SensitivityState, k: int
+    ) -> SensitivityState:
+        """Return a member that begins as a copy of the leading one."""
+        now = filters.filter.relinearised(best.now)
+        begun = filters.filter.inflated(now, JUMPS.size) if k == WIDE else now
+        due = self.replay.first if work.replays[k] else NEVER
+        return numbered(restarted(filters, begun, best), k, due)
 
     def _report(
         self,
@@ -446,6 +463,7 @@ class AutoLaw(Law[Bank, AutoState]):
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""
         order = np.argsort(-weights, kind="stable")
+        # Members of less weight would add columns to the factors, and nothing that is seen.
         used = order[weights[order] >= 1e-4 * weights.max()]
         weights = weights[used] / weights[used].sum()
         each = [self.member.member_belief(filters, now, k) for k in used.tolist()]
@@ -476,4 +494,5 @@ def _tick(state: AutoState, interval: Interval) -> float:
     ratio = h / state.tick
     if state.count > TRIAL or abs(ratio - 1.0) < REGULAR:  # the same filters serve again
         return state.tick
+    # Running geometric mean: log(tick) moves to log(h) by 1/count of the difference.
     return float(state.tick * ratio ** (1.0 / state.count))

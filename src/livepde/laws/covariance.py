@@ -30,8 +30,12 @@ def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
     k = x.C.shape[2]
     finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
     C = filter_.reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
+    # In the principal axes of the posterior relative to the prior each direction has its share p of
+    # its own, `left` squared.
     rotation, left, _ = np.linalg.svd(C)
     share = np.minimum(left * left, 1.0)
+    # Factors on standard deviations: for the first k rows as the docstring says, for the others,
+    # which are the state's alone, the square root of lambda.
     widths = np.repeat(inflation[:, None], rotation.shape[1], axis=1)
     widened = share + inflation[:, None] ** 2 * (1.0 - share)
     widths[:, :k] = np.sqrt(np.minimum(widened, 1.0 / np.maximum(share, np.finfo(float).tiny)))

@@ -85,6 +85,7 @@ class Damping(ABC):
             dX = self.theta(r.replaced(step * r.X, r.VX, lambda: r.V)) - theta
         if r.VX > 0:
             dVX = self.theta(r.replaced(r.X, step * r.VX, lambda: r.V)) - theta
+        # ||r||_V~ costs a solve, so it is varied only if the rule has read it.
         if reads and r.V > 0:
             dV = (self.theta(r.replaced(r.X, r.VX, lambda: step * r.V)) - theta) / (1e-6 * r.V)
         return dX / (1e-6 * r.X or 1.0), dVX / (1e-6 * r.VX or 1.0), dV

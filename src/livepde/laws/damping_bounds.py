@@ -189,6 +189,7 @@ def unobserved_damping(c: Constants, e_bound: float, nu_min: float = 0.0) -> flo
     >>> unobserved_damping(Constants(1.0, 0.0, hidden_ratio=2.0), e_bound=1.0)
     8.0
     """
+    # Norms of which the quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is the largest possible one.
     return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0), nu_min)
 
 
@@ -318,6 +319,7 @@ class NoisyBound(Damping):
 
     def theta(self, r: Residual) -> float:
         d = self.d_bound
+        # The true r is not known: ||r||_X is bounded from above, ||r||_VX~ from below.
         least = np.sqrt(r.VX) - d.VX
         if least <= 0.0:
             return self.theta_max

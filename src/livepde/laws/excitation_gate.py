@@ -94,6 +94,7 @@ class ExcitationGate:
         a, followed
             Values of the probes at w and at the estimate, shape (PROBES,).
         """
+        # Fading means: each moves by the share 1/window towards its new value.
         size = float(a @ a)
         scale = math.sqrt(size * excitation.size)
         share = 1.0 / self.window
@@ -104,6 +105,7 @@ class ExcitationGate:
         energy = excitation.energy + share * (size - excitation.energy)
         correlated = excitation.correlated + share * (product - excitation.correlated)
         largest = max(excitation.largest, correlated)
+        # b_k of the docstring of this module, and the share of the square that is noise.
         left, noise = a - followed, excitation.noise
         if scale > 0.0:
             jump = left - excitation.left
@@ -155,6 +157,7 @@ class Probes:
         self.form = model.form_A
         self.fixed: Array | None = None
         self.pairs = p, e = pairs(model, split)
+        # Where (A(w) e, p) is linear in w, it is one product with a row for each pair.
         vq, qu = self.form.tensor("v", "q"), self.form.tensor("q", "u")
         if vq is not None and qu is not None:
             pattern = self.form.pattern("q", "u")
@@ -177,6 +180,7 @@ def pairs(model: Model, split: Split) -> tuple[Array, Array]:
     p = _smooth(model, split, rng)
     # A copy of the space: the factor of a large one is not kept.
     found = copy(model.Q).riesz(rng.standard_normal((model.Q.dim, PROBES)))
+    # Each unknown by itself, so that one in another unit does not outweigh it.
     for part in (item.part for item in model.latent.parts.values()):
         for e in found.T:
             alone = np.zeros_like(e)
@@ -189,9 +193,11 @@ def pairs(model: Model, split: Split) -> tuple[Array, Array]:
 def _smooth(model: Model, split: Split, rng: np.random.Generator) -> Array:
     extent = float(np.ptp(model.mesh.p, axis=1).max())
     mass = model.bilinear(mass_form)
+    # u v + extent^2 grad u . grad v: with the size of the domain both terms have one unit.
     smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
     parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
     space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
+    # A white load: independent, with the variances on the diagonal of the mass matrix.
     root = np.sqrt(mass.diagonal())[:, None]
     white = root * rng.standard_normal((model.X.dim, PROBES))
     return np.asarray(split.R @ space.riesz(split.R.T @ white))

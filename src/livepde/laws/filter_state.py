@@ -96,6 +96,7 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
     if not shift.any():
         return np.zeros(x.u.shape[1])
+    # With xi ~ N(0, I) and a = C^T xi, the least xi that gives the shift is the expected one.
     weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
     moved: Array = weights @ x.U[k]
     return moved

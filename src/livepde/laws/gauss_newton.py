@@ -67,6 +67,7 @@ def distance(filter_: Filter, window: Window) -> float:
     now = window.now
     shift = filter_.reduction.transition(window.length) @ _missed(filter_, window)
     weights = np.linalg.lstsq(now.C[0].T, shift, rcond=None)[0]
+    # In standard deviations that are inflated as the reported ones are.
     return float(np.linalg.norm(weights)) / float(now.innovations.inflation[0])
 
 
@@ -76,10 +77,12 @@ def placed(filter_: Filter, window: Window, q: Array) -> FilterState:
     now, start = window.now, window.start
     start = replace(start, level=now.level, samples=now.samples, kept=now.kept)
     shift = reduction.reduced(q - start.q[0])
+    # Such an initial state moves with q along du_0/dq, and is uncertain by the unknowns alone.
     if window.initial:
         initial = model.initial_directions(q, reduction.Phi, window.moment)
         u, du = model.initial_state(q, window.moment), -initial @ shift
         U = start.C @ initial.T
         return replace(start, q=q[None], u=u[None], du=du[None], da=-shift[None], U=U)
+    # The estimate does not move with the reference: du and da fall by as much.
     moved = along(start, 0, shift)
     return replace(start, q=q[None], u=start.u + moved, du=start.du - moved, da=start.da - shift)

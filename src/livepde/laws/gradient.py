@@ -179,6 +179,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
     ) -> tuple[GradientState, Report]:
         interval = work.problem.linear_readings(interval, state.u)
         new, report = self._advanced(work, state, interval, work.closed(state.excitation))
+        # A q that prior and data cannot explain is not believed: the step is taken again with q
+        # held.
         if report.status.ok and (doubt := work.metric.doubt(new.metric, new.q)):
             new, report = self._advanced(work, state, interval, frozen=True)
             if report.status.ok:
@@ -215,6 +217,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
             predicted = work.problem.predict(state.u, state.q, moment)
             return state, Report(Status.of(failure), predicted)
 
+        # Below, u - r is w = u_alpha + P u at the end; the metric learns from q before it is
+        # clipped.
         u, q = end[:n], model.latent.clipped(end[n:])
         r, change = R(u) - u_alpha, end[n:] - state.q
         after = Transition(forms, end[n:], u - r, change, stages.equation_error, moment, length)

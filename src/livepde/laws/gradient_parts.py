@@ -132,6 +132,8 @@ class StageSequence:
         self.path = path
         self.metric = metric
         self.slope = rate
+        # Without a rate other sensors are present, or q is held now or was before: another matrix,
+        # so that the factor of the last stage does not serve.
         self.kept = kept if rate is not None else KeptFactor.none()
         self.left = left
         self.width = width
@@ -173,6 +175,7 @@ class StageSequence:
             return np.zeros(self.coupled.terms.n)
         (problem, t, at), forms = self._last, self.coupled.terms.forms
         n, begin = self.coupled.terms.n, max(t - problem.h, self.path.interval.t0)
+        # r at the beginning of the stage: M r' is the change of M r over its length.
         before = forms.split.project(problem.c[:n]) - self.path.at(begin).u
         change = at.mass_r - forms.mass @ before
         error: Array = at.residual[:n] - at.theta * at.Mr - change / problem.h

@@ -43,6 +43,7 @@ def first_guess(z: Array) -> Array | None:
         if len(z) >= PATIENCE:  # readings of a coarse resolution repeat most of the time
             size = np.where(size > rounding, size, np.sqrt(np.nanmean(bends**2, axis=0)))
         guesses.append(np.where(size > rounding, size / np.sqrt(comb(2 * order, order)), np.inf))
+    # Orders are compared by the sensors for which each of them has a result.
     known = np.isfinite(guesses).all(axis=0)
     sizes = [float(np.log(guess[known]).sum()) for guess in guesses]
     noise: Array = guesses[int(np.argmin(sizes))].copy()
@@ -51,6 +52,7 @@ def first_guess(z: Array) -> Array | None:
         return None
     # Sensors that differ by chance alone are alike.
     logs, usual = np.log(noise[good]), float(np.median(np.log(noise[good])))
+    # Logarithms shrink to their median by the share of their scatter that chance explains.
     chance = min(1.0, SCATTER**2 / max(float(((logs - usual) ** 2).mean()), SCATTER**2))
     noise[good] = np.exp(usual + (1.0 - chance) * (logs - usual))
     noise[~good] = np.exp(usual)

@@ -54,6 +54,7 @@ class HalvedMesh:
         spaces = (fine.state_space, fine.X, fine.parameter_space)
         observed = problem.observed.observation.bind(*spaces)
         P = coarse.state_space.prolongation(fine.state_space)
+        # An unknown that moves may have several components, each with the coefficients of a block.
         pairs = zip(coarse.latent.parts.values(), fine.latent.parts.values(), strict=True)
         blocks = [
             sp.kron(sp.eye_array(one.evolution.copies), one.block.prolongation(other.block))
@@ -113,6 +114,7 @@ class HalvedMesh:
         """
         if self.G is not None:
             return np.asarray(self.G @ difference)
+        # Sensors without one constant matrix: their derivative at the prolonged state.
         physical = self.model.latent.value(self.unknowns @ q)
         H_u, _ = self.observed.jacobian(self.prolonged(u[None])[0], physical, moment)
         return np.asarray(H_u @ difference)

@@ -74,6 +74,7 @@ def _extended(log: Array) -> Array:
 
     Logs share a buffer: the row is where no log has written yet, else in a copy.
     """
+    # A time that is not SPARE shows that another log with the same first rows has written here.
     rows, buffer = log.shape[1], log.base
     if (
         not isinstance(buffer, np.ndarray)

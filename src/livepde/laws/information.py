@@ -173,6 +173,7 @@ def trace_probes(space: HilbertSpace) -> Array:
     def inverse(x: Array) -> Array:
         full = np.zeros(space.dim)
         full[free] = x
+        # D^(1/2) G^-1 D^(1/2) with the diagonal D of G: it has no unit.
         return np.asarray((root * space.riesz(root * full))[free])
 
     if m <= LEADING + DRAWS:
@@ -182,6 +183,7 @@ def trace_probes(space: HilbertSpace) -> Array:
         values, modes = eigsh(operator, k=count, v0=np.ones(m), tol=COARSE)
     columns = [modes * np.sqrt(values)]
     if m > LEADING + DRAWS:
+        # Random signs without their part in the modes, by Hutchinson's estimate of a trace.
         signs = 2.0 * np.random.default_rng(0).integers(0, 2, (DRAWS, m)) - 1.0
         rest = [sign - modes @ (modes.T @ sign) for sign in signs]
         columns += [_root(inverse, x, modes)[:, None] / math.sqrt(DRAWS) for x in rest]
@@ -210,6 +212,7 @@ def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
             break
         y /= left
     k = len(basis)
+    # The root times x is about ||x|| V T^(1/2) e_1, with the Lanczos basis V and its matrix T.
     values, vectors = np.linalg.eigh(T[:k, :k], UPLO="U")
     powers = vectors @ (np.sqrt(np.maximum(values, 0.0)) * vectors[0])
     root: Array = size * (powers @ np.array(basis))
@@ -311,6 +314,7 @@ class InformationMetric(MetricRule[Information]):
         gain = self.normal(after.forms).gain(A, after.q, after.error(), self.probes)
         rough = gain.matrix[:, self.on_diagonal] @ (1.0 / self.diagonal)
         force = np.stack([gain.force, Q.riesz(gain.force)])
+        # The first sample has no change: by this factor both powers are the same.
         change = force - state.force if state.samples else math.sqrt(2.0) * force
         power = np.stack([self._powers(force), self._powers(change) / 2.0])
         seen = np.array([gain.trace.sum(), rough.sum()])
@@ -318,6 +322,7 @@ class InformationMetric(MetricRule[Information]):
         given = state.given + told
         share = told / given if given > 0.0 else 0.0
         kept = max(0.0, 1.0 - FORGETS * h / elapsed)
+        # Rows within omega fade by information, those that hold fluxes of P u by time.
         faded = np.maximum(0.0, 1.0 - FADES * np.array([share, h / elapsed]))
         matrix = h * gain.matrix
         for new, old, left in zip(matrix, state.matrix, faded, strict=True):
@@ -329,6 +334,8 @@ class InformationMetric(MetricRule[Information]):
             total=faded * state.total + h * gain.trace,
             given=given,
             force=force,
+            # One h is the time that the sample counts for, the other makes a squared force a
+            # spectral density.
             power=kept * state.power + h * h * power,
             seen=kept * state.seen + h * seen,
             elapsed=elapsed,
@@ -357,6 +364,7 @@ class InformationMetric(MetricRule[Information]):
         J = state.matrix.sum(axis=0)
         old, most = (state.spread, state.weighed), 1.0 + AGED
         if all(new / most <= last <= new * most for new, last in zip((S, total), old, strict=True)):
+            # The current H and the J of now are compared along the last step of q.
             prior = state.spread * float(change @ self.model.Q.dual(change))
             held, now = (self.pattern.compact(data) @ change @ change for data in (state.held, J))
             if prior + now <= (1.0 + STEEPER) * (prior + held):
@@ -366,6 +374,7 @@ class InformationMetric(MetricRule[Information]):
     def departure(self, state: Information, q: Array) -> float:
         """Return ||q - q0||_Q^2 over its critical value under the model, at the level `CHANCE`."""
         away = q - state.origin
+        # k of the docstring of this module: at most m, and at most trace(G_Q^-1 J)/S.
         told = float(self.model.Q.free.sum())
         if state.given < told * state.spread:
             told = state.given / state.spread

@@ -51,6 +51,7 @@ def with_input_noise(
     """
     members, _, n = x.U.shape
     k = x.C.shape[2]
+    # The mean alone is propagated once more for each channel: no tangents, no offset.
     bare = changed(
         x,
         du=np.zeros_like(x.du),

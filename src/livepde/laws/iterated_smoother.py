@@ -166,6 +166,7 @@ def _descended(samples: _Samples, best: _Pass) -> _Pass:
 
 def _shares(before: FilterState, now: FilterState) -> Array:
     """Return the remaining shares of the variance of the unknowns of one member, ascending."""
+    # Eigenvalues of the covariance now relative to that at the start: they have no units.
     earlier, later = before.C[0].T @ before.C[0], now.C[0].T @ now.C[0]
     # The eigenproblem needs a definite matrix, also where a coordinate began without variance.
     found: Array = eigh(later, earlier + 1e-12 * np.trace(earlier) * np.eye(len(later)))[0]
@@ -188,6 +189,7 @@ def _apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
 
 
 def _deviations(x: FilterState, shift: Array) -> float:
+    # The length of the least xi with C^T xi = shift, where xi ~ N(0, I).
     weights = np.linalg.lstsq(x.C[0].T, shift, rcond=None)[0]
     return float(np.linalg.norm(weights))
 
@@ -231,6 +233,7 @@ class _Samples:
             misfit += missed(filter_, x, self.opening)
             x = assimilate_at_once(filter_, x, filter_.span(self.opening), self.work.options)
         x = self._remembered(x)
+        # The prior of the start is a ~ N(0, I): minus twice its logarithm is |a|^2.
         followed = [reduction.reduced(x.q[0] - prior)]
         nothing = np.zeros((1, reduction.size))
         misfit += float(followed[0] @ followed[0])

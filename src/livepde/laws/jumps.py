@@ -101,14 +101,16 @@ class Jumps:
     unknowns: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.probability < 1:
-            raise LawError(f"Jumps: probability must lie between 0 and 1; got {self.probability}.")
-        if self.window < 1 or self.window & (self.window - 1):
-            raise LawError(f"Jumps: window must be a power of two; got {self.window}.")
-        if not (np.isfinite(self.size) and self.size > 0):
-            raise LawError(f"Jumps: size must be a positive number; got {self.size}.")
-        if self.settle < 0:
-            raise LawError(f"Jumps: settle must be at least 0; got {self.settle}.")
+        # A power of two has a single bit, which the number below it lacks.
+        doubles = self.window >= 1 and not self.window & (self.window - 1)
+        for name, holds, rule in (
+            ("probability", 0 < self.probability < 1, "lie between 0 and 1"),
+            ("window", doubles, "be a power of two"),
+            ("size", np.isfinite(self.size) and self.size > 0, "be a positive number"),
+            ("settle", self.settle >= 0, "be at least 0"),
+        ):
+            if not holds:
+                raise LawError(f"Jumps: {name} must {rule}; got {getattr(self, name)}.")
         if self.unknowns is not None:
             names = self.unknowns
             if isinstance(names, str) or not (names and all(isinstance(n, str) for n in names)):
@@ -149,9 +151,12 @@ class Jumps:
         sums = np.cumsum(new.squares, axis=1)[:, lengths]
         freedom = np.cumsum(new.counts, axis=1)[:, lengths]
         scatter = watch.usual.scatter[:, None]
+        # Survival function of the chi-square distribution: the chance of so large a sum.
         with np.errstate(invalid="ignore"):  # no freedom, no chance
             chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / scatter**2)
         chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
+        # The least chance of several tests: by Bonferroni's factor all of them together raise false
+        # alarms at the stated rate.
         unlikely = chance * len(lengths) < self.probability
         alarm: Mask = ~early & (new.counts[:, 0] > 0.0) & unlikely
         if alarm.any():

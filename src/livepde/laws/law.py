@@ -237,6 +237,7 @@ class Belief:
         """
         if self.q_factor is None or self.prior_factor is None:
             return np.zeros(0)
+        # In coordinates in which the prior is N(0, I) the singular values are the remaining shares.
         axes, sizes, _ = np.linalg.svd(self.prior_factor[part], full_matrices=False)
         seen = sizes > 1e-12 * sizes.max(initial=0.0)
         reduced = (axes[:, seen].T @ self.q_factor[part]) / sizes[seen, None]

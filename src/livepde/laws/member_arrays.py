@@ -16,6 +16,8 @@ State = TypeVar("State")
 
 def changed(state: State, **parts: Any) -> State:
     """Return a state with some fields exchanged: `dataclasses.replace` in a tenth of its time."""
+    # Neither __init__ nor __post_init__ runs, and a cached property would be copied with the
+    # fields: states have none.
     new: State = object.__new__(type(state))
     new.__dict__.update(state.__dict__)
     new.__dict__.update(parts)
@@ -99,6 +101,7 @@ def zeros(state: State) -> State:
 
 def _widened(arrays: tuple[Array, ...]) -> list[Array]:
     """Return arrays of members, those with fewer rows of a square root filled up with zeros."""
+    # Rows of zeros do not change the covariance [U C]^T [U C].
     if arrays[0].ndim < 3 or len({array.shape[1] for array in arrays}) == 1:
         return list(arrays)
     rows = max(array.shape[1] for array in arrays)

@@ -46,6 +46,8 @@ class MemberSensors:
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
             U, C = x.U[k], x.C[k]
+            # The offset of the estimate is one more row: so predictions stay linear about the
+            # point.
             if deviates:
                 U, C = np.vstack([U, x.du[k]]), np.vstack([C, x.da[k]])
             z, Y = self._of_one(x.u[k], x.q[k], U, C, at, k)

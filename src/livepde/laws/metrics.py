@@ -133,6 +133,8 @@ class ConstantMetric(MetricRule[NoState]):
     def stage(self, c: Array, h: float, gain: float, sigma: float) -> Metric:
         """Return the metric of a stage that begins at c."""
         latent, Q = self.model.latent, self.model.Q
+        # G_Q ((q - c)/h + sigma q)/gain = A(w)^T r as an equation for q - c: the terms in c are
+        # loads.
         load = np.zeros_like(c)
         if sigma:
             load = load - Q.dual(c) * (sigma / gain)

@@ -89,6 +89,8 @@ class SelectedRows(NormalEquations):
         whole = inverse.sum(axis=0)
         # Each pair of entries of a row is a term of J; those above the diagonal are mirrored.
         entry = np.flatnonzero((whole[rows] > 0.0) & (free[cols] > 0.0))
+        # Each entry of A, numbered by `entry`, meets all of those in its row: `left` repeats it as
+        # often, and `right` counts through them from the first of the row.
         own = rows[entry]
         counts = np.bincount(own, minlength=pattern.shape[0])
         first = (np.cumsum(counts) - counts)[own]
@@ -111,6 +113,7 @@ class SelectedRows(NormalEquations):
     def _matrix(self, A: Array) -> Array:
         data = np.zeros(self.shape)
         if len(self.starts):
+            # Terms are sorted by their place in J, so that each entry of J is the sum of a segment.
             terms = A[self.left]
             terms *= A[self.right]
             terms *= self.weights
@@ -182,5 +185,6 @@ def diagonal_bound(mass: sp.csr_array) -> Array:
     root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scale = sp.diags_array(1.0 / root)
     rows = abs(scale @ mass @ scale).sum(axis=1)
+    # diag(row sums) less the scaled M is diagonally dominant, and so has no negative eigenvalue.
     bound: Array = np.where(diagonal > 0.0, root**2 * np.maximum(rows, 1.0), 0.0)
     return bound

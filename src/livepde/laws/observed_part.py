@@ -151,6 +151,7 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
                 alpha = smoother.alpha(state)
             else:
                 state = state.followed(z, boundary)
+        # The alpha of the last sample serves all of the interval.
         if smoother is None:
             return state, _InversePath(self.problem, interval, split)
         return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)

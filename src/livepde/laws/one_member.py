@@ -102,8 +102,7 @@ def _iterated(
 ) -> tuple[FilterState, Diagnostics[float] | None]:
     """Return the filter after a sample that may have moved it too far, and what was done, or None.
 
-    The cure of an excessive move is a replay of this one sample from the start of its interval. The
-    search follows neither ledger nor discretisation errors, which cost as much again.
+    The cure of an excessive move is a replay of this one sample from the start of its interval.
     """
     before = state.now
     if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is
@@ -117,6 +116,7 @@ def _iterated(
 
     for temper in range(guards.temperings + 1):
         tempered = Diagnostics(tempered=1.0) if temper else None
+        # The level is a variance, hence twice the exponent: noise TEMPER^temper times as large.
         begin = changed(before, level=before.level * TEMPER ** (2 * temper), kept=kept)
         if temper:
             x, _ = _filtered(work, begin, interval)
@@ -127,19 +127,32 @@ def _iterated(
         far = missed_most(filter_, window) > guards.reach
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered
-        for _ in range(guards.iterations):
-            last, q = window, next_reference(filter_, window)
-            bare = replace(window, start=unaccompanied(begin))
-            x, report = _filtered(work.unaccompanied, placed(filter_, bare, q), interval)
-            if not report.status.ok:
-                break
-            window = replace(window, now=x, reference=q)
-            if distance(filter_, window) <= CONVERGED:
-                x, report = _filtered(work, placed(filter_, last, q), interval)
-                if not report.status.ok:
-                    break
-                return levelled(x, temper), replace(tempered or Diagnostics(), iterated=1.0)
+        found = _converged(work, window, interval, guards.iterations)
+        if found is not None:
+            return levelled(found, temper), replace(tempered or Diagnostics(), iterated=1.0)
     return _filtered(work, before, interval.silent)[0], Diagnostics(held=1.0)
+
+
+def _converged(
+    work: SensitivityWork, window: Window, interval: Interval, most: int
+) -> FilterState | None:
+    """Return the filter after a sample, about the reference where Gauss-Newton steps end, or None.
+
+    The search follows neither ledger nor discretisation errors, which cost as much again.
+    """
+    filter_, bare = work.filter, unaccompanied(window.start)
+    for _ in range(most):
+        last, q = window, next_reference(filter_, window)
+        begin = placed(filter_, replace(window, start=bare), q)
+        x, report = _filtered(work.unaccompanied, begin, interval)
+        if not report.status.ok:
+            return None
+        window = replace(window, now=x, reference=q)
+        if distance(filter_, window) <= CONVERGED:
+            # Once more about the same reference, now with ledger and discretisation errors.
+            x, report = _filtered(work, placed(filter_, last, q), interval)
+            return x if report.status.ok else None
+    return None
 
 
 def _rescued(
@@ -167,6 +180,7 @@ def _rescued(
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]
+    # The estimate of before with a wider covariance comes first, the prior is the last resort.
     for start in (work.filter.inflated(older, 1.0), work.filter.with_prior(older)):
         again, found = _retaken(work, state, start, row, silent)
         if not astray(found):
@@ -229,6 +243,7 @@ def _watched(
             if not status.ok:
                 break
         start = work.filter.inflated(x, jumps.size, work.jumping)
+        # Rows of samples that this member did not take have no time: they are not counted.
         taken = np.flatnonzero(np.isfinite(state.log[0, row:, 0]))
         at = row + int(taken[before])
         again, found = _retaken(work, new, start, at, known[before:])

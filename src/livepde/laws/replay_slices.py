@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from itertools import chain
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def _advanced(
         part, failed = _one_sample(work, part)
         for k in np.flatnonzero(part.replay.active).tolist():
             part, ended[k] = _turned(work, part, k, k in failed)
-            failures[k] = ended[k] and k in failed
+            failures[k] = k in failed
         taken += 1
     told = None
     if ended.any():
@@ -115,6 +116,7 @@ def _one_sample(
     replay, together = state.replay, defaultdict(list)
     for k in np.flatnonzero(replay.active).tolist():
         row = int(replay.row[k])
+        # Members with the same interval of time take it together, as arrays.
         together[float(state.log[k, row, 0]), following(state.log[k], row)].append(k)
     failed: set[int] = set()
     for (_, row), members in together.items():
@@ -142,7 +144,8 @@ def _assimilated(
     if len(members) == 1:
         return x, members
     each = [_assimilated(work, state, [k], row) for k in members]  # one that fails stops all
-    return join(*(one for one, _ in each)), [k for _, wrong in each for k in wrong]
+    filters, wrong = zip(*each, strict=True)
+    return join(*filters), list(chain.from_iterable(wrong))
 
 
 def _turned(
@@ -155,6 +158,8 @@ def _turned(
         return _ended(state, k, take(state, k)), True
     if row < until:
         return state, False
+    # At the row where the replay began: go round again about the next reference, or keep this one
+    # and catch up with the samples that came meanwhile.
     if row == until and replay.rounds[k] >= 0:
         one = take(state, k)
         left = distance(work.filter, _window(work, one, one.replay.x))

@@ -163,12 +163,15 @@ class SmoothingOperator:
         self.G = sp.csr_array(filter_.G[:, self.fixed])
         stiff = k > 0.0
         self.inverse = np.where(stiff, 1.0 / np.where(stiff, k, 1.0), 0.0)
+        # s Var(n) of each mode: one for noise that is white in Z.
         if observed.noise is None:
             self.variance = np.ones(self.size)
         else:
             spread = filter_.fitted * observed.noise[present]
             self.variance = (spread**2).sum(axis=1) / s
         self.removed = self._removed(GRID[:, None] * filter_.rho)
+        # On the modes L is (k/s)^(1/2), and the inner product of Z weighs by s: (k s)^(1/2)
+        # together.
         self.told = self.removed * (1.0 - self.removed)
         self.weight = np.sqrt(k * s)
         self.noise = (1.0 - self.removed) @ (np.sqrt(k / s) * self.variance)
@@ -199,6 +202,7 @@ class SmoothingOperator:
         share = 1.0 / (balance.samples + 1)
         power, pairs = balance.power, balance.pairs
         if pair:
+            # e holds this sample, the one before the last, and the last one, in this order.
             back = -self.spectral.s * (e[0] - e[2]) * (e[2] - e[1]) / self.variance
             half = slice(0, self.size // 2)  # s ascends: the roughest come first
             pairs += 1
@@ -228,6 +232,7 @@ class SmoothingOperator:
         first = int(above[0])
         if first == 0:
             return 0.0
+        # Between two alphas of the grid the excess is taken as linear in log(alpha).
         low, high = excess[first - 1], excess[first]
         part = low / (low - high)
         return float(GRID[first - 1] ** (1 - part) * GRID[first] ** part * self.spectral.rho)

@@ -174,6 +174,8 @@ def stored(
     assimilated = state.assimilated
     if work.replay or work.start_window:
         assimilated = assimilated + (taken & span.present)
+    # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
+    # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
     if work.back and last - state.since_newer.min() >= work.back:
         due = taken & (last - state.since_newer >= work.back)

@@ -87,6 +87,7 @@ class ShadowState:
     @classmethod
     def none(cls, members: int, n: int, k: int) -> ShadowState:
         """Return the value without any shadow."""
+        # No step writes into the arrays of a state, so that several fields may share one.
         zero, nothing = np.zeros(members, dtype=np.int64), np.zeros((members, 0))
         time, kept = np.zeros(members), KeptFactors.none(members)
         u, a = np.zeros((members, 0, n)), np.zeros((members, 0, k))

@@ -109,11 +109,7 @@ def _descended(samples: _FixedInterval) -> _SmootherPass:
             "smaller dt_max, or a prior closer to what the run found."
         )
     for _ in range(ITERATIONS):
-        found = [
-            (x.C[0], _reduced(samples.work, x, x.da)) for x in _backward(best, best.points[-1].x)
-        ]
-        target = np.array([a for _, a in reversed(found)])
-        std = np.array([np.linalg.norm(C, axis=0) for C, _ in reversed(found)])
+        target, std = _smoothed_unknowns(samples.work, best)
         step = target - best.trajectory
         if (np.abs(step) <= CONVERGED * std + ROUNDING).all():
             break
@@ -124,6 +120,17 @@ def _descended(samples: _FixedInterval) -> _SmootherPass:
             break
         best = better
     return best
+
+
+def _smoothed_unknowns(work: SensitivityWork, best: _SmootherPass) -> tuple[Array, Array]:
+    """Return reduced unknowns given all samples, and their standard deviations, as a trajectory."""
+    # One by one: the filters of all samples at once, with their states, may need much memory.
+    found = [
+        (_reduced(work, x, x.da), np.linalg.norm(x.C[0], axis=0))
+        for x in _backward(best, best.points[-1].x)
+    ]
+    a, std = zip(*reversed(found), strict=True)
+    return np.array(a), np.array(std)
 
 
 def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
@@ -149,6 +156,7 @@ def _backward(best: _SmootherPass, after: FilterState) -> Iterator[FilterState]:
         shadows = changed(shadows, u=0.0 * shadows.u, fine=0.0 * shadows.fine)
         T = x.past[0]
         mu = x.dpast[0] + mu @ T
+        # A square root is one up to rotations of its rows: the triangle is enough.
         B = np.asarray(np.linalg.qr(np.vstack([B @ T, point.R]), mode="r"))
 
 
@@ -228,6 +236,7 @@ class _FixedInterval:
             shift = trajectory[0] - _reduced(self.work, start)
             q = q + filter_.reduction.Phi @ shift
         x = placed(filter_, self.window, filter_.reduction.bounded(q))
+        # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
         weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
@@ -242,6 +251,7 @@ class _FixedInterval:
         drifts = filter_.drifts(self.window.now.member)
         gained = filter_.reduction.gained(h, variance, drifts)[0]
         if jumps is not None and number in self.jumps:
+            # The jump is at the beginning of the interval, and is carried to its end.
             F = filter_.reduction.transition(h)
             gained = gained + jumps.size**2 * (F**2 @ self.work.jumping)
         return np.asarray(gained)

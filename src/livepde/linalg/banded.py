@@ -49,6 +49,7 @@ class BandedFactor:
     @cached_property
     def _triangles(self) -> tuple[Array, Array] | None:
         """L and U in band storage, if no rows were exchanged and triangular solves are faster."""
+        # With row exchanges L is a product with permutations, and no triangle in band storage.
         if self.lower * len(self.pivots) < FEW or not np.array_equal(
             self.pivots, np.arange(len(self.pivots))
         ):

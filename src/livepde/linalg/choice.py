@@ -71,6 +71,7 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
     superlu = SuperLUSolver(pattern, symmetric)
     if band <= SMALL:
         return Choice(superlu, f"{wide}, at most {SMALL}")
+    # One V-cycle is enough for an approximate inverse, so multigrid pays for smaller matrices.
     most = WIDEST_SUPERLU if approximate else WIDEST_FACTOR
     if symmetric and band > most:
         return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")

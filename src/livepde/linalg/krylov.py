@@ -51,6 +51,7 @@ def conjugate_gradients(
             return x, iteration
         z = precondition(r)
         new = np.einsum("i...,i...->...", r, z)
+        # beta = (r, z)/(r, z) of before; infinity makes it zero in the first iteration.
         p = z + _ratio(new, rz if iteration else np.full_like(rz, np.inf)) * p
         Kp = apply(p)
         curvature = np.einsum("i...,i...->...", p, Kp)
@@ -115,6 +116,7 @@ def gmres(
     left = 1.0
     for k in range(limit):
         new = precondition(apply(basis[k]))
+        # Arnoldi's method by modified Gram-Schmidt: each product uses what is left.
         for j, vector in enumerate(basis):
             H[j, k] = new @ vector
             new -= H[j, k] * vector
@@ -127,6 +129,7 @@ def gmres(
         if left <= tolerance:
             x = sum(size * w * vector for w, vector in zip(weights, basis, strict=True))
             return np.asarray(x), k + 1
+        # The Krylov space is exhausted, and dividing would not be defined.
         if H[k + 1, k] == 0.0:
             break
         basis.append(new / H[k + 1, k])

@@ -30,6 +30,7 @@ class Leading:
 
     def solve(self, b: Array) -> Array:
         """Return the leading unknowns; the right-hand sides of the other equations are zero."""
+        # [[E, F], [F^T, H]] (x, y) = (b, 0) gives (E - F H^-1 F^T) x = b.
         return self.factor.solve(self._padded(b))[: self.size]
 
     def _padded(self, b: Array) -> Array:

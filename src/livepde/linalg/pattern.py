@@ -140,6 +140,7 @@ def sandwich(
     """
     a, b = sp.csc_array(left), sp.csr_array(right)
     i, j = inner.rows, inner.indices
+    # An entry (i, j) of `inner` meets every entry of column i of `left` and of row j of `right`.
     count_a, count_b = np.diff(a.indptr)[i], np.diff(b.indptr)[j]
     item, rank = _expand(count_a * count_b)
     at_a = a.indptr[i[item]] + rank // np.maximum(count_b[item], 1)

@@ -92,6 +92,7 @@ class DolfinxModel:
         self.sensors = self._readings(np.zeros((0, 1)) if sensors is None else sensors)
         self._forms: dict[tuple[str, bool], Any] = {}
         self._matrices: dict[tuple[str, bool], Any] = {}
+        # F is affine in u if its derivative does not contain u any more.
         slope = ufl.algorithms.expand_derivatives(self._form("u", False))
         self.linear = self.u not in slope.coefficients()
 
@@ -161,6 +162,8 @@ class DolfinxModel:
         api = self.api
         self.numbers: list[Any] = []
         self.Q: Any = None
+        # A function space has a dofmap. All else is numbers, wrapped so that UFL can differentiate
+        # in them.
         if hasattr(q, "dofmap"):
             self.Q, self.q = q, api.fem.Function(q)
             self.given: Any = self.q
@@ -373,6 +376,7 @@ class Interface:
         count = len(mesh.topology.original_cell_index)
         dofs = V.dofmap.list.array.reshape(count, -1)
         corners = mesh.geometry.dofmap.array.reshape(count, -1)
+        # P0 has one coefficient in each cell, P1 one at each of its corners.
         if dofs.shape[1] == 1:
             given = np.asarray(mesh.topology.original_cell_index)[:, None]
         elif dofs.shape == corners.shape:

@@ -137,5 +137,6 @@ def _loaded(like: Any, order: IntArray, viewer: Any) -> Any:
     vector = zeros(like)
     ordered = _ordered(vector, order)
     ordered.load(viewer)
+    # In reverse: from the common order to that of the coefficients on these ranks.
     _scatter(vector, order, ordered).scatter(ordered, vector, mode=True)
     return vector

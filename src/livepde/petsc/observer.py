@@ -250,6 +250,7 @@ class CoupledSolver:
         reason, count = self.ksp.getConvergedReason(), self.ksp.getIterationNumber()
         if reason < 0 and reason != PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT:
             raise StepFailed("singular", f"PETSc's solver stopped with reason {reason}")
+        # The preconditioner ages as the iterations for one digit grow beyond those when it was new.
         digits = -math.log10(accuracy)
         self._best = self._best or count / digits
         self._slow = count > REBUILD * self._best * digits + 2
@@ -352,11 +353,14 @@ class Stage:
         self.Mr, self.mass_r = Mr, mass_r = model.pull * r, model.mass_observed * r
         self.norms = Residual(*self.squares(r, mass_r, Mr), lambda: self.seen)
         self.theta = self.rule() if self.given is None else self.given
+        # First line: the mass term, F with nu N_op u, and the pull.
         terms = model.mass * ((u - self.begin_u) / self.h), self.force(u, q), Mr * self.theta
         self.first = (terms[0] + terms[1] + terms[2]) * free
         size = max(self.least, TINY, *(dual(term * free, 0) for term in terms))
         back = zeros(q)
         self.A_in.multTranspose(r, back)
+        # Second line: sigma q is sigma (q - c_q), in the weight, and sigma c_q. To hold q is to
+        # make the weight of G_Q huge.
         drift = 0.0 if self.solver.held else law.sigma / law.gain
         change = model.gram * ((q - self.begin_q) * self.weight + self.begin_q * drift)
         self.second = change - back
@@ -433,6 +437,7 @@ class Stage:
 
 def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
     """Return pairs (e_k, p_k) for the gate: e_k in the unit ball of Q, p_k smooth on omega."""
+    # M_op is integrated over omega alone: a little mass makes it definite outside, too.
     stiff = model.pull.copy()
     stiff.axpy(1e-6, model.mass, petsc_module().Mat.Structure.UNKNOWN_NONZERO_PATTERN)
     stiff.zeroRowsColumns(model.fixed, 1.0)
@@ -443,6 +448,7 @@ def probes(model: PetscModel, free: Any) -> list[tuple[Any, Any]]:
         e, p = zeros(q), zeros(u)
         of_q.solve(random_vector(q, model.numbers_q, seed), e)
         e.scale(1.0 / math.sqrt(abs(float(e.dot(model.gram * e)))))
+        # No seed is used for both e and p.
         load = model.mass_observed * random_vector(u, model.numbers_u, PROBES + seed)
         of_u.solve(load * free, p)
         found.append((e, p))

@@ -211,6 +211,7 @@ class BandedStage(MemberStage):
         units = np.eye(model.parameter_space.dim)
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
+        # Masks of the entries between free coefficients, and of free rows with Dirichlet columns.
         inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
         # The matrices depend on neither time nor inputs; the forms still need some moment as
         # argument.
@@ -222,6 +223,7 @@ class BandedStage(MemberStage):
         self._mass = self._product(mass * free[rows])
         self._slopes = self._product(*(slope * inner for slope in slopes))
         self._mass_band = self._blocks.band(mass * inner)
+        # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         self._rest_band = self._blocks.band(rest * inner + ones)
         self._slope_bands = self._blocks.band(np.array(slopes) * inner)
@@ -309,7 +311,9 @@ class BandedStage(MemberStage):
         offset = None if self._offset.zero else self._offset(at).reshape(-1, unknowns.shape[1], n)
         if offset is not None:
             new[0] -= h * (unknowns[:, None] @ offset)[:, 0]
+        # The state first: the tangents need it.
         new[:1] = factor.solve(new[:1])
+        # A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n), drives the tangents.
         driven = (self._slopes @ new[0].T).T.reshape(size, -1, n)
         if offset is not None:
             driven = driven + offset

@@ -220,8 +220,11 @@ class _Iteration(Generic[Point]):
                     at = new
                     break
                 new = self._damped(at, update)
+            # A factor that came with the prediction has a limit of its own.
             refresh = near.refresh if factor is near.factor else newton.refresh
             slow = not new.size <= refresh * at.size
+            # With an old factor an update may fail: the better iterate stays, and is factorised
+            # next.
             at = new if new.size < at.size else at
             factor = None if slow else factor
         return Solution(at, self.updates, self.made)

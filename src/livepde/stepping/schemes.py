@@ -55,4 +55,5 @@ class Alexander2(Scheme):
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         g = self.gamma
         first = stage(y, t + g * h, g * h)
+        # The second stage begins at y + (1 - gamma) h k_1, where h k_1 = (first - y)/gamma.
         return stage(y + (1 - g) / g * (first - y), t + h, g * h)

@@ -123,6 +123,7 @@ class Span:
             return self.end
         moment = None if self.interval is None else self.interval.at(t)
         mixed = self.inputs1
+        # The same object at both ends says that inputs are held: no interpolation.
         if self.inputs0 is not mixed:
             s = (t - self.start) / (self.t1 - self.start)
             mixed = (1 - s) * self.inputs0 + s * mixed

@@ -176,6 +176,7 @@ class ForwardStage:
     def _dual_weights(self) -> Array:
         diagonal = np.abs(self.model.mass.diagonal())
         least = diagonal.max(initial=0.0) or 1.0
+        # Algebraic components have no mass: they are weighed like the heaviest coefficient.
         weights: Array = self.model.X.free / np.where(diagonal > 0.0, diagonal, least)
         return weights
 
@@ -322,10 +323,10 @@ class ForwardStage:
         """
         model, begin, free = self.model, c[:, 0], self.model.X.free[:, None]
         new, end = np.empty_like(c), c.shape[1] - apart
-        groups = [part for part in (slice(1, end), slice(end, None)) if c[0, part].size]
+        groups = [part for part in (slice(1, end), slice(end, c.shape[1])) if c[0, part].size]
 
         def driven(u: Array, part: slice) -> Array:
-            along = directions[:, part.start - 1 : part.stop - 1 if part.stop else None]
+            along = directions[:, part.start - 1 : part.stop - 1]  # the state has no direction
             return self._driven(u, c[:, part], q, along, h, moment)
 
         if not self.keeps or not self.solver.price:
@@ -353,7 +354,7 @@ class ForwardStage:
         new[:, 0] = u = corrected.solve(begin, model.impose(guess, moment), known, STATE, PASSES)
         for part in groups:
             start, known = c[:, part], driven(u, part)
-            if part.stop is None:
+            if part.start == end:
                 new[:, part] = corrected.once(start, known)
             else:
                 new[:, part] = corrected.solve(start, start, known, tolerance, PASSES - 1)
@@ -419,6 +420,7 @@ class _StageEquation:
     def limited(self, at: _StateEvaluation, allowed: float) -> bool:
         stage, moment = self.stage, self.moment
         data = np.abs(stage._data(at.y, self.q, self.h, moment))
+        # Rounding leaves a share of |S| |u|, the sum of the sizes of all terms in each row.
         sizes = stage._rows[0].matrix(data) @ np.maximum(np.abs(at.y), np.abs(self.c))
         own = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
