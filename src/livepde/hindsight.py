@@ -57,7 +57,7 @@ class Hindsight:
         elif taken:
             self._intervals.append(interval)
             self._q.append(q)
-        # NaN without an alarm, which no comparison holds for.
+        # NaN without an alarm: then the comparison is false.
         onset = estimate.diagnostics.jump_samples
         if onset > 0:
             self._jumps.add(len(self._intervals) - int(onset))

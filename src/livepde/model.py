@@ -166,6 +166,7 @@ class Model:
         self.form_M = self._form("M", _product(x) if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
+        # A in the parameter as forms see it; `form_A` is the same in latent coefficients.
         self.physical_A = self._form("A", A, triple, "u", dA, "q")
         self.form_A = compose(self.physical_A, self.latent)
         sources = f if isinstance(f, Sequence) else [f]

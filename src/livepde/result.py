@@ -391,6 +391,7 @@ class Result:
             )
             records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
+            # The last fields are part of the dataset, also where `fields_every` has left them out.
             last = self.snapshot(self.last)
         data = self.layout.dataset(records, last)
         if self.last is not None:

@@ -100,6 +100,7 @@ def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
 
 def _moved(name: str, folder: Path, files: dict[str, bytes]) -> str:
     """Return the name of user code within the unit, and add its file to `files`."""
+    # A file comes with the unit; a module has to be installed where the unit runs.
     source, _, attribute = name.rpartition(":")
     return f"{_taken(folder / source, files)}:{attribute}" if source.endswith(".py") else name
 

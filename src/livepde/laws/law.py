@@ -126,6 +126,7 @@ class Problem:
 
     def unread(self, interval: Interval) -> Interval:
         """Return an interval without the readings that the initial state was made of."""
+        # The initial state holds these readings already: a second time they would count twice.
         used = [name in self.initial_readings for name in self.observed.names]
         return replace(interval, z1=np.where(used, np.nan, interval.z1)) if any(used) else interval
 
@@ -299,6 +300,7 @@ def numerical(error: Exception) -> Status | None:
         return Status("singular", text)
     if isinstance(error, RuntimeError) and "singular" in text:
         return Status("singular", text)
+    # SciPy says "array must not contain infs or NaNs".
     if isinstance(error, ArithmeticError) or (isinstance(error, ValueError) and "infs" in text):
         return Status("not_finite", text)
     return None

@@ -62,6 +62,7 @@ class _Relative(Law[GradientParts, GradientState]):
 
     @property
     def _base(self) -> GradientLaw:
+        # The step is that of the gradient law: what differs is in `work`, from `_parts`.
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
     def _parts(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientParts:
@@ -165,4 +166,5 @@ class KueglerLaw(_Relative):
     """
 
     def prepare(self, problem: Problem) -> GradientParts:
+        # Without M_op the pull is mu R^T M r.
         return self._parts(problem, None, at_estimate=True)

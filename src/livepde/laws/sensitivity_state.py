@@ -194,6 +194,7 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
     rows, least = state.log.shape[1], max(work.back, LEAST)
     if rows <= least:
         return state
+    # The first row that any member may still go back to; the numbers of rows move with it.
     older = state.since_older if work.back else np.full(len(state), rows - 1)
     stays = state.replays | (state.start_due != NEVER)
     first = int(np.where(stays, np.minimum(older, state.window), older).min())

@@ -98,6 +98,7 @@ class _MatrixBlock:
         if self.transposed:
             rows, cols = cols, rows
         scale = a[rows] * b[cols]
+        # Each entry of the block is one entry of K, scaled: a map with one value in each row.
         kept = np.flatnonzero(scale).astype(np.int32)
         starts = np.arange(len(kept) + 1, dtype=np.int32)
         shape = (len(kept), self.inner.nnz)
@@ -105,6 +106,7 @@ class _MatrixBlock:
 
     def _product(self, left: Sparse, right: Sparse) -> tuple[IntArray, IntArray, sp.csr_array]:
         if self.transposed:
+            # left K^T right is the transpose of right^T K left^T.
             a, b = sp.csr_array(right).T, sp.csr_array(left).T
             cols, rows, weights = sandwich(a, self.inner, b)
         else:

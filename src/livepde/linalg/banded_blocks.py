@@ -87,7 +87,7 @@ class BandedBlocks:
             storage[bad] = 0.0
             storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T
-        # Rows of the storage: fill-in, upper, main and lower diagonal; the outer two are compared.
+        # Rows of the storage: fill-in, upper, main, lower diagonal. Symmetric if rows 1, 3 agree.
         if lower == upper == 1 and (banded[1, 1:] == banded[3, :-1]).all():
             diagonal, side, info = lapack.dpttrf(banded[2], banded[3, :-1])
             if info == 0:

@@ -51,7 +51,7 @@ def conjugate_gradients(
             return x, iteration
         z = precondition(r)
         new = np.einsum("i...,i...->...", r, z)
-        # beta = (r, z)/(r, z) of before; infinity makes it zero in the first iteration.
+        # beta is (r, z) over that of the iteration before: zero in the first one, by infinity.
         p = z + _ratio(new, rz if iteration else np.full_like(rz, np.inf)) * p
         Kp = apply(p)
         curvature = np.einsum("i...,i...->...", p, Kp)

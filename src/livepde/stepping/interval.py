@@ -210,7 +210,7 @@ def advance(
     """
     h = control.parts * (t1 - t0) / control.count(t1 - t0)
     grades = control.grade(t0, h)
-    # A substep has a power of two of ticks, one for each halving that may be needed.
+    # A substep has 2^k ticks, where k is the number of halvings that may be needed.
     whole = 1 << (control.halvings + grades)  # ticks of a substep
     finest = control.count(t1 - t0) * whole
     width = (t1 - t0) / finest

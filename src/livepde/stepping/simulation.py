@@ -49,6 +49,7 @@ def simulate(
     for t0, t1 in pairwise(times):
         interval = Interval(t0, t1, values(t0), values(t1), none, none)
 
+        # The interval is a default, since a closure would see that of a later round.
         def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
             return forward.solve(c, q, h, interval.at(t))
 

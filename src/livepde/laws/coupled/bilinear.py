@@ -69,6 +69,7 @@ class BilinearSolver(MonolithicSolver):
             outside = _tensors(forms.A_out)
             by_u = by_u + maps["A_out"] @ outside[0]
             by_q = by_q + maps["A_out u"] @ outside[1]
+        # Each block is linear in one of the four vectors, and so all of them are one product.
         return sp.csr_array(sp.hstack([by_w, by_u, by_q, by_r]))
 
     @cached_property
@@ -126,6 +127,7 @@ class BilinearSolver(MonolithicSolver):
         driven = A @ q
         if coupling_out is not None:
             driven = driven + coupling_out.matrix(u) @ q
+        # R^T M_op r and R^T M r by one product.
         by_r = products["r"] @ r
         Mr, mass_r = by_r[:n], by_r[n:]
         norms = terms.norms(r, Mr, mass_r, data.observed)

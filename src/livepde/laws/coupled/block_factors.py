@@ -123,6 +123,7 @@ class BlockSolver(StageSolver):
             flux = forms.B_in.matrix("v", "u", moment, u=at.w)
             flux = flux + form.matrix("v", "u", moment, u=at.w, q=q)
             S = S + masked(sp.csr_array(flux @ forms.W), free, free)
+            # The derivative of A(w)^T r in w; W = dw/du makes it one in u.
             seen = form.matrix("q", "u", moment, u=at.w, v=at.r, q=q)
             back = sp.csr_array(masked(seen, free_q, np.ones(n)) @ forms.W)
         if not terms.linear:
@@ -136,6 +137,7 @@ class BlockSolver(StageSolver):
             forward = sp.csr_array(A + outside)
         S = S + masked(sp.csr_array(at.theta * forms.pull + forms.hidden), free, free)
         S = sp.csr_array(S + sp.diags_array(1.0 - free))
+        # S without its stiffness: on the observed part the pull adds theta to 1/h.
         rates = self.lumped * (1.0 / h + at.theta * np.abs(forms.split.R.diagonal()))
         row = terms.slope(data, at)
         border = None if row is None else (at.Mr * free, row * free)
@@ -255,6 +257,8 @@ class BlockJacobian:
         split = terms.forms.split
         parts = list(terms.forms.model.latent.parts.values())
         if len(parts) == 1 and isinstance(parts[0].unknown, Field):
+            # Entries of one sign show that A does not differentiate q: then a diagonal stands for
+            # the product, with the same image of a constant q.
             image = self.forward @ terms.free_q
             if np.abs(self.forward.data).sum() <= ONE_SIGN * np.abs(image).sum():
                 seen = self.A.T @ split.project(state.solve(image))

@@ -217,6 +217,7 @@ class CoupledStage:
         n = self.terms.n
         w = kept.u_alpha.copy()
         fixed = self.terms.forms.model.X.fixed
+        # Dirichlet values of the stage that the factor is of, not those of this moment.
         w[fixed] = kept.y[:n][fixed]
         made = StageProblem(kept.y, kept.h, problem.moment, kept.u_alpha, metric)
         data = self.solver.data(made, w)

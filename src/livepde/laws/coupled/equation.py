@@ -173,7 +173,7 @@ class StageTerms:
 
     @cached_property
     def size(self) -> int:
-        """N + m."""
+        """Number of unknowns n + m."""
         return self.n + self.forms.model.Q.dim
 
     @cached_property
@@ -349,6 +349,8 @@ class StageTerms:
         """Return the derivative of theta in u, shape (n,); None if it is zero."""
         if data.problem.metric.theta is not None or at.theta >= STIFFEST / data.problem.h:
             return None
+        # Chain rule: the squared norms of r in X, VX~ and V~ have the derivatives 2 R^T M r, 2 R^T
+        # M_op r and 2 M_op^T times the representative of M_op r.
         dX, dVX, dV = self.damping.slopes(at.norms)
         row = (2.0 * dX) * at.mass_r + (2.0 * dVX) * at.Mr
         if dV:
@@ -372,6 +374,7 @@ class StageTerms:
         problem, moment = data.problem, data.problem.moment
         c, v = np.abs(problem.c), np.abs(at.w) + np.abs(problem.u_alpha)
         w, own = {"u": at.w}, {"u": at.y[:n]}
+        # Row by row the sum of the sizes of all terms; differences count with both operands.
         A = abs(forms.A_in.matrix("v", "q", moment, q=at.y[n:], **w))
         first = abs(model.mass) @ ((u + c[:n]) / problem.h) + A @ q + np.abs(data.source)
         first += abs(forms.B_in.matrix("v", "u", moment, **w)) @ np.abs(at.w)
@@ -475,6 +478,7 @@ class StageSolver(ABC):
         change = self.weighed(data, q - data.problem.c[n:])
         coupling = A_in.T @ r
         residual = np.empty_like(y)
+        # Both lines of the docstring of this module; rows of fixed coefficients are zero.
         residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
         residual[n:] = (change - data.load - coupling) * terms.free_q
         first = [residual[:n], rate, driven, pull]

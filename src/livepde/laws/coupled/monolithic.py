@@ -97,6 +97,7 @@ class MonolithicSolver(StageSolver):
         whole.add("pull", Pattern.of(forms.pull), free, free)
         whole.add("N", Pattern.of(forms.hidden), free, free)
         whole.add("A_in", A.pattern("v", "q"), free, free_q, at=(0, n))
+        # The same data a second time: -A^T R in the second line.
         whole.add("A_in", A.pattern("v", "q"), minus, R, at=(n, 0), transposed=True)
         if forms.W is not None:
             W = sp.csr_array(forms.W @ free)
@@ -176,6 +177,7 @@ class _Bordered:
 
     @cached_property
     def _scaled(self) -> Array:
+        # (K + b a^T)^-1 = K^-1 - K^-1 b a^T K^-1/(1 + a^T K^-1 b); `column` is K^-1 b.
         pivot = 1.0 + float(self.row @ self.column[: len(self.row)])
         if pivot == 0.0:
             raise LinearAlgebraError("The damped system is singular: take less damping.")

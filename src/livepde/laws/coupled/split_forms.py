@@ -92,6 +92,7 @@ class StageForms:
             return sp.csr_array(sp.eye_array(n))
         estimated = sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
         if self.split.omega is not None:
+            # Only coefficients that the forms over omega read can make w unknown.
             touched = np.zeros(n)
             touched[self.B_in.pattern("v", "u").indices] = 1.0
             touched[self.A_in.pattern("v", "u").indices] = 1.0
@@ -114,7 +115,7 @@ class StageForms:
 
     @cached_property
     def hidden(self) -> sp.csr_array:
-        """Nu P^T N_op P over omega, and nu N_op outside of it (MN2), shape (n, n)."""
+        """Matrix nu P^T N_op P over omega, and nu N_op outside of it (MN2), shape (n, n)."""
         n, P = self.model.X.dim, self.split.P
         if not self.nu:
             return sp.csr_array((n, n))
