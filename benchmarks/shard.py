@@ -27,7 +27,7 @@ from livepde.stepping import Advance, simulate
 
 __all__ = ["shard"]
 
-SIZE = 500  # members of a shard
+SIZE = 250  # members of a shard: a step of more takes more memory at a time
 TRUTHS = 20  # rods of other coefficients; each member has noise of its own
 GROWN = "shard: memory of 10 000 members"
 WARM = 100  # samples of each member before time and memory are taken: logs are as long as they get
@@ -52,7 +52,7 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
     Parameters
     ----------
     members
-        Rods whose memory and time of a step are measured, in shards of 500.
+        Rods whose memory and time of a step are measured, in shards of 250.
     kills
         How often one of two workers is killed at a random moment.
     """

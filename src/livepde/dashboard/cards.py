@@ -175,8 +175,9 @@ def _failures(seen: RunView) -> Iterator[str]:
         text = "The run did not end, but nobody writes it any more: it was killed. Go on with it"
         yield f"{text}: livepde run CASE --out RUN --resume."
     if seen.status == "silent":
-        last = [event for event in seen.events if event.kind == "silent"][-1]
-        yield f"The source is silent: {last.message}."
+        # The page holds the newest events only, and this one may be older.
+        said = [event.message for event in seen.events if event.kind == "silent"]
+        yield f"The source is silent{''.join(f': {text}' for text in said[-1:])}."
     if seen.unwell:
         yield f"Not well: {seen.unwell}."
     if seen.dataset is not None and seen.dataset.sizes["time"]:
