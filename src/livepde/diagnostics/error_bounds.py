@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -368,16 +369,14 @@ def bounds(
     CheckReport
         One line for each bound; their hypotheses are checked by `conditions`.
     """
+    # For noisy data the bounds hold before T*; they are made of the errors at the first sample.
     kept = [item for item in errors if item.t < until or item is errors[0]]
     if not kept:
         raise ConfigurationError("bounds: the tracker has not seen any estimate.")
-    smoothed = data == "smoothed"
-
-    def energy(item: Errors) -> float:
-        return item.smoothed_energy if smoothed else item.energy
-
+    label, name = ("r_alpha", "smoothed_energy") if data == "smoothed" else ("r", "energy")
+    energy, residual = attrgetter(name), attrgetter(f"{label}.X")
     start = energy(kept[0])
-    label = "r_alpha" if smoothed else "r"
+    # sigma pulls q to zero, where ||e||_Q = ||q*||_Q.
     limit = max(start, q_true**2) if sigma > 0 else start
     lines = [
         CheckLine.at_most(
@@ -388,7 +387,7 @@ def bounds(
         )
     ]
     p0 = kept[0].p.X ** 2
-    largest_p = float(_values(kept, lambda item: item.p.X**2).max())
+    largest_p = float(_values(kept, attrgetter("p.X")).max()) ** 2
     if nu > 0:
         C = c.hidden_VX_X
         b = c.C_N**2 * C**4 / c.c_N**2 * float(_values(kept, lambda item: item.Pu**2).max())
@@ -401,7 +400,7 @@ def bounds(
     elif largest_p == 0.0:
         lines.append(CheckLine.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
     if sigma == 0 and c.L_C > 0:
-        part = _integral(kept, lambda item: item.p.V * (item.r_alpha.X if smoothed else item.r.X))
+        part = _integral(kept, lambda item: item.p.V * residual(item))
         lines.append(
             CheckLine.at_most(
                 f"3. integral of ||p||_V ||{label}||_X",

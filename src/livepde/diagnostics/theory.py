@@ -324,28 +324,16 @@ def theory_report(
         window = max((items[-1].t - items[0].t) / 20.0, 1e-12)
     tracker = OnlineTracker(identifier, window, noise)
     notes: list[str] = []
-    followed = None
-    if twin is not None:
-        try:
-            followed = TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
-        except ConfigurationError as error:
-            notes.append(str(error))
+    followed = _followed(twin, tracker, notes)
     for sample in items:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         tracker.add(estimate, sample)
         if followed is not None and estimate.status.ok:
             followed.add(estimate, sample.z)
     tables: list[Sheet] = []
-    found: Constants | None = None
-    try:
-        found = tracker.constants()
-        tables.append(_constants_table(found))
-    except LivepdeError as error:
-        notes.append(f"The constants cannot be computed: {error}")
+    found = _constants(tracker, tables, notes)
     tables += _residual_tables(tracker, notes)
-    stopping = None
-    if found is not None:
-        stopping = _stopping(tracker, found, tables, notes)
+    stopping = None if found is None else _stopping(tracker, found, tables, notes)
     spectrum = _spectrum(tracker, tables, notes)
     reports: list[CheckReport] = []
     if followed is None or found is None:
@@ -356,13 +344,29 @@ def theory_report(
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
 
 
-def _constants_table(c: Constants) -> Sheet:
+def _followed(twin: Twin | None, tracker: OnlineTracker, notes: list[str]) -> TwinTracker | None:
+    if twin is None:
+        return None
+    try:
+        return TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+    except ConfigurationError as error:
+        notes.append(str(error))
+        return None
+
+
+def _constants(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> Constants | None:
+    try:
+        c = tracker.constants()
+    except LivepdeError as error:
+        notes.append(f"The constants cannot be computed: {error}")
+        return None
     rows = [
         (name, float(getattr(c, name)), text, label, _how(name, c))
         for name, (label, text) in DEFINITIONS.items()
     ]
     columns = ("constant", "value", "definition", "in the paper", "is")
-    return Sheet("Constants of the discretised model", columns, rows)
+    tables.append(Sheet("Constants of the discretised model", columns, rows))
+    return c
 
 
 def _how(name: str, c: Constants) -> str:

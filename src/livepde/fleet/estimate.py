@@ -201,14 +201,20 @@ class FleetResult:
         data["status"] = (both, self._series("status"), flags)
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
-        nothing = np.full(len(self.members), np.nan)
-        for name in dict.fromkeys(chain.from_iterable(row.diagnostics for row in rows)):
+        for name, values in self._diagnostics().items():
             # A diagnostic may have the name of an unknown, which comes first.
-            key = f"{NOTE}{name}" if name in data else name
-            values = self._table([row.diagnostics.get(name, nothing) for row in rows])
-            data[key] = (both, values)
+            data[f"{NOTE}{name}" if name in data else name] = (both, values)
         data.attrs["scalars"] = "\n".join(layout.scalars)
         return data
+
+    def _diagnostics(self) -> dict[str, Array]:
+        """Return numbers of the law, (members, times) each; NaN at samples that have none."""
+        names = dict.fromkeys(chain.from_iterable(row.diagnostics for row in self._rows))
+        nothing = np.full(len(self.members), np.nan)
+        return {
+            name: self._table([row.diagnostics.get(name, nothing) for row in self._rows])
+            for name in names
+        }
 
     def _series(self, name: str, *more: int) -> Array:
         return self._table([getattr(row, name) for row in self._rows], *more)

@@ -113,14 +113,10 @@ def with_conditions(
     for name, given in (boundary or {}).items():
         _check_boundary(model, name)
         for condition in given if isinstance(given, Sequence) else [given]:
-            if isinstance(condition, Flux):
-                terms.gained(condition.value, name)
-            else:
-                terms.exchanged(condition, name)
+            terms.through(name, condition)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
-    if unused := [name for name in more if name not in terms.named]:
-        raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
+    terms.check_all_named()
     whole = model.with_unknowns(more) if more else model
     return whole.with_terms(terms.A, terms.B, terms.inputs)
 
@@ -139,15 +135,14 @@ class _Terms:
         self.A: list[Any] = []
         self.B: list[Any] = []
 
-    def gained(
-        self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
-    ) -> None:
-        """Add a flux or a source."""
-        amount = self._amount(value)
-        self._add(where, lambda q, u, v, x: -amount(q, x) * inside(x) * v, value)
+    def check_all_named(self) -> None:
+        if unused := [name for name in self.unknowns if name not in self.named]:
+            raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
 
-    def exchanged(self, condition: Exchange, boundary: str) -> None:
-        """Add an exchange as two terms, so that the term in u reads no input."""
+    def through(self, boundary: str, condition: Condition) -> None:
+        """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
+        if isinstance(condition, Flux):
+            return self.gained(condition.value, boundary)
         h, ambient = self._amount(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
         # A term in u that reads an input would make the matrix of a stage depend on time, and
@@ -155,10 +150,19 @@ class _Terms:
         self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
         self._add(boundary, lambda q, u, v, x: -h(q, x) * ambient(q, x) * v, *given)
 
+    def gained(
+        self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
+    ) -> None:
+        """Add a flux or a source."""
+        amount = self._amount(value)
+        # In M u_t + A(u) q + B(u) = f the terms stand on the left side, hence the sign.
+        self._add(where, lambda q, u, v, x: -amount(q, x) * inside(x) * v, value)
+
     def _add(self, where: str | None, term: Callable[..., Any], *amounts: Amount) -> None:
         def known(u: Any, v: Any, x: Place) -> Any:
             return term(None, u, v, x)
 
+        # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
         unknown = any(isinstance(amount, str) for amount in amounts)
         form = term if unknown else known
         (self.A if unknown else self.B).append(form if where is None else On(where, form))
@@ -200,6 +204,7 @@ def _region(model: Model, name: str, over: Any) -> tuple[str | None, Callable[[A
         if over not in (model.mesh.subdomains or {}):
             raise ModelError(f"source '{name}': the mesh has no subdomain '{over}'.")
         return over, _everywhere
+    # The predicate is tried at the mean of the vertices of each cell.
     if not np.any(over(model.mesh.p[:, model.mesh.t].mean(axis=1))):
         raise ModelError(f"source '{name}': no cell of the mesh lies in it.")
     return None, over

@@ -144,8 +144,7 @@ def _model(
     if "loss" in given:
         terms += _exchange("loss")
     if "transfer" in given:
-        sides = _free(name, mesh, held)
-        terms += [On(side, term) for side in sides for term in _exchange("transfer")]
+        terms += _transfer(name, mesh, held)
     if "source" in given:
         terms.append(lambda q, u, v, x: -q.source * v)
     return Model(
@@ -167,8 +166,8 @@ def _exchange(coefficient: str) -> list[Any]:
     ]
 
 
-def _free(name: str, mesh: Any, held: Mapping[str, Any]) -> list[str]:
-    """Return the named boundaries without a value."""
+def _transfer(name: str, mesh: Any, held: Mapping[str, Any]) -> list[On]:
+    """Return the Robin terms at the named boundaries without a value."""
     free = (
         [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
     )
@@ -177,7 +176,7 @@ def _free(name: str, mesh: Any, held: Mapping[str, Any]) -> list[str]:
             f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
             "it out, or leave one out of dirichlet."
         )
-    return free
+    return [On(side, term) for side in free for term in _exchange("transfer")]
 
 
 SURROUNDINGS = {

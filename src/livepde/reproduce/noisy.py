@@ -133,15 +133,12 @@ def noisy_run(
     progress
         True: show a progress bar.
     """
-    if not level > 0:
-        raise ConfigurationError(f"level must be a positive number, 0.01 for 1 %; got {level}.")
     model, twin = _problem()
-    stream: Any = WhiteNoise(twin, level, seed)
-    if kind == "nodal":
-        stream = _Noisy(twin, RelativeNoise(level), seed)
+    stream = _stream(twin, level, seed, kind)
     full, smoothed = Full(reconstruction=Pseudoinverse()), None
     if smoothing:
         smoother = LocalPolynomial(WINDOW, DEGREE)
+        # Smoothing in time leaves this share of the level for the discrepancy principle in space.
         left = level * smoother.noise_factor(float(twin.times[1] - twin.times[0]))
         full = Full(reconstruction=Tikhonov("V", Discrepancy(TAU, level=left)))
         stream = smoothed = smoother(stream)
@@ -158,9 +155,18 @@ def noisy_run(
     for sample in watched(stream, len(twin), label) if progress else stream:
         estimate = identifier.step(sample.t, sample.z)
         errors.append(twin.error(estimate.q) if estimate.status.ok else np.nan)
+        # In the first window the polynomial has fewer samples, and its slope more noise.
         if smoothed is not None and sample.t > WINDOW:
             rates.append(smoothed.norm_d_rate(twin.weights))
     return NoisyRun(np.asarray(twin.times), np.array(errors), max(rates, default=float("nan")))
+
+
+def _stream(twin: Twin, level: float, seed: int, kind: Kind) -> Any:
+    if not level > 0:
+        raise ConfigurationError(f"level must be a positive number, 0.01 for 1 %; got {level}.")
+    if kind == "nodal":
+        return _Noisy(twin, RelativeNoise(level), seed)
+    return WhiteNoise(twin, level, seed)
 
 
 @dataclass(frozen=True, eq=False)
