@@ -319,23 +319,23 @@ class Identifier:
             )
         self._state, self._inputs = state, inputs
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # seen in the result
     def _stepped(self, interval: Interval) -> tuple[Any, Report]:
         """Return state and report after a sample; the state before it after a numerical failure.
 
         A numerical failure is an operation that raises, or a belief of the law that is not finite,
         be it only the squares of its numbers.
         """
-        before, t0, t1 = self._state, interval.t0, interval.t1
+        before = self._state
         try:
-            with _quiet():
-                if t1 > t0:
-                    state, report = self.law.step(self._work, before, interval)
-                else:
-                    state = self.law.begin(self._work, before, interval)
-                    report = Report(Status(), self._expected(interval))
-                if not report.status.taken or self.law.finite(self._work, state):
-                    return state, report
-                failure = Status("not_finite", "what the law believes after it is not finite")
+            if interval.t1 > interval.t0:
+                state, report = self.law.step(self._work, before, interval)
+            else:
+                state = self.law.begin(self._work, before, interval)
+                report = Report(Status(), self._expected(interval))
+            if not report.status.taken or self.law.finite(self._work, state):
+                return state, report
+            failure = Status("not_finite", "what the law believes after it is not finite")
         except Exception as error:
             found = numerical(error)
             if found is None:

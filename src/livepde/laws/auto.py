@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +22,7 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, without_factors
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
     added,
@@ -36,7 +35,7 @@ from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report
 from livepde.laws.member_arrays import changed, join, take
 from livepde.laws.replay import Replay
-from livepde.laws.sensitivity import SensitivityLaw, without_factors
+from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.sensitivity_state import (
     NEVER,
     SensitivityState,
@@ -406,7 +405,7 @@ class AutoLaw(Law[Bank, AutoState]):
                 awake=float(len(awake)),
             )
 
-        return Report(OK, predicted, leading.steps, cache(diagnosed))
+        return Report(OK, predicted, leading.steps, diagnosed)
 
     def settled(self, work: Bank, state: AutoState) -> AutoState:
         noise = state.noise if state.known else np.ones_like(state.noise)

@@ -9,11 +9,18 @@ import numpy as np
 from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import changed
 from livepde.laws.shadow_state import ShadowState
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied", "without_ledger"]
+__all__ = [
+    "NO_LEDGER",
+    "FilterState",
+    "along",
+    "unaccompanied",
+    "without_factors",
+    "without_ledger",
+]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -81,16 +88,6 @@ class FilterState:
     def __len__(self) -> int:
         return len(self.member)
 
-    @property
-    def centred(self) -> bool:
-        """True if the estimate of every member is its linearisation point."""
-        return not (self.da.any() or self.du.any())
-
-    @property
-    def off_centre(self) -> Mask:
-        """Members whose estimate is not the linearisation point, shape (members,)."""
-        return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
-
 
 def along(x: FilterState, k: int, shift: Array) -> Array:
     """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
@@ -102,8 +99,17 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     return moved
 
 
+def without_factors(x: FilterState) -> FilterState:
+    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
+    if not (x.kept.q.shape[1] or x.shadows.u.shape[1]):
+        return x
+    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())
+
+
 def without_ledger(x: FilterState) -> FilterState:
     """Return a filter state without the data that only its verdict needs."""
+    if x.ledger is NO_LEDGER:
+        return x
     return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
 
 

@@ -256,7 +256,7 @@ class Reduction:
         """Return latent parameters within their `ends`, shape (..., m): q itself if they are."""
         lower, upper = self.ends
         inside = (q >= lower) & (q <= upper)
-        return q if inside.all() else np.minimum(np.maximum(q, lower), upper)
+        return q if np.count_nonzero(inside) == q.size else np.minimum(np.maximum(q, lower), upper)
 
     def held(self, q: Array) -> Array:
         """Return how many latent parameters would lie too far from the prior, (...) for (..., m).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -170,10 +170,9 @@ def stored(
     """
     if not work.keeps_log:
         return changed(state, now=now, **parts)
-    log = added(state.log, span, taken)
-    assimilated = state.assimilated
+    parts["log"] = log = added(state.log, span, taken)
     if work.replay or work.start_window:
-        assimilated = assimilated + (taken & span.present)
+        parts["assimilated"] = state.assimilated + (taken & span.present)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
@@ -186,7 +185,7 @@ def stored(
                 "since_older": np.where(due, state.since_newer, state.since_older),
                 "since_newer": np.where(due, last, state.since_newer),
             }
-    return changed(state, now=now, log=log, assimilated=assimilated, **parts)
+    return changed(state, now=now, **parts)
 
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
@@ -196,6 +195,8 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
         return state
     # The first row that any member may still go back to; the numbers of rows move with it.
     older = state.since_older if work.back else np.full(len(state), rows - 1)
+    if older.min() < least:
+        return state
     stays = state.replays | (state.start_due != NEVER)
     first = int(np.where(stays, np.minimum(older, state.window), older).min())
     if first < least:
@@ -217,9 +218,9 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
     """Return the reports of the members after a sample."""
     # Not all of the filter is kept for what may never be read.
-    members, innovations, level, q, da = len(now), now.innovations, now.level, now.q, now.da
+    members, innovations, level, q, da = len(now.q), now.innovations, now.level, now.q, now.da
     reduction, shadows = work.filter.reduction, work.filter.shadows
-    if shadows is not None:
+    if now.kept.q.shape[1]:
         now = changed(now, kept=now.kept.forgotten())
 
     def diagnosed() -> Diagnostics[Array]:
@@ -239,8 +240,8 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, cache(diagnosed))
+    steps = told.steps + np.zeros(members, dtype=np.int64)
+    return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
 
 
 def new_window(
