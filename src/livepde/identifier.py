@@ -437,7 +437,7 @@ class Identifier:
         judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self.inputs
-        if not names and not gaps.counts[1:].any():
+        if not names and not (inputs and gaps.counts[1:].any()):
             return judge
 
         def found() -> Verdict:

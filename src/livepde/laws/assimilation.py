@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -76,8 +76,7 @@ class MemberReports:
         return MemberReports(tuple(statuses), predicted, steps, diagnosed)
 
 
-@dataclass(frozen=True, eq=False)
-class Assimilation:
+class Assimilation(NamedTuple):
     """Outcome of the assimilation of a sample.
 
     Attributes
@@ -157,7 +156,8 @@ def absorb(
         noise = np.sqrt(x.level)[:, None] * noise
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
-    largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
+    sizes = np.abs(d)
+    worst = float(np.fmax.reduce(sizes, axis=None, initial=0.0))
     variance = 1.0 + (Y * Y).sum(axis=1)
     e = d / np.sqrt(variance)
     shadows, off = filter_.shadows, None
@@ -190,10 +190,14 @@ def absorb(
         followed = shadows.updated(x, new, made, used / noise, off, span.t1)
         new = changed(new, shadows=followed)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
-    # square overflows would leave statistics that are not finite.
-    sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
-    finite = np.isfinite(sums + largest * largest)
-    return new, Assimilation(predicted, steps, OK, finite, dropped, float(largest.max()))
+    # square overflows would leave statistics that are not finite. The squares of all members tell
+    # at once that nothing of this has happened.
+    finite = np.ones(len(d), dtype=bool)
+    squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
+    if not squares + worst * worst < math.inf:
+        sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
+        finite = np.isfinite(sums + np.fmax.reduce(sizes, axis=1, initial=0.0) ** 2)
+    return new, Assimilation(predicted, steps, OK, finite, dropped, worst)
 
 
 def _judged(

@@ -67,8 +67,10 @@ class Guards:
 
         `change` is that of the reduced unknowns, in prior standard deviations, (members, k).
         """
-        near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
-        return near
+        near: Mask = np.abs(change) <= self.reach
+        if np.count_nonzero(near) == near.size:
+            return np.ones(len(near), dtype=bool)
+        return near.all(axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +96,9 @@ class Scale:
 
     def add(self, z: Array, d: Array) -> Scale:
         """Return the value after a sample z with innovations d, NaN where missing."""
-        first = np.where(np.isnan(self.first), np.abs(d), self.first)
+        first, unseen = self.first, np.isnan(self.first)
+        if np.count_nonzero(unseen):
+            first = np.where(unseen, np.abs(d), first)
         # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 

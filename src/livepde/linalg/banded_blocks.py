@@ -80,7 +80,7 @@ class BandedBlocks:
         (n, height), blocks = self.solver.storage[0], len(storage)
         lower, upper = self.solver.band
         middle, bad = lower + upper, NONE
-        if not math.isfinite(storage.sum()):
+        if not math.isfinite(np.vdot(storage, storage)):  # one of its squares may overflow, too
             bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
             # A block that is not finite is replaced by the identity, so that the others can be
             # factorised.
@@ -88,7 +88,7 @@ class BandedBlocks:
             storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T
         # Rows of the storage: fill-in, upper, main, lower diagonal. Symmetric if rows 1, 3 agree.
-        if lower == upper == 1 and (banded[1, 1:] == banded[3, :-1]).all():
+        if lower == upper == 1 and not np.count_nonzero(banded[1, 1:] != banded[3, :-1]):
             diagonal, side, info = lapack.dpttrf(banded[2], banded[3, :-1])
             if info == 0:
 

@@ -135,7 +135,6 @@ class BandedStage(MemberStage):
         # columns.
         (size, n), h, at = columns.shape[1:], stage.h, stage.at
         together = len(columns) - stage.apart
-        columns, apart = columns[:together], columns[together:]
         latent = self.model.latent
         unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
         factor = stage.factors.get(h)
@@ -147,8 +146,8 @@ class BandedStage(MemberStage):
             factor = stage.factors[h] = self._blocks.factorise(storage)
         if size == 1 and len(factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
-        known = np.array((self._mass @ columns.reshape(-1, n).T).T, order="C")
-        new = known.reshape(columns.shape)
+        known = (self._mass @ columns[:together].reshape(-1, n).T).T
+        new = np.array(known, order="C").reshape(together, size, n)
         if not self._load.zero:
             new[0] += h * self._load(at)
         if not self._boundary.zero:
@@ -162,19 +161,20 @@ class BandedStage(MemberStage):
         driven = (self._slopes @ new[0].T).T.reshape(size, -1, n)
         if offset is not None:
             driven = driven + offset
+        along = h * stage.directions
         if together > 1:
-            along = stage.directions[:, : together - 1]
-            new[1:] -= ((h * along) @ driven).transpose(1, 0, 2)
+            new[1:] -= (along[:, : together - 1] @ driven).transpose(1, 0, 2)
             new[1:] = factor.solve(new[1:])
         if not self._boundary.zero:
             new[0] += self._boundary(at)
-        if not len(apart):
+        if not stage.apart:
             return new, stage.kept
         # BLAS may round products of other shapes differently, so the separate columns share no
         # product with the others.
-        known = np.array((self._mass @ apart.reshape(-1, n).T).T, order="C").reshape(apart.shape)
-        known -= ((h * stage.directions[:, together - 1 :]) @ driven).transpose(1, 0, 2)
-        return np.concatenate([new, factor.solve(known)]), stage.kept
+        known = (self._mass @ columns[together:].reshape(-1, n).T).T
+        apart = np.array(known, order="C").reshape(-1, size, n)
+        apart -= (along[:, together - 1 :] @ driven).transpose(1, 0, 2)
+        return np.concatenate([new, factor.solve(apart)]), stage.kept
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
