@@ -22,7 +22,7 @@ from livepde.laws.bank import (
     say_the_same,
     scaled,
 )
-from livepde.laws.filter_state import FilterState, without_factors
+from livepde.laws.filter_state import FilterState
 from livepde.laws.guess import first_guess
 from livepde.laws.history import (
     added,
@@ -42,6 +42,7 @@ from livepde.laws.sensitivity_state import (
     SensitivityWork,
     new_window,
     restarted,
+    without_factors,
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed

@@ -13,14 +13,7 @@ from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = [
-    "NO_LEDGER",
-    "FilterState",
-    "along",
-    "unaccompanied",
-    "without_factors",
-    "without_ledger",
-]
+__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied"]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -99,20 +92,8 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     return moved
 
 
-def without_factors(x: FilterState) -> FilterState:
-    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
-    if not (x.kept.q.shape[1] or x.shadows.u.shape[1]):
-        return x
-    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())
-
-
-def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter state without the data that only its verdict needs."""
-    if x.ledger is NO_LEDGER:
-        return x
-    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
-
-
 def unaccompanied(x: FilterState) -> FilterState:
     """Return a filter state without its ledger and without the errors of the discretisation."""
-    return changed(without_ledger(x), shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))
+    members, k = x.da.shape
+    causes, shadows = np.zeros((*x.causes.shape[:2], 0)), ShadowState.none(members, x.u.shape[1], k)
+    return changed(x, causes=causes, ledger=NO_LEDGER, shadows=shadows)

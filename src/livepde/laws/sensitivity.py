@@ -18,10 +18,10 @@ from livepde.laws.assimilation import (
     assimilate,
 )
 from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter, MeanFilter
-from livepde.laws.filter_state import NO_LEDGER, FilterState, without_factors, without_ledger
+from livepde.laws.filter import Filter, MeanFilter, MemberSensors
+from livepde.laws.filter_state import NO_LEDGER, FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
-from livepde.laws.guards import Guards, Scale
+from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
@@ -29,18 +29,20 @@ from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put, take, where
-from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
+    Scale,
     SensitivityState,
     SensitivityWork,
     reports_of,
     shortened,
     stored,
+    without_factors,
+    without_ledger,
 )
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
@@ -428,8 +430,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = usual & ~(replays & full & ~state.replay.active)
         parts: dict[str, Any] = {}
         if (guards := self.guards) is not None:
-            near = guards.within_reach(x.da - before.da)
-            usual = usual & (near if replays is None else replays | near)
+            far = np.abs(x.da - before.da) > guards.reach
+            if np.count_nonzero(far):
+                near = ~far.any(axis=1)
+                usual = usual & (near if replays is None else replays | near)
             parts["scale"] = scale = state.scale.add(span.z1, span.z1 - told.predicted)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.

@@ -179,10 +179,10 @@ class Span:
         """Return the span of one interval, common to all members."""
         first = last = NO_INPUTS
         if channels:
-            last = np.array([[interval.inputs1[name] for name in channels]])
+            last = np.array([list(map(interval.inputs1.__getitem__, channels))])
             first = last
             if interval.inputs0 is not interval.inputs1:
-                first = np.array([[interval.inputs0[name] for name in channels]])
+                first = np.array([list(map(interval.inputs0.__getitem__, channels))])
         t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
         noise = None if interval.noise is None else interval.noise[None]
         gaps = None
@@ -196,8 +196,9 @@ class Span:
     @property
     def start(self) -> float:
         """Most frequent start time of the members."""
-        if len(self.t0) == 1 or (self.t0 == self.t0[0]).all():
-            return float(self.t0[0])
+        first = float(self.t0[0])
+        if len(self.t0) == 1 or (self.t0 == first).all():
+            return first
         times, counts = np.unique(self.t0, return_counts=True)
         return float(times[np.argmax(counts)])
 
