@@ -254,21 +254,17 @@ class Filter:
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
         # A coordinate that gains in one member has a row in all of them: members share one array.
-        grows = np.flatnonzero((gained > 0.0).any(axis=0))
-        members, _, k = x.C.shape
-        new = np.zeros((members, len(grows), k))
-        new[:, np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
-        return changed(
-            x,
-            q=self.reduction.predict(x.q, h),
-            da=x.da @ F.T,
-            U=_extended(x.U, len(grows)),
-            C=np.concatenate([x.C @ F.T, new], axis=1),
-            past=_extended(x.past, len(grows)),
-            causes=_extended(x.causes, len(grows)),
-            age=x.age + h,
-            shadows=changed(x.shadows, a=x.shadows.a @ F.T),
-        )
+        (grows,) = (gained > 0.0).any(axis=0).nonzero()
+        members, r, k = x.C.shape
+        C = np.zeros((members, r + len(grows), k))
+        C[:, :r] = x.C @ F.T
+        C[:, r + np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
+        parts: dict[str, Any] = {"C": C, "U": _extended(x.U, len(grows))}
+        parts |= {name: _extended(getattr(x, name), len(grows)) for name in ("past", "causes")}
+        if x.shadows.a.shape[1]:
+            parts["shadows"] = changed(x.shadows, a=x.shadows.a @ F.T)
+        q, da = self.reduction.predict(x.q, h), x.da @ F.T
+        return changed(x, q=q, da=da, age=x.age + h, **parts)
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
@@ -489,7 +485,10 @@ class MeanFilter(Filter):
 
 def _extended(rows: Array, count: int) -> Array:
     """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
-    return np.concatenate([rows, np.zeros((len(rows), count, rows.shape[2]))], axis=1)
+    members, r, size = rows.shape
+    longer = np.zeros((members, r + count, size))
+    longer[:, :r] = rows
+    return longer
 
 
 def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:

@@ -30,7 +30,10 @@ def replay_slice(
     replay = work.replay
     if replay is None:
         return state, None
-    due = (state.assimilated >= state.due) & ~state.replay.active
+    active = state.replay.active
+    due = (state.assimilated >= state.due) & ~active
+    if not np.count_nonzero(active | due):
+        return state, None
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
     return _advanced(work, state, replay.slice)
