@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,8 @@ class Channels:
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
         """Return assimilated values and their noise, withheld values, and inputs, all checked.
 
-        The noise is None if no value has one of its own, NaN where one has none.
+        The noise is None if no value has one of its own, NaN where one has none. Among the inputs
+        may be other channels.
         """
         z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
@@ -139,8 +141,7 @@ class Channels:
             values[name] = value if usual else number(value, f"channel '{name}'")
         noise = own_noise(_row(self.observed.names, stds)) if stds else None
         withheld = _row(self.hidden, values) if self.hidden else NOTHING
-        named = {name: values[name] for name in self.inputs if name in values}
-        return _row(self.observed.names, values), noise, withheld, named
+        return _row(self.observed.names, values), noise, withheld, values
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
         """Return value and noise of a reading given as a pair."""
@@ -213,4 +214,4 @@ class Channels:
 
 def _row(names: Sequence[str], values: Mapping[str, float]) -> Array:
     """Return the values of some names as an array, NaN where there is none."""
-    return np.array([values.get(name, math.nan) for name in names])
+    return np.array(list(map(values.get, names, repeat(math.nan))))

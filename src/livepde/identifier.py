@@ -381,13 +381,6 @@ class Identifier:
         """Return the belief of the law about the physical parameter."""
         return self.problem.physical(self.latent_belief())
 
-    def _reader(self) -> Callable[[], Belief]:
-        """Return a function that gives the current belief of the law, of the physical parameter."""
-        # Estimates that are kept hold the small state of the law; mean and factors are computed
-        # when read.
-        read, problem = self.law.reader(self._work, self._state), self.problem
-        return read if self.model.latent.plain else lambda: problem.physical(read())
-
     def _estimate(
         self,
         t: float,
@@ -399,7 +392,10 @@ class Identifier:
         *,
         scored: bool = False,
     ) -> Estimate:
-        read, error = self._reader(), withheld
+        # Estimates that are kept hold the small state of the law; mean and factors are computed
+        # when read.
+        latent, problem, error = self.law.reader(self._work, self._state), self.problem, withheld
+        read = latent if self.model.latent.plain else lambda: problem.physical(latent())
         if self.withheld is not None:
             belief = read()
             read = lambda: belief  # noqa: E731

@@ -284,8 +284,10 @@ class Report:
 
 def finite(*arrays: Array | None) -> bool:
     """Return whether products of the squares of some arrays are finite; None counts as empty."""
-    # A sum is NaN with any of its terms, which a maximum need not be.
-    return bool(sum([np.vdot(a, a) for a in arrays if a is not None]) <= LARGEST)
+    total = 0.0  # NaN with any of its terms, which a maximum need not be
+    for a in arrays:
+        total += 0.0 if a is None else np.vdot(a, a)
+    return bool(total <= LARGEST)
 
 
 def numerical(error: Exception) -> Status | None:
