@@ -28,7 +28,7 @@ import numpy as np
 from livepde.fem import Field, LogNormal, Normal, Sobolev, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, Replay, SensitivityLaw
-from livepde.laws.filter import MemberSensors
+from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array

@@ -192,7 +192,7 @@ def absorb(
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
-    finite = np.ones(len(d), dtype=bool)
+    finite = x.member >= 0  # all of them
     squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
     if not squares + worst * worst < math.inf:
         sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)

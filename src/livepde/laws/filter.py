@@ -20,7 +20,6 @@ from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import scipy.sparse as sp
 from scipy.linalg import lapack
 
 from livepde.fem import Moment
@@ -28,11 +27,11 @@ from livepde.laws.filter_state import FilterState, along
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed
+from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array, BlockFactor, IntArray, Mask, compact
-from livepde.observation import Observed
+from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
@@ -44,7 +43,7 @@ from livepde.stepping import (
 )
 from livepde.verdict import Judge
 
-__all__ = ["Filter", "FollowedErrors", "MeanFilter", "MemberSensors", "Update", "contraction"]
+__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update", "contraction"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -77,65 +76,6 @@ class Update(NamedTuple):
         """Return log det (I + Y^T Y)/2, shape (members,)."""
         spread: Array = -np.log(np.abs(np.diagonal(self.W, axis1=1, axis2=2))).sum(axis=1)
         return spread
-
-
-class MemberSensors:
-    """Predicted readings of each member and their derivatives, linear about its point."""
-
-    def __init__(self, problem: Problem, reduction: Reduction) -> None:
-        self.problem = problem
-        self.reduction = reduction
-        observed = problem.observed
-        # Others may read the unknowns, inputs or the time, or bend at the state.
-        self.fixed = (
-            type(observed) is Observed
-            and not observed.observation.directs
-            and not observed.observation.inputs
-        )
-
-    @cached_property
-    def _G(self) -> sp.csr_array | Array:
-        return compact(self.problem.observed.G)
-
-    def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
-        """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
-
-        Linear about the linearisation point.
-        """
-        if self.fixed:
-            return (self._G @ (x.u + x.du).T).T, self.rows(x, x.U, x.C, at)
-        predicted, rows = [], []
-        for k in range(len(x)):
-            deviates = bool(x.du[k].any() or x.da[k].any())
-            U, C = x.U[k], x.C[k]
-            # The offset of the estimate is one more row: so predictions stay linear about the
-            # point.
-            if deviates:
-                U, C = np.vstack([U, x.du[k]]), np.vstack([C, x.da[k]])
-            z, Y = self._of_one(x.u[k], x.q[k], U, C, at, k)
-            predicted.append(z + Y[-1] if deviates else z)
-            rows.append(Y[: len(x.U[k])])
-        return np.array(predicted), np.array(rows)
-
-    def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
-        """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
-        if self.fixed:
-            members, r, n = U.shape
-            return np.asarray((self._G @ U.reshape(-1, n).T).T.reshape(members, r, -1))
-        each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
-        return np.array(list(each))
-
-    def _of_one(
-        self, u: Array, q: Array, U: Array, C: Array, at: Moments, k: int
-    ) -> tuple[Array, Array]:
-        """Return the readings of one member, and those of rows [U C]."""
-        observed, latent, moment = self.problem.observed, self.problem.model.latent, at.member(k)
-        physical = latent.value(q)
-        H_u, H_q = observed.jacobian(u, physical, moment)
-        Y: Array = np.asarray((H_u @ U.T).T)
-        if H_q is not None:
-            Y = Y + self.reduction.directions(q[None], C[None])[0] @ H_q.T
-        return observed.predict(u, physical, moment), Y
 
 
 class FollowedErrors(Protocol):

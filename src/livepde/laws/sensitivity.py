@@ -18,7 +18,7 @@ from livepde.laws.assimilation import (
     assimilate,
 )
 from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter, MeanFilter, MemberSensors
+from livepde.laws.filter import Filter, MeanFilter
 from livepde.laws.filter_state import NO_LEDGER, FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards
@@ -29,6 +29,7 @@ from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put, take, where
+from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
 from livepde.laws.replay import Replay, ReplayState
@@ -392,7 +393,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         begun = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
         new, told, usual = self._together(work, begun, span)
         reports = reports_of(work, new.now, told)
-        if not usual.all():
+        if np.count_nonzero(usual) < usual.size:
             new, reports = self._apart(work, begun, new, reports, usual, span)
             usual = np.array([status.ok for status in reports.statuses])
             if not usual.any():
@@ -402,7 +403,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if replayed is not None:
                 reports = reports.updated(replayed)
         due = new.assimilated >= new.start_due
-        if due.any():
+        if np.count_nonzero(due):
             new, started = iterate_starts(work, new, due)
             if started is not None:
                 taken = usual

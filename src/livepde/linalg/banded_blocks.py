@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -16,8 +17,7 @@ __all__ = ["BandedBlocks", "BlockFactor"]
 NONE = np.zeros(0, dtype=np.intp)
 
 
-@dataclass(frozen=True, eq=False)
-class BlockFactor:
+class BlockFactor(NamedTuple):
     """Factors of the diagonal blocks of a block-diagonal matrix.
 
     Attributes

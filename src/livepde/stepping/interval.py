@@ -211,8 +211,10 @@ class Span:
     @property
     def present(self) -> Mask:
         """Mask of members with a measurement at the end, shape (members,) or (1,)."""
-        some: Mask = np.asarray(np.isfinite(self.z1).any(axis=1))
-        return some
+        given = np.isfinite(self.z1)
+        if np.count_nonzero(given) == given.size:
+            return np.ones(len(given), dtype=bool)
+        return np.asarray(given.any(axis=1))
 
     def at(self, t: float) -> Moments:
         """Return time and inputs at t of members with a common start."""
