@@ -160,7 +160,7 @@ class AutoState:
     @property
     def leader(self) -> int:
         """The member with the largest weight."""
-        return int(np.argmax(self.weights))
+        return int(self.weights.argmax())
 
     @property
     def awake(self) -> list[int]:
@@ -170,7 +170,7 @@ class AutoState:
 
     def at(self, number: int) -> int:
         """Return the position of a member that is awake among `members`."""
-        return int(np.flatnonzero(self.members.now.member == number)[0])
+        return int((self.members.now.member == number).nonzero()[0][0])
 
 
 def normalised(weights: Array) -> Array:

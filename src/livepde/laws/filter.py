@@ -185,6 +185,15 @@ class Filter:
 
         Their process noise stands in new rows of the square root, in the same order for every h.
         """
+        end = self.unknowns_after(x, h)
+        grown = end.C.shape[1] - x.C.shape[1]
+        if not grown:
+            return end
+        U, past, causes = (_extended(part, grown) for part in (x.U, x.past, x.causes))
+        return changed(end, U=U, past=past, causes=causes)
+
+    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
+        """Return q, da, C and the shifts by shadows after a time h; all else is that of before."""
         if not self.moves or h == 0.0:
             return x
         drifts = self.drifts(x.member)
@@ -199,12 +208,11 @@ class Filter:
         C = np.zeros((members, r + len(grows), k))
         C[:, :r] = x.C @ F.T
         C[:, r + np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
-        parts: dict[str, Any] = {"C": C, "U": _extended(x.U, len(grows))}
-        parts |= {name: _extended(getattr(x, name), len(grows)) for name in ("past", "causes")}
-        if x.shadows.a.shape[1]:
-            parts["shadows"] = changed(x.shadows, a=x.shadows.a @ F.T)
+        shadows = x.shadows
+        if shadows.a.shape[1]:
+            shadows = changed(shadows, a=shadows.a @ F.T)
         q, da = self.reduction.predict(x.q, h), x.da @ F.T
-        return changed(x, q=q, da=da, age=x.age + h, **parts)
+        return changed(x, q=q, da=da, C=C, age=x.age + h, shadows=shadows)
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
@@ -267,7 +275,7 @@ class Filter:
             # An inner stage sees the unknowns at its own time: those of the end would reduce the
             # order of the time scheme.
             if self.moves and t != stop:
-                now = self.predict_unknowns(x, t - start)
+                now = self.unknowns_after(x, t - start)
                 q, along = now.q, directions(now)
             same = factors if q is end.q else {}
             work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
@@ -415,7 +423,7 @@ class MeanFilter(Filter):
         parts = {item.name: getattr(filter_, item.name) for item in fields(filter_)}
         return cls(**(parts | {"judge": None, "shadows": None}))
 
-    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
+    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
         """Return the filter state with the mean of the unknowns predicted over a time h."""
         if not self.moves or h == 0.0:
             return x
