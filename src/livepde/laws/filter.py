@@ -203,7 +203,8 @@ class Filter:
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
         # A coordinate that gains in one member has a row in all of them: members share one array.
-        (grows,) = (gained > 0.0).any(axis=0).nonzero()
+        gains: Mask = np.asarray((gained > 0.0).any(axis=0))
+        (grows,) = gains.nonzero()
         members, r, k = x.C.shape
         C = np.zeros((members, r + len(grows), k))
         C[:, :r] = x.C @ F.T
@@ -251,9 +252,9 @@ class Filter:
         """Return the state at the end of a part of a span."""
         end, kept = self.predict_unknowns(x, stop - start), x.kept
         deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
-        off = np.zeros(len(x.member), dtype=bool)
+        off: Mask = np.zeros(len(x.member), dtype=bool)
         if deviates:
-            off = x.da.any(axis=1) | x.du.any(axis=1)
+            off = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
         shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
