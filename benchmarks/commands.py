@@ -98,6 +98,7 @@ class Program:
             rich_markup_mode="rich",
             context_settings={"help_option_names": ["-h", "--help"]},
         )
+        self.app.callback()(lambda: None)  # so that a program of one command has its name, too
 
     def command(self, quick: str, name: str | None = None) -> Callable[[Measurement], Measurement]:
         """Return a decorator that adds a function as a command with --quick and --json.
@@ -124,10 +125,8 @@ class Program:
                         given[key] = count.quick
                 given |= {key: shared[key] for key in shared if key in parameters}
                 words = self._words(context)
-                title = inspect.getdoc(function) or ""
-                outcome = conducted(
-                    lambda: function(**given), shared["out"], words, title.split("\n")[0]
-                )
+                title = (inspect.getdoc(function) or "").split("\n")[0].rstrip(".")
+                outcome = conducted(lambda: function(**given), shared["out"], words, title)
                 report_outcome(outcome, words, shared["as_json"])
 
             shared = {

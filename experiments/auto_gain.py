@@ -7,9 +7,9 @@ grid, with Tikhonov in the V~ norm by the discrepancy principle with the exact l
 relative L2 errors of q after the last sample, t = 60; q = 0 has 1. The prior deviation of `seed` is
 0.01, that of `seed-excited` 1.
 
-    python experiments/auto_gain.py
+    python -m experiments.auto_gain
 
-takes the seeds 100 to 109 and about a quarter of an hour; `python experiments/auto_gain.py seed 100
+takes the seeds 100 to 109 and about a quarter of an hour; `python -m experiments.auto_gain seed 100
 101` runs one example with these seeds.
 """
 

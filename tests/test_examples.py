@@ -51,9 +51,8 @@ def test_every_example_is_tested():
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "experiments").glob("*.py")), ids=lambda p: p.stem)
-def test_experiments_find_what_they_import(path, monkeypatch):
-    monkeypatch.syspath_prepend(str(path.parent))
-    assert runpy.run_path(str(path), run_name="imported")
+def test_experiments_find_what_they_import(path):
+    assert runpy.run_module(f"experiments.{path.stem}", run_name="imported")
 
 
 @pytest.mark.parametrize(
