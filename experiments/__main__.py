@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
-from benchmarks.commands import Program
+import typer
+
+from benchmarks.commands import Program, chosen
 from livepde.cli import main
 from livepde.runs.outcome import Outcome
 
@@ -31,6 +34,25 @@ def degenerate(quick: bool = False, as_json: bool = False) -> Outcome:
     from experiments.degenerate import degenerate as study
 
     return study(quick=quick, progress=not as_json)
+
+
+@program.command(quick="The first families of one and of two dimensions only.")
+def dimensions(
+    truth: Annotated[
+        str, typer.Option(help="Where the data come from: discrete (the same scheme), analytic.")
+    ] = "discrete",
+    quick: bool = False,
+    as_json: bool = False,
+) -> Outcome:
+    """Run the paper's equation in 1D, 2D and 3D with Q = H^2: orders of convergence.
+
+    Example:  python -m experiments dimensions --truth analytic
+    """
+    from experiments.dimensions import NOTES
+    from experiments.dimensions import dimensions as study
+
+    chosen([truth], NOTES, "truth")
+    return study(truth, quick=quick, progress=not as_json)  # type: ignore[arg-type]
 
 
 if __name__ == "__main__":

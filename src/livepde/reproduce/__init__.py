@@ -7,7 +7,6 @@ reproduce NAME` and the tests run them.
 from __future__ import annotations
 
 from livepde.reproduce.boiger2016 import BOIGER2016
-from livepde.reproduce.dimensions import DIMENSIONS
 from livepde.reproduce.exact import EXACT
 from livepde.reproduce.experiment import Experiment
 from livepde.reproduce.noisy import SEED_EXCITED_NOISE
@@ -23,7 +22,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         SEED,
         SEED_EXCITED,
         SEED_EXCITED_NOISE,
-        DIMENSIONS,
         BOIGER2016,
         RELATIVES,
         EXACT,
