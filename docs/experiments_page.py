@@ -46,7 +46,7 @@ docs/experiments_page.py`. The cases on data of others have [a page of their own
 """
 COMMANDS = {  # what draws, and checks its numbers -> how it is run
     **dict.fromkeys(EXPERIMENTS, "livepde reproduce"),
-    **dict.fromkeys(("degenerate", "dimensions"), "python -m experiments"),
+    **dict.fromkeys(("degenerate", "dimensions", "relatives"), "python -m experiments"),
     "control": "python -m benchmarks",
 }
 PARTS = {

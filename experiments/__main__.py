@@ -55,5 +55,16 @@ def dimensions(
     return study(truth, quick=quick, progress=not as_json)  # type: ignore[arg-type]
 
 
+@program.command(quick="The data of the paper's example only.")
+def relatives(quick: bool = False, as_json: bool = False) -> Outcome:
+    """Compare the laws of Boiger and Kaltenbacher, Baumeister et al. and Kügler on the same data.
+
+    Example:  python -m experiments relatives --json
+    """
+    from experiments.relatives import relatives as study
+
+    return study(quick=quick, progress=not as_json)
+
+
 if __name__ == "__main__":
     sys.exit(main(app))

@@ -10,7 +10,6 @@ from livepde.reproduce.boiger2016 import BOIGER2016
 from livepde.reproduce.exact import EXACT
 from livepde.reproduce.experiment import Experiment
 from livepde.reproduce.noisy import SEED_EXCITED_NOISE
-from livepde.reproduce.relatives import RELATIVES
 from livepde.reproduce.seed import SEED
 from livepde.reproduce.seed_excited import SEED_EXCITED
 
@@ -23,7 +22,6 @@ EXPERIMENTS: dict[str, Experiment] = {
         SEED_EXCITED,
         SEED_EXCITED_NOISE,
         BOIGER2016,
-        RELATIVES,
         EXACT,
     )
 }
