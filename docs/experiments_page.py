@@ -46,7 +46,9 @@ docs/experiments_page.py`. The cases on data of others have [a page of their own
 """
 COMMANDS = {  # what draws, and checks its numbers -> how it is run
     **dict.fromkeys(EXPERIMENTS, "livepde reproduce"),
-    **dict.fromkeys(("degenerate", "dimensions", "relatives"), "python -m experiments"),
+    **dict.fromkeys(
+        ("seed-excited-noise", "degenerate", "dimensions", "relatives"), "python -m experiments"
+    ),
     "control": "python -m benchmarks",
 }
 PARTS = {

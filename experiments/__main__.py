@@ -66,5 +66,18 @@ def relatives(quick: bool = False, as_json: bool = False) -> Outcome:
     return study(quick=quick, progress=not as_json)
 
 
+@program.command(
+    name="seed-excited-noise", quick="One seed of white noise of 1 %, no search in hindsight."
+)
+def seed_excited_noise(quick: bool = False, as_json: bool = False) -> Outcome:
+    """Measure what smoothing in time and space is good for: 1, 5 and 10 % noise, five seeds.
+
+    Example:  python -m experiments seed-excited-noise --quick
+    """
+    from experiments.seed_excited_noise import seed_excited_noise as study
+
+    return study(quick=quick, progress=not as_json)
+
+
 if __name__ == "__main__":
     sys.exit(main(app))

@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from experiments.seed_excited_noise import WhiteNoise
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.observation import Discrepancy, Full, Subdomain, Tikhonov
-from livepde.reproduce import noisy, seed, seed_excited
+from livepde.reproduce import seed, seed_excited
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
@@ -73,7 +74,7 @@ def compare(name: str, level: float, number: int) -> tuple[float, float]:
         u_true=module.u_true,
         times=module.TIMES,
     )
-    samples = list(noisy.WhiteNoise(twin, level, number) if level else twin)
+    samples = list(WhiteNoise(twin, level, number) if level else twin)
     sensors = smoothed(observation, level) if level else observation
 
     def u0(x: Any) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from livepde.reproduce.boiger2016 import BOIGER2016
 from livepde.reproduce.exact import EXACT
 from livepde.reproduce.experiment import Experiment
-from livepde.reproduce.noisy import SEED_EXCITED_NOISE
 from livepde.reproduce.seed import SEED
 from livepde.reproduce.seed_excited import SEED_EXCITED
 
@@ -20,7 +19,6 @@ EXPERIMENTS: dict[str, Experiment] = {
     for item in (
         SEED,
         SEED_EXCITED,
-        SEED_EXCITED_NOISE,
         BOIGER2016,
         EXACT,
     )
