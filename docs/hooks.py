@@ -75,7 +75,9 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
     kind = model["properties"].get("kind", {}).get("const")
     if kind:
         title += f", `kind = {json.dumps(kind)}`"
-    yield f"## {title}\n\n{model['description']}\n\n| key | value | default |\n|---|---|---|"
+    # Options of a law are documented at length where they are declared: the summary is enough here.
+    about = model["description"].partition("\n\n")[0]
+    yield f"## {title}\n\n{about}\n\n| key | value | default |\n|---|---|---|"
     needed = model.get("required", ())
     inner: list[tuple[str, str]] = []
     for key, value in model["properties"].items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from livepde.laws import (
 )
 
 __all__ = ["law_of"]
+
+Options = TypeVar("Options")
 
 
 def law_of(frame: Frame) -> AnyLaw:
@@ -70,9 +72,7 @@ def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
 def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
     """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
     given = spec.jumps
-    found: Jumps | None = (
-        Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
-    )
+    found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
     names = (found.unknowns if found is not None else None) or ()
     known = [*frame.spec.unknowns, *unknowns_of(frame)]
     for name in names:
@@ -82,11 +82,11 @@ def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
     return found
 
 
-def _chosen(kind: Any, given: Any) -> Any:
-    """Return an option of a law that a case has as true, false or a table."""
+def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
+    """Return options of a law that a case has as true (the defaults), false or a table."""
     if isinstance(given, bool):
         return kind() if given else None
-    return kind(**given.model_dump())
+    return given
 
 
 def _noise(frame: Frame, spec: SensitivitySpec) -> float | str | None:

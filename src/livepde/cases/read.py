@@ -7,32 +7,15 @@ import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 
 from livepde.cases.limits import check_document, check_text
-from livepde.cases.schema import (
-    AutoSpec,
-    CaseSpec,
-    ChannelSpec,
-    CorrelatedSpec,
-    DataSpec,
-    EvolutionSpec,
-    GradientSpec,
-    GuardsSpec,
-    JumpsSpec,
-    MeshSpec,
-    OutputSpec,
-    RegionSpec,
-    ReplaySpec,
-    SensitivitySpec,
-    ShadowsSpec,
-    StepsSpec,
-    UnknownSpec,
-    VariantSpec,
-)
+from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError
 
 __all__ = [
@@ -70,23 +53,7 @@ EXPECTED = {
     "too_short": "at least one entry",
     "string_too_short": "a name",
 }
-# Keys of a table, * for any name -> its model.
-TABLES: dict[str, type[BaseModel]] = {
-    "mesh": MeshSpec,
-    "data": DataSpec,
-    "steps": StepsSpec,
-    "output": OutputSpec,
-    "unknowns.*": UnknownSpec,
-    "regions.*": RegionSpec,
-    "channels.*": ChannelSpec,
-    "law.guards": GuardsSpec,
-    "law.shadows": ShadowsSpec,
-    "law.jumps": JumpsSpec,
-    "law.replay": ReplaySpec,
-    "variants.*": VariantSpec,
-    "*.evolution": EvolutionSpec,
-    "*.correlated": CorrelatedSpec,
-}
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # of a model, of a dataclass
 
 
 def read_text(path: Path) -> str:
@@ -199,27 +166,26 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     # where true, false or a table may stand, a table is not wrong for being no boolean.
     def rank(item: Any) -> tuple[bool, bool]:
         table = item["type"] == "bool_type" and isinstance(item["input"], dict)
-        return item["type"] != "extra_forbidden", table
+        return item["type"] not in UNKNOWN_KEY, table
 
     found = min(error.errors(), key=rank)
-    path = _path(found["loc"], raw)
-    key = ".".join(path)
     kind, got = found["type"], found["input"]
-    if kind == "extra_forbidden":
+    path = _path(found["loc"], raw, kind == "missing")
+    key = ".".join(path)
+    if kind in UNKNOWN_KEY:
         return f"there is no key '{key}'; {did_you_mean(path[-1], _keys(path[:-1], raw))}"
     if kind == "missing":
         return f"the key '{key}' is missing."
     context = found.get("ctx", {})
-    if kind == "union_tag_not_found":
-        return f"the key '{key}.kind' is missing; expected 'sensitivity' or 'gradient'."
     if kind == "union_tag_invalid":
         tag = str(context["tag"])
-        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, ['auto', 'sensitivity', 'gradient'])}"
+        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, _choices(context['expected_tags']))}"
     if kind == "literal_error":
-        choices = str(context["expected"]).replace(" or ", ", ").replace("'", "").split(", ")
-        return f"{key}: got {_short(got)}; {did_you_mean(str(got), choices)}"
+        return f"{key}: got {_short(got)}; {did_you_mean(str(got), _choices(context['expected']))}"
     if kind == "value_error":
-        message = str(context["error"])
+        # Options of a law refuse a value themselves: "Guards: reach must be a positive number."
+        *_, last = "", *found["loc"]
+        message = str(context["error"]).removeprefix(f"{last}: ").removesuffix(".")
         shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
     expected = EXPECTED.get(kind)
@@ -231,14 +197,22 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     return f"{key}: got {_short(got)}; expected {expected}."
 
 
+def _choices(expected: str) -> list[str]:
+    """Return the words that a message of pydantic quotes."""
+    return re.findall(r"'([^']*)'", expected)
+
+
 def _short(value: Any) -> str:
     """Return a value as it is shown in a sentence."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
-def _path(loc: tuple[int | str, ...], raw: Any) -> list[str]:
-    """Return the keys of an error as the file has them, without pydantic's own tags."""
+def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
+    """Return the keys of an error as the file has them, without pydantic's own tags.
+
+    The last one of a key that is missing stands in no file.
+    """
     path: list[str] = []
     here = raw
     for k, part in enumerate(loc):
@@ -248,23 +222,42 @@ def _path(loc: tuple[int | str, ...], raw: Any) -> list[str]:
         elif isinstance(here, list) and isinstance(part, int) and part < len(here):
             here = here[part]
             path[-1] += f"[{part}]"
-        elif k == len(loc) - 1 and isinstance(here, dict):
-            path.append(str(part))  # a missing key
+        elif missing and k == len(loc) - 1:
+            path.append(str(part))
     return path or [str(part) for part in loc[:1]]
 
 
-def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
+def _keys(path: Iterable[str], raw: Mapping[str, Any]) -> list[str]:
     """Return the keys that a table may have."""
-    model: type[BaseModel] | None = CaseSpec
-    if path == ["law"]:
-        kind = raw["law"].get("kind") if isinstance(raw.get("law"), dict) else ""
-        laws: dict[str, type[BaseModel]] = {"auto": AutoSpec, "gradient": GradientSpec}
-        model = laws.get(str(kind), SensitivitySpec)
-    elif path:
-        first = path[0].partition("[")[0]  # variants[0] is one of the variants
-        region = "regions.*" if path[2:3] == ["regions"] and len(path) == 4 else ""
-        names = (region, ".".join(path), f"*.{path[-1]}", f"{first}.*")
-        model = next((TABLES[name] for name in names if name in TABLES), None)
-    if model is None:
-        return []
-    return [item.alias or name for name, item in model.model_fields.items()]
+    here: Any = raw
+    kinds: list[Any] = [CaseSpec]
+    for part in path:
+        key, _, number = part.partition("[")  # variants[0] is one of the variants
+        here = here[key][int(number[:-1])] if number else here[key]
+        below = [get_args(one)[1] if _is_named(one) else _fields(one).get(key) for one in kinds]
+        kinds = [inner for one in below for inner in _tables(one)]
+    # Of several laws it is the one that the table names.
+    tables = map(_fields, kinds)
+    kind = here.get("kind", "sensitivity")
+    fits = (known for known in tables if kind in get_args(known.get("kind", Literal[kind])))
+    return list(dict.fromkeys(chain.from_iterable(fits)))
+
+
+def _tables(kind: Any) -> Iterator[Any]:
+    """Yield the tables among the types that a value may have, and mappings from names."""
+    if _is_named(kind) or _fields(kind):
+        yield kind
+    else:
+        for inner in get_args(kind):
+            yield from _tables(inner)
+
+
+def _is_named(kind: Any) -> bool:
+    return get_origin(kind) is dict
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    """Return key -> type of a table; empty for another type."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return {item.alias or name: item.annotation for name, item in kind.model_fields.items()}
+    return get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
