@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange import export_fmu
 from livepde.exchange.unit_process import UnitProcess, of_case

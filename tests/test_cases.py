@@ -13,9 +13,9 @@ import pytest
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
-from livepde.cases.settings import parse, to_toml
-from livepde.cases.template import write_template
+from livepde.cases.read import parse, to_toml
 from livepde.cases.units import convert
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.streams import Twin

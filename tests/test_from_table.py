@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.data_sources import source_of
+from livepde.cases.data import source_of
 from livepde.cases.measured import measured
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
 

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import cases
 from livepde.cases.measured import measured
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.fem import Inputs, Moment
 from livepde.models import EQUATIONS

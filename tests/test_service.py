@@ -17,7 +17,7 @@ from commands import bad, call, estimates, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.data_sources import source_of
+from livepde.cases.data import source_of
 from livepde.cases.live_case import Wiring
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal

@@ -22,8 +22,7 @@ from benchmarks.faults.plants import PATIENCE
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from benchmarks.faults.run import hearing, undisturbed
 from livepde.cases import Case, load
-from livepde.cases.data import data_file
-from livepde.cases.data_sources import policy_of, source_of
+from livepde.cases.data import data_file, policy_of, source_of
 from livepde.errors import LivepdeError
 from livepde.identifier import Sample
 from livepde.records import Record

@@ -15,6 +15,7 @@ import numpy as np
 
 from livepde.cases.case_channels import (
     columns_of,
+    expanded,
     initial_of,
     initial_weights,
     input_noise_of,
@@ -22,15 +23,13 @@ from livepde.cases.case_channels import (
     sensor_notes,
 )
 from livepde.cases.case_frame import Frame
-from livepde.cases.case_model import drive_notes, mesh_of, model_of, options_of, process_notes
-from livepde.cases.conditions import conditioned
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
-from livepde.cases.instruments import expanded
+from livepde.cases.geometry import mesh_of
 from livepde.cases.laws import law_of
-from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
+from livepde.cases.process import conditioned, drive_notes, model_of, options_of, process_notes
+from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml, to_toml
 from livepde.cases.schema import VariantSpec
-from livepde.cases.settings import apply, to_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample

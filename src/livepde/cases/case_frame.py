@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from livepde.cases.limits import LARGEST, SMALLEST
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
-from livepde.cases.units import convert
+from livepde.cases.units import LARGEST, SMALLEST, convert
 from livepde.errors import CaseError
 from livepde.models import Equation
 
@@ -44,6 +43,19 @@ class Frame:
         """Name of the case: that of its file, or of its folder if the file is 'case.toml'."""
         path = self.path.absolute()
         return path.stem if path.stem != "case" else path.parent.name or "case"
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The inputs of the equation that are constants, in its units."""
+        known, given = self.equation.inputs, self.spec.inputs
+        self.only(given, known, "inputs")
+        for name in given:
+            if name in self.spec.channels:
+                raise self.error(f"inputs.{name}", f"there is a channel '{name}', too; keep one.")
+        return {
+            name: self.convert(value, known[name].unit, f"inputs.{name}")
+            for name, value in given.items()
+        }
 
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""

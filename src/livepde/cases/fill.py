@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from livepde.cases.read import is_blank, read_toml, spec_of
-from livepde.cases.settings import apply, key_path, toml_line
+from livepde.cases.read import apply, is_blank, key_path, read_toml, spec_of, toml_line
 from livepde.errors import CaseError
 
 __all__ = ["Blank", "blanks", "filled", "with_channel"]

@@ -6,9 +6,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from livepde.cases.case_channels import noise_of
+from livepde.cases.case_channels import noise_of, unknowns_of
 from livepde.cases.case_frame import Frame
-from livepde.cases.instruments import unknowns_of
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
 from livepde.errors import LawError

@@ -13,8 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from livepde.cases.case import Case, Prepared
-from livepde.cases.data import check_hours, read_data
-from livepde.cases.data_sources import Data, limits_of, policy_of, publishers_of, source_of
+from livepde.cases.data import (
+    Data,
+    check_hours,
+    limits_of,
+    policy_of,
+    publishers_of,
+    read_data,
+    source_of,
+)
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted

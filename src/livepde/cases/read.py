@@ -1,33 +1,43 @@
-"""Reader of case files: TOML to a checked specification, or one sentence about an error."""
+"""Reader of case files: TOML, with settings from outside, to a checked specification."""
 
 from __future__ import annotations
 
+import copy
 import difflib
+import math
 import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
+from datetime import date, time
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel, ValidationError
 
-from livepde.cases.limits import check_document, check_text
 from livepde.cases.schema import CaseSpec
+from livepde.cases.units import LARGEST
 from livepde.errors import CaseError
 
 __all__ = [
     "BLANK",
+    "apply",
     "beside",
     "blanks_in",
+    "check_document",
+    "check_text",
     "did_you_mean",
     "is_blank",
+    "key_path",
+    "parse",
     "read_spec",
     "read_text",
     "read_toml",
     "spec_of",
+    "to_toml",
+    "toml_line",
 ]
 
 BLANK = "?"  # how a value begins that is still to be filled in
@@ -35,6 +45,30 @@ LONGEST = 1_000_000  # bytes of a case file
 DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
 SHOWN = 60  # characters of a line that is shown
 LONGEST_SHOWN = 200  # characters of a value that is shown
+
+NAMED = ("unknowns", "channels")  # tables whose members are the case's own
+BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
+DEPTH = 32  # tables, lists and parts of a key within one another
+COUNTS = {  # keys that say how much is kept or tried -> the most
+    "every": 1_000_000,
+    "fields_every": 1_000_000_000,
+    "harmonics": 100,
+    "iterations": 1000,
+    "modes": 10_000,
+    "past": 10_000,
+    "queue": 10_000_000,
+    "seeds": 10_000,
+    "temperings": 100,
+    "thin": 1_000_000_000,
+    "window": 100_000,
+}
+OTHER = 1_000_000_000  # of any other whole number
+FREE = ("data.missing",)  # keys whose numbers only stand for something
+NAMES = 10_000  # of a table
+LONG_KEY = 200  # characters of a name
+NAME = re.compile(r"[\w\"'-]+")
+DOTTED = re.compile(r"(?:a\s?\.\s?){" + str(DEPTH) + "}")
+DIGITS = re.compile(r"[0-9_]{400}")
 
 # Type of pydantic's error -> what the message expects.
 EXPECTED = {
@@ -261,3 +295,191 @@ def _fields(kind: Any) -> dict[str, Any]:
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         return {item.alias or name: item.annotation for name, item in kind.model_fields.items()}
     return get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
+
+
+def parse(assignments: Iterable[str]) -> dict[str, Any]:
+    """Return key -> value of texts such as 'law.noise=2 K'; values are TOML, or else text.
+
+    >>> parse(["law.noise=2 K", "data.every=2", "expect="])
+    {'law.noise': '2 K', 'data.every': 2, 'expect': None}
+    """
+    found: dict[str, Any] = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not (equals and key.strip()):
+            raise CaseError(f"--set {text}: expected key=value, as law.memory='3 d'.")
+        if not value.strip():
+            found[key.strip()] = None
+            continue
+        try:
+            (found[key.strip()],) = tomllib.loads(f"value = {value}").values()
+        except (tomllib.TOMLDecodeError, ValueError):
+            found[key.strip()] = value.strip()
+    return found
+
+
+def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a case's document with other values.
+
+    Parameters
+    ----------
+    document
+        The parsed case.
+    settings
+        Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
+        sets the keys in it and leaves the others; None takes the key away.
+    where
+        For messages.
+
+    Raises
+    ------
+    CaseError
+        A key that is none, or an unknown, a channel or a key to take away that the case has not.
+    """
+    changed = copy.deepcopy(dict(document))
+    for key, given in settings.items():
+        for path, value in _leaves(key_path(key, where), given):
+            here = changed
+            for k, part in enumerate(path[:-1]):
+                if k == 1 and path[0] in NAMED and part not in here:
+                    raise CaseError(
+                        f"{where}: {'.'.join(path)}: the case has no '{path[0]}.{part}'; "
+                        f"{did_you_mean(part, here)}"
+                    )
+                if not isinstance(here.get(part), dict):
+                    here[part] = {}
+                here = here[part]
+            if value is not None:
+                here[path[-1]] = value
+            elif here.pop(path[-1], None) is None:
+                raise CaseError(
+                    f"{where}: there is no key '{'.'.join(path)}' to take away; "
+                    f"{did_you_mean(path[-1], here)}"
+                )
+    return changed
+
+
+def key_path(key: str, where: str) -> tuple[str, ...]:
+    """Return the keys of 'law.noise' as `--set` takes them; raises `CaseError`."""
+    try:
+        here: Any = tomllib.loads(f"{key} = 0")
+    except tomllib.TOMLDecodeError:
+        raise CaseError(f"{where}: '{key}' is no key; expected one as 'law.noise'.") from None
+    path = []
+    while isinstance(here, dict):
+        ((name, here),) = here.items()
+        path.append(name)
+    return tuple(path)
+
+
+def _leaves(path: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from _leaves((*path, name), item)
+    else:
+        yield path, value
+
+
+def to_toml(document: Mapping[str, Any]) -> str:
+    """Return a document as TOML.
+
+    >>> print(to_toml({"title": "a", "mesh": {"from": 0, "x": [1.0, 2.0]}}), end="")
+    title = "a"
+    <BLANKLINE>
+    [mesh]
+    from = 0
+    x = [1.0, 2.0]
+    """
+    plain = {key: value for key, value in document.items() if not isinstance(value, dict)}
+    lines = [toml_line(key, value) for key, value in plain.items()]
+    for name, table in document.items():
+        if name not in plain:
+            lines += ["", f"[{_key(name)}]"]
+            lines += [toml_line(key, value) for key, value in table.items()]
+    return "\n".join(lines) + "\n"
+
+
+def toml_line(key: str, value: Any) -> str:
+    """Return a key and its value as a line of TOML.
+
+    >>> toml_line("T 1", {"role": "sensor", "at": 0.5})
+    '"T 1" = { role = "sensor", at = 0.5 }'
+    """
+    return f"{_key(key)} = {_value(value)}"
+
+
+def _key(name: str) -> str:
+    return name if name and BARE.issuperset(name) else _text(name)
+
+
+def _text(value: str) -> str:
+    """Return a basic string of TOML, with only the characters escaped that need it."""
+    escapes = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+    shown = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08x}") for c in value)
+    return f'"{"".join(shown)}"'
+
+
+def _value(value: Any) -> str:
+    match value:
+        case bool():
+            return str(value).lower()
+        case str():
+            return _text(value)
+        case date() | time():
+            return value.isoformat()
+        case float():
+            return repr(value) if math.isfinite(value) else str(value)
+        case Mapping():
+            items = (toml_line(key, item) for key, item in value.items())
+            return "{ " + ", ".join(items) + " }" if value else "{}"
+        case list():
+            return "[" + ", ".join(map(_value, value)) + "]"
+    return str(value)
+
+
+def check_text(text: str, where: str) -> None:
+    """Refuse a document that would take long to read, before it is read."""
+    if DOTTED.search(NAME.sub("a", text)):
+        raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
+    if DIGITS.search(text):
+        raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
+
+
+def check_document(document: Mapping[str, Any], where: str) -> None:
+    """Refuse numbers and depths that no case needs."""
+    for key, value, depth in _values(document, where):
+        if depth > DEPTH:
+            text = f"more than {DEPTH} tables or lists within one another"
+            raise CaseError(f"{where}: {key[:LONG_KEY]}: {text}.")
+        if max(map(len, key.split("."))) > LONG_KEY:
+            raise CaseError(f"{where}: {key[:LONG_KEY]}...: a name has at most {LONG_KEY} letters.")
+        if key.startswith(FREE) or isinstance(value, bool):
+            continue
+        name = key.rpartition(".")[2]
+        if isinstance(value, int) and abs(value) > COUNTS.get(name, OTHER):
+            most = COUNTS.get(name, OTHER)
+            raise CaseError(f"{where}: {key}: got {_digits(value)}; expected at most {most}.")
+        if isinstance(value, float) and LARGEST < abs(value) < float("inf"):
+            raise CaseError(f"{where}: {key}: got {value:g}; expected less than {LARGEST:g}.")
+
+
+def _digits(value: int) -> str:
+    return str(value) if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
+
+
+def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
+    """Iterate over all values with their keys and depths; deeper levels are not entered."""
+    stack: list[tuple[str, Any, int]] = [("", value, 0)]
+    while stack:
+        key, value, depth = stack.pop()
+        if depth > DEPTH or not isinstance(value, Mapping | list):
+            yield key, value, depth
+        elif isinstance(value, Mapping):
+            if len(value) > NAMES:
+                what = key or "the case"
+                raise CaseError(
+                    f"{where}: {what} has {len(value)} names; expected at most {NAMES}."
+                )
+            stack += [(f"{key}.{n}" if key else n, v, depth + 1) for n, v in value.items()]
+        else:
+            stack += [(key, item, depth + 1) for item in value]

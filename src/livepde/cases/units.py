@@ -9,11 +9,14 @@ from functools import cache
 from tokenize import TokenError
 from typing import Any
 
-from livepde.cases.limits import LARGEST, check_unit
 from livepde.errors import CaseError
 
-__all__ = ["SI", "Affine", "conversion", "convert", "in_si"]
+__all__ = ["LARGEST", "SI", "SMALLEST", "Affine", "check_unit", "conversion", "convert", "in_si"]
 
+LARGEST = 1e60  # of a number: products of four are finite
+SMALLEST = 1e-60  # of a standard deviation, a rate, a length
+UNIT = 100  # characters of a unit
+POWER = r"(?:\^|\*\*)"
 KINDS = (("s", "min", "h", "d"), ("mm", "cm", "m", "ft"), ("degC", "K", "degF"))  # for hints
 # What pint's parser lets through for text that is no unit at all.
 NOT_A_UNIT = (
@@ -198,6 +201,38 @@ def in_si(unit: str) -> SI | None:
     whole = {name: int(power) for name, power in exponents.items()}
     offset = float(zero.magnitude)
     return SI(float(one.magnitude) - offset, offset, whole)
+
+
+def check_unit(unit: str, where: str) -> None:
+    """Refuse a unit that is too long, or that raises a power to a power."""
+    if len(unit) > UNIT:
+        raise CaseError(f"{where}: a unit has at most {UNIT} characters; got {len(unit)}.")
+    flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", unit)
+    if re.search(rf"{POWER}[-+(]*[0-9]{{3,}}", flat) or _towers(flat):
+        raise CaseError(
+            f"{where}: '{unit}' is not a unit: powers are numbers below 100, and none is raised to "
+            "another."
+        )
+    if re.search(r"[0-9]{10}", flat):
+        raise CaseError(f"{where}: '{unit}' is not a unit: its numbers have less than 10 digits.")
+
+
+def _towers(unit: str) -> bool:
+    """Return whether a power, or a group with a power in it, is raised to a power."""
+    if re.search(rf"{POWER}[-+(]*[0-9.]*\)*{POWER}", unit):
+        return True
+    powers, marks = 0, []
+    for match in re.finditer(rf"\(|\)|{POWER}", unit):
+        sign = match[0]
+        if sign == "(":
+            marks.append(powers)
+        elif sign == ")":
+            inside = powers > (marks.pop() if marks else powers)
+            if inside and re.match(POWER, unit[match.end() :]):
+                return True
+        else:
+            powers += 1
+    return False
 
 
 def _expected(unit: str, given: str) -> str:

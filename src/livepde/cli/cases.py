@@ -15,8 +15,8 @@ from livepde.cli.printing import named, print_table, terminal
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from livepde.cases.from_table import FoundChannel
     from livepde.cases.measured import Measured
+    from livepde.cases.new_case import FoundChannel
     from livepde.models import Equation
 
 __all__ = ["equations", "init"]
@@ -74,7 +74,7 @@ def init(
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
-    from livepde.cases.template import check_free, files_for, write_files, write_template
+    from livepde.cases.new_case import check_free, files_for, write_files, write_template
     from livepde.models import EQUATIONS
 
     console = terminal()
@@ -123,7 +123,7 @@ def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int 
 def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
     """Return the text of a case with the values given by --set and by answers to questions."""
     from livepde.cases.fill import filled
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
     from livepde.cli.questions import answered, asks
 
     text = filled(text, parse(settings), where)
@@ -146,7 +146,7 @@ def _show_written(
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     """Print a summary of the tables: times, and columns with roles, units and ranges."""
-    from livepde.cases.from_table import channels_in
+    from livepde.cases.new_case import channels_in
     from livepde.runs import Table
 
     rows = [_channel_row(item, read, equation) for item in channels_in(read, equation)]

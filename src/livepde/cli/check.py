@@ -112,7 +112,7 @@ def _percent(share: float) -> str:
 
 def _show_advice(console: Console, prepared: Prepared) -> None:
     """Print where one more sensor would help most."""
-    from livepde.cases.placement import advise
+    from livepde.cases.preview import advise
     from livepde.runs import Table
 
     found = advise(prepared, prepared.stream)
@@ -131,7 +131,7 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 def _show_wiring(console: Console, case: Case) -> None:
     """Print the source of a process's samples, and the intake policy of each channel."""
-    from livepde.cases.data_sources import policy_of, source_text
+    from livepde.cases.data import policy_of, source_text
     from livepde.runs import Table
 
     policy, unit = policy_of(case.frame), case.frame.equation.time_unit

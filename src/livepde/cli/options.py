@@ -66,7 +66,7 @@ def names_in(place: str) -> Callable[[str], list[str]]:
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     """Read a case with the settings of the command line."""
     from livepde import cases
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
 
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 

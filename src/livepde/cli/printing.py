@@ -44,11 +44,9 @@ def terminal(*, err: bool = False) -> Console:
 def named(name: str, known: Mapping[str, Any], what: str) -> Any:
     """Return an item by name; one sentence with the closest name if there is none."""
     if name not in known:
-        import difflib
+        from livepde.cases.read import did_you_mean
 
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known)}."
-        raise ConfigurationError(f"there is no {what} '{name}'; {hint}")
+        raise ConfigurationError(f"there is no {what} '{name}'; {did_you_mean(name, known)}")
     return known[name]
 
 
