@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from livepde.cases.case_channels import (
     columns_of,
@@ -28,7 +29,7 @@ from livepde.cases.equations import resolve
 from livepde.cases.geometry import mesh_of
 from livepde.cases.laws import law_of
 from livepde.cases.process import conditioned, drive_notes, model_of, options_of, process_notes
-from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml, to_toml
+from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import VariantSpec
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
@@ -191,7 +192,7 @@ def load(
     document = read_toml(text, str(file))
     if settings:
         document = apply(document, settings, str(file))
-        text = to_toml(document)
+        text = tomlkit.dumps(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import copy
 import difflib
-import math
 import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import is_dataclass
-from datetime import date, time
 from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from livepde.cases.schema import CaseSpec
@@ -36,7 +35,7 @@ __all__ = [
     "read_text",
     "read_toml",
     "spec_of",
-    "to_toml",
+    "toml_key",
     "toml_line",
 ]
 
@@ -47,7 +46,6 @@ SHOWN = 60  # characters of a line that is shown
 LONGEST_SHOWN = 200  # characters of a value that is shown
 
 NAMED = ("unknowns", "channels")  # tables whose members are the case's own
-BARE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
 DEPTH = 32  # tables, lists and parts of a key within one another
 COUNTS = {  # keys that say how much is kept or tried -> the most
     "every": 1_000_000,
@@ -380,61 +378,28 @@ def _leaves(path: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...]
         yield path, value
 
 
-def to_toml(document: Mapping[str, Any]) -> str:
-    """Return a document as TOML.
-
-    >>> print(to_toml({"title": "a", "mesh": {"from": 0, "x": [1.0, 2.0]}}), end="")
-    title = "a"
-    <BLANKLINE>
-    [mesh]
-    from = 0
-    x = [1.0, 2.0]
-    """
-    plain = {key: value for key, value in document.items() if not isinstance(value, dict)}
-    lines = [toml_line(key, value) for key, value in plain.items()]
-    for name, table in document.items():
-        if name not in plain:
-            lines += ["", f"[{_key(name)}]"]
-            lines += [toml_line(key, value) for key, value in table.items()]
-    return "\n".join(lines) + "\n"
-
-
 def toml_line(key: str, value: Any) -> str:
     """Return a key and its value as a line of TOML.
 
     >>> toml_line("T 1", {"role": "sensor", "at": 0.5})
     '"T 1" = { role = "sensor", at = 0.5 }'
     """
-    return f"{_key(key)} = {_value(value)}"
+    return f"{toml_key(key)} = {_value(value)}"
 
 
-def _key(name: str) -> str:
-    return name if name and BARE.issuperset(name) else _text(name)
-
-
-def _text(value: str) -> str:
-    """Return a basic string of TOML, with only the characters escaped that need it."""
-    escapes = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
-    shown = (escapes.get(c, c if c.isprintable() else f"\\U{ord(c):08x}") for c in value)
-    return f'"{"".join(shown)}"'
+def toml_key(name: str) -> str:
+    """Return a key as TOML has it, in quotes where they are needed."""
+    return tomlkit.key(name).as_string()
 
 
 def _value(value: Any) -> str:
-    match value:
-        case bool():
-            return str(value).lower()
-        case str():
-            return _text(value)
-        case date() | time():
-            return value.isoformat()
-        case float():
-            return repr(value) if math.isfinite(value) else str(value)
-        case Mapping():
-            items = (toml_line(key, item) for key, item in value.items())
-            return "{ " + ", ".join(items) + " }" if value else "{}"
-        case list():
-            return "[" + ", ".join(map(_value, value)) + "]"
-    return str(value)
+    """Return a value on one line, with blanks inside of the braces of an inline table."""
+    if isinstance(value, Mapping):
+        items = ", ".join(toml_line(key, item) for key, item in value.items())
+        return f"{{ {items} }}" if items else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    return tomlkit.item(value).as_string()
 
 
 def check_text(text: str, where: str) -> None:

@@ -490,7 +490,7 @@ class SensitivitySpec(FilterSpec):
     replay: StrictBool | Replay = False
     jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | Jumps = False
     guards: StrictBool | Guards = True
-    verdict: StrictBool | Literal["cheap"] = SensitivityLaw.verdict
+    verdict: StrictBool | Literal["cheap"] = True
 
 
 class AutoSpec(FilterSpec):
