@@ -113,7 +113,7 @@ def compare_fmu(
     """
     if case.live:
         raise ConfigurationError(
-            f"{case.frame.path}: the unit is compared on the data of the case, and its source goes "
+            f"{case.path}: the unit is compared on the data of the case, and its source goes "
             "on: set another data.file."
         )
     prepared = case.prepare()

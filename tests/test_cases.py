@@ -479,7 +479,7 @@ def test_own_code_that_fails(rod, body, named):
 
 def test_own_module(rod):
     path = rod(('equation = "heat"  ', 'equation = "livepde.models.diffusion:HEAT"  '))
-    assert cases.load(path, allow_code=True).frame.equation.name == "heat"
+    assert cases.load(path, allow_code=True).equation.name == "heat"
     path = rod(("livepde.models.diffusion:HEAT", "missing.py:build"))
     with pytest.raises(lp.errors.CaseError, match=r"there is no file '.*missing\.py'"):
         cases.load(path, allow_code=True)
@@ -1128,7 +1128,7 @@ def test_settings(rod):
 
 def test_tables_are_set_key_by_key(rod):
     case = cases.load(rod(), settings={"steps": {"dt_max": "5 s"}, 'law."replay".first': 16})
-    assert (case.dt_max, case.frame.spec.steps.scheme) == (5.0, "alexander2")
+    assert (case.dt_max, case.spec.steps.scheme) == (5.0, "alexander2")
     assert case.law.replay == lp.Replay(first=16)
 
 
@@ -1222,7 +1222,7 @@ expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
 
 
 def test_variants(rod):
-    (variant,) = cases.load(rod(("[expect]", VARIANTS))).variants
+    (variant,) = cases.load(rod(("[expect]", VARIANTS))).spec.variants
     assert variant.name == "noisier"
     assert variant.seeds == 3
     assert variant.expect == {"rmse": ("<=", 1.0), "alpha.error": ("<=", 0.1)}

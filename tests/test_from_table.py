@@ -680,7 +680,7 @@ def test_several_tables_are_not_followed(here):
         cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
     case = cases.load("mine/case.toml", settings=FILES)
     with pytest.raises(lp.errors.CaseError, match="a process is followed in one: name it"):
-        source_of(case.frame, None, "")
+        source_of(case, None, "")
 
 
 @pytest.mark.parametrize(

@@ -141,9 +141,7 @@ def _regions(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> di
     for name, item in channels.items():
         key = f"channels.{name}.over"
         if isinstance(item.over, str):
-            if item.over not in known:
-                text = f"the mesh has no part '{item.over}'; {did_you_mean(item.over, known)}"
-                raise frame.error(key, text)
+            frame.require(item.over, known, key, f"the mesh has no part '{item.over}'")
             regions[name] = item.over
         else:
             regions[name] = _inside(sides_of(frame, item.over, len(mesh.p), key))
@@ -168,9 +166,8 @@ def _followed(
     for name, item in channels.items():
         given = item.follows if isinstance(item.follows, tuple) else (str(item.follows),)
         for channel in given:
-            if channel not in known:
-                text = f"there is no channel '{channel}' of role position; "
-                raise frame.error(f"channels.{name}.follows", text + did_you_mean(channel, known))
+            text = f"there is no channel '{channel}' of role position"
+            frame.require(channel, known, f"channels.{name}.follows", text)
         if len(given) != len(mesh.p):
             text = f"got {len(given)} channels; needs one for each of {len(mesh.p)} coordinates."
             raise frame.error(f"channels.{name}.follows", text)
@@ -230,9 +227,8 @@ def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
     if channel.quantity is not None:
         known, asked = frame.equation.quantities, channel.quantity
-        if asked not in known:
-            text = f"'{frame.equation.name}' has no quantity '{asked}'; "
-            raise frame.error(f"channels.{name}.quantity", text + did_you_mean(asked, known))
+        text = f"'{frame.equation.name}' has no quantity '{asked}'"
+        frame.require(asked, known, f"channels.{name}.quantity", text)
         return known[asked].at(float(low[0]), float(high[0]))
     return _inside_mesh(frame, mesh, channel.at, key)
 

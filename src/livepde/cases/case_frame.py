@@ -36,7 +36,7 @@ class Frame:
     path: Path
     spec: CaseSpec
     equation: Equation
-    reader: Callable[..., Any] | None = None
+    reader: Callable[..., Any] | None
 
     @property
     def name(self) -> str:
@@ -101,9 +101,14 @@ class Frame:
     def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
         """Raise unless every name given is known to the equation."""
         for name in given:
-            if name not in known:
-                text = f"the equation '{self.equation.name}' has no '{name}' here; "
-                raise self.error(key, text + did_you_mean(name, known))
+            self.require(
+                name, known, key, f"the equation '{self.equation.name}' has no '{name}' here"
+            )
+
+    def require(self, name: str, known: Iterable[str], key: str, text: str) -> None:
+        """Raise an error that begins with `text` unless a name is one of `known`."""
+        if name not in known:
+            raise self.error(key, f"{text}; {did_you_mean(name, known)}")
 
     def roles(self, *roles: str) -> dict[str, ChannelSpec]:
         """Return the channels of some roles."""

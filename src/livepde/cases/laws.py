@@ -8,7 +8,6 @@ import numpy as np
 
 from livepde.cases.case_channels import noise_of, unknowns_of
 from livepde.cases.case_frame import Frame
-from livepde.cases.read import did_you_mean
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
 from livepde.errors import LawError
 from livepde.laws import (
@@ -72,12 +71,10 @@ def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
     """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
     given = spec.jumps
     found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
-    names = (found.unknowns if found is not None else None) or ()
     known = [*frame.spec.unknowns, *unknowns_of(frame)]
-    for name in names:
-        if name not in known:
-            key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
-            raise frame.error(key, f"there is no unknown '{name}'; {did_you_mean(name, known)}")
+    key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
+    for name in (found.unknowns if found is not None else None) or ():
+        frame.require(name, known, key, f"there is no unknown '{name}'")
     return found
 
 

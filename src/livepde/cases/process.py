@@ -69,8 +69,8 @@ def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
     if not isinstance(value, option.kind):
         kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
         raise frame.error(key, f"got {value!r}; expected {kind}.")
-    if option.choices and value not in option.choices:
-        raise frame.error(key, f"got '{value}'; {did_you_mean(str(value), option.choices)}")
+    if option.choices:
+        frame.require(str(value), option.choices, key, f"got '{value}'")
     return value
 
 
@@ -123,13 +123,11 @@ def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
     known = [*(mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
     for name, value in held(frame).items():
-        if name not in known:
-            raise frame.error("boundary", f"no boundary '{name}'; {did_you_mean(name, known)}")
+        frame.require(name, known, "boundary", f"no boundary '{name}'")
         values[name] = value
     for name, channel in frame.roles("boundary").items():
         key, at = f"channels.{name}.at", str(channel.at)
-        if at not in known:
-            raise frame.error(key, f"no boundary '{at}'; {did_you_mean(at, known)}")
+        frame.require(at, known, key, f"no boundary '{at}'")
         if at in values:
             raise frame.error(key, f"the boundary '{at}' has a value already; keep one.")
         values[at] = Channel(name)
@@ -149,24 +147,21 @@ def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
 def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
     key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
-    options = _options_of(frame, spec, unit, key)
-    if spec.field:
-        with frame.located(key, SpaceError):
-            return _field(frame, mesh, spec, name, options)
-    if spec.regions is None:
-        with frame.located(key, SpaceError):
-            return Scalar(**options)
-    places = {region: item.over for region, item in spec.regions.items()}
-    regions = _regions(frame, mesh, places, f"{key}.regions")
-    # A region may state a prior of its own; the others share that of the unknown.
-    own = {}
-    for region, item in spec.regions.items():
-        if (there := spec.at(item)) is not None:
-            where = f"{key}.regions.{region}"
-            given = _options_of(frame, there, unit, where)
-            with frame.located(where, SpaceError):
-                own[region] = Scalar(**given)
     with frame.located(key, SpaceError):
+        options = _options_of(frame, spec, unit, key)
+        if spec.field:
+            return _field(frame, mesh, spec, name, options)
+        if spec.regions is None:
+            return Scalar(**options)
+        places = {region: item.over for region, item in spec.regions.items()}
+        regions = _regions(frame, mesh, places, f"{key}.regions")
+        # A region may state a prior of its own; the others share that of the unknown.
+        own = {}
+        for region, item in spec.regions.items():
+            if (there := spec.at(item)) is not None:
+                where = f"{key}.regions.{region}"
+                with frame.located(where, SpaceError):
+                    own[region] = Scalar(**_options_of(frame, there, unit, where))
         return Piecewise(regions, **options, own=own)
 
 
@@ -207,8 +202,7 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
-        with frame.located(key, SpaceError):
-            return Normal(prior, std, (low, high))
+        return Normal(prior, std, (low, high))
     return _transformed(frame, spec.transform, prior, std, (low, high), key)
 
 
@@ -226,9 +220,7 @@ def _transformed(
     if not low < median < high:
         text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
         raise frame.error(key, text + "inside of the bounds.")
-    distribution = LogNormal if transform == "log" else LogitNormal
-    with frame.located(key, SpaceError):
-        return distribution(median, std, (low, high))
+    return (LogNormal if transform == "log" else LogitNormal)(median, std, (low, high))
 
 
 def _evolution(
@@ -391,9 +383,7 @@ def conditioned(frame: Frame) -> Frame:
         own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
         more = {name: item for name, item in unknowns.items() if name in names.unknowns}
         for name in boundary:
-            if name not in (mesh.boundaries or {}):
-                text = f"no boundary '{name}'; {did_you_mean(name, mesh.boundaries or {})}"
-                raise frame.error("boundary", text)
+            frame.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
         placed = {
             name: Source(amount, None if over is None else _place(frame, mesh, over, name))
             for name, (amount, over) in sources.items()

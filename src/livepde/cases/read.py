@@ -399,7 +399,8 @@ def _value(value: Any) -> str:
         return f"{{ {items} }}" if items else "{}"
     if isinstance(value, list):
         return f"[{', '.join(map(_value, value))}]"
-    return tomlkit.item(value).as_string()
+    shown: str = tomlkit.item(value).as_string()
+    return shown
 
 
 def check_text(text: str, where: str) -> None:

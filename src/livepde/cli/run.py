@@ -261,7 +261,7 @@ def batch(
         prepared.stream,
         progress=not quiet,
         total=len(table) if table else None,
-        fields_every=prepared.case.fields_every,
+        fields_every=prepared.case.spec.output.fields_every,
         journal=journal,
     )
     return writer, (prepared, driven)
@@ -302,7 +302,7 @@ def concluded(
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
-    driving = loaded.frame.roles("boundary", "input")
+    driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
         return verdict(dataset).with_findings(input_findings(driven.journal, driving))
@@ -318,7 +318,7 @@ def concluded(
     notes[:0] = [*loaded.notes, *found.sentences]
     if len(driven.result):
         notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
-        if loaded.smoothed:
+        if loaded.spec.output.smoothed:
             smooth = partial(_with_smoothed, prepared, driven, dataset)
             dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
             notes += told
@@ -349,7 +349,7 @@ def _with_smoothed(
     samples = ((taken.t, taken.values) for taken in driven.journal.taken())
     begun = prepared.identifier_with(prepared.case.law)
     try:
-        smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
+        smoothed = begun.smoothed(samples, fields_every=prepared.case.spec.output.fields_every)
     except LivepdeError as error:  # the estimates of the run are kept
         return dataset, [f"Nothing is smoothed: {error}"]
     return with_smoothed(dataset, smoothed), []
