@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 import typer
 
 from livepde.cli import main
-from livepde.cli.fmu import Standard
+from livepde.cli.export import Standard
 from livepde.cli.options import CodeOption, JsonOption, SetOption, load_case
 from livepde.cli.printing import can_draw, named, report_outcome, terminal
 

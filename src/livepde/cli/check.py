@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case
+from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, print_table, terminal
 
 if TYPE_CHECKING:
@@ -26,9 +26,7 @@ def check(
     case: CaseArgument,
     data: Annotated[
         str | None,
-        typer.Option(
-            help="Other data than the case names (.csv, .jsonl, .parquet).", show_default=False
-        ),
+        option("Other data than the case names (.csv, .jsonl, .parquet)."),
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
