@@ -46,7 +46,6 @@ __all__ = [
     "input_noise_of",
     "noise_of",
     "observation_of",
-    "positions_of",
     "sensor_notes",
     "unknowns_of",
 ]
@@ -197,7 +196,7 @@ def _part(
         for name, item in channels.items()
         if item.quantity is not None
     }
-    uncertain = positions_of(frame, channels)
+    uncertain = {name: std for name, std in _shifted(frame).items() if name in channels}
     return Points(points, direct, uncertain or None, **common)
 
 
@@ -269,12 +268,7 @@ def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
 
 def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
     """Return the noise of each sensor of a role; None if none is given."""
-    channels, unit = frame.roles(role), frame.equation.state.unit
-    levels = {
-        name: frame.positive(channel.noise, unit, f"channels.{name}.noise")
-        for name, channel in channels.items()
-        if channel.noise is not None
-    }
+    channels, levels = frame.roles(role), _stated(frame, "noise", role)
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."
@@ -284,11 +278,7 @@ def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
 
 def input_noise_of(frame: Frame) -> dict[str, float]:
     """Return the noise of the boundary and input channels that state one."""
-    return {
-        name: frame.positive(channel.noise, frame.unit(name), f"channels.{name}.noise")
-        for name, channel in frame.roles("boundary", "input").items()
-        if channel.noise is not None
-    }
+    return _stated(frame, "noise", "boundary", "input")
 
 
 def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
@@ -453,74 +443,58 @@ def _coordinate(frame: Frame, cell: str, where: str) -> float:
 
 def unknowns_of(frame: Frame) -> dict[str, Unknown]:
     """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
-    found = {
-        "offset": _offsets(frame),
-        "gain": _gains(frame),
-        POSITION: _shifts(frame),
-        "correlated": _correlated(frame),
-    }
-    return {name: unknown for name, unknown in found.items() if unknown is not None}
-
-
-def _offsets(frame: Frame) -> Unknown | None:
-    unit = frame.equation.state.unit
-    stds = {
-        name: frame.positive(item.offset, unit, f"channels.{name}.offset")
-        for name, item in frame.roles("sensor").items()
-        if item.offset is not None
-    }
-    if not stds:
-        return None
-    prior = Normal(0.0, _common(frame, stds, "offset"))
-    return Scalars(tuple(stds), prior, unit=_difference(unit))
-
-
-def _gains(frame: Frame) -> Unknown | None:
-    sensors = frame.roles("sensor").items()
+    state = frame.equation.state.unit
+    found: dict[str, Unknown] = {}
+    # Differences of a temperature are in K.
+    unit = "K" if state == "degC" else state
+    if offsets := _stated(frame, "offset", "sensor"):
+        prior = Normal(0.0, _common(frame, offsets, "offset"))
+        found["offset"] = Scalars(tuple(offsets), prior, unit=unit)
     # A gain is a factor without a unit, 1 for an exact sensor.
-    stds = {name: item.gain for name, item in sensors if item.gain is not None}
-    return Scalars(tuple(stds), Normal(1.0, _common(frame, stds, "gain"))) if stds else None
+    if gains := _stated(frame, "gain", "sensor", unit=""):
+        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(frame, gains, "gain")))
+    if stds := _shifted(frame):
+        places = {name: frame.spec.channels[name].at for name in stds}
+        names = [
+            shift
+            for name, at in places.items()
+            for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
+        ]
+        prior = Normal(0.0, _common(frame, stds, "at_std"))
+        found[POSITION] = Scalars(names, prior, unit=frame.equation.length_unit)
+    if errors := _correlated(frame):
+        std, time = _common(frame, errors, "correlated")
+        # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
+        prior, fades = Normal(0.0, std), MeanReverting(time)
+        found["correlated"] = Scalars(tuple(errors), prior, unit=unit, evolution=fades)
+    return found
 
 
-def _shifts(frame: Frame) -> Unknown | None:
-    """Return the distances of sensors from their stated positions, one for each coordinate."""
-    stds = positions_of(frame, frame.roles("sensor"))
-    if not stds:
-        return None
-    prior = Normal(0.0, _common(frame, stds, "at_std"))
-    places = {name: frame.spec.channels[name].at for name in stds}
-    names = [
-        shift
-        for name, at in places.items()
-        for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
-    ]
-    return Scalars(names, prior, unit=frame.equation.length_unit)
+def _shifted(frame: Frame) -> dict[str, float]:
+    """Return the standard deviation of the position of each sensor that states one."""
+    return _stated(frame, "at_std", "sensor", unit=frame.equation.length_unit)
 
 
-def _correlated(frame: Frame) -> Unknown | None:
-    """Return the errors of sensors that fade with a correlation time."""
-    unit, errors = frame.equation.state.unit, {}
+def _correlated(frame: Frame) -> dict[str, tuple[float, float]]:
+    """Return standard deviation and correlation time of the errors of sensors that fade."""
+    found = {}
     for name, item in frame.roles("sensor").items():
         if item.correlated is not None:
             key = f"channels.{name}.correlated"
-            std = frame.positive(item.correlated.std, unit, f"{key}.std")
+            std = frame.positive(item.correlated.std, frame.equation.state.unit, f"{key}.std")
             time = frame.positive(item.correlated.time, frame.equation.time_unit, f"{key}.time")
-            errors[name] = (std, time)
-    if not errors:
-        return None
-    std, time = _common(frame, errors, "correlated")
-    # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
-    prior, fades = Normal(0.0, std), MeanReverting(time)
-    return Scalars(tuple(errors), prior, unit=_difference(unit), evolution=fades)
+            found[name] = (std, time)
+    return found
 
 
-def positions_of(frame: Frame, channels: Mapping[str, ChannelSpec]) -> dict[str, float]:
-    """Return the standard deviation of the position of each sensor that states one."""
-    unit = frame.equation.length_unit
+def _stated(frame: Frame, key: str, *roles: str, unit: str | None = None) -> dict[str, float]:
+    """Return a number > 0 of each channel that states one, in the channel's unit or another."""
     return {
-        name: frame.positive(item.at_std, unit, f"channels.{name}.at_std")
-        for name, item in channels.items()
-        if item.at_std is not None
+        name: frame.positive(
+            value, frame.unit(name) if unit is None else unit, f"channels.{name}.{key}"
+        )
+        for name, item in frame.roles(*roles).items()
+        if (value := getattr(item, key)) is not None
     }
 
 
@@ -532,11 +506,6 @@ def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
             text = f"differs from that of '{first}'; all sensors share one prior."
             raise frame.error(f"channels.{name}.{key}", text)
     return value
-
-
-def _difference(unit: str) -> str:
-    """Return the unit of differences of a temperature, or of another quantity."""
-    return "K" if unit == "degC" else unit
 
 
 def calibrated(

@@ -11,7 +11,7 @@ from dataclasses import replace
 from datetime import datetime, tzinfo
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -36,13 +36,10 @@ from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.join import join_tables
+from livepde.streams.mqtt import Broker, MqttSink, MqttSource
 from livepde.streams.names import no_file
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES
-
-if TYPE_CHECKING:
-    from livepde.streams.mqtt import Broker
-
 
 __all__ = [
     "Data",
@@ -326,8 +323,6 @@ def _own_source(frame: Frame, position: str) -> RowSource:
     """Return the source that the case names: a broker, a server or a file."""
     spec = frame.spec.data
     if spec.mqtt is not None:
-        from livepde.streams.mqtt import MqttSource
-
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
         return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.times[0])
     if spec.opcua is not None:
@@ -362,8 +357,6 @@ def publishers_of(frame: Frame) -> list[Sink]:
     spec = frame.spec.output.mqtt
     if spec is None:
         return []
-    from livepde.streams.mqtt import MqttSink
-
     return [MqttSink(_broker(frame, spec, "output.mqtt"), spec.topic)]
 
 
@@ -381,8 +374,6 @@ def source_text(frame: Frame) -> str:
 
 
 def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
-    from livepde.streams.mqtt import Broker
-
     return Broker(
         host=spec.host,
         port=spec.port,

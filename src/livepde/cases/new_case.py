@@ -13,12 +13,12 @@ import numpy as np
 
 from livepde.cases.measured import IN_BRACKETS, Measured, measured, unit_in
 from livepde.cases.read import BLANK, beside, toml_line
+from livepde.cases.schema import DataSpec
 from livepde.errors import RunError
 from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
-from livepde.streams.csvfile import UTF_8
 
 __all__ = [
     "PLACES",
@@ -39,7 +39,6 @@ SUFFIX = re.compile(r"(?<=\w)_(?P<unit>[A-Za-z]\w*)$")  # Q_W, dH_mm
 NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
 FAMILY = 8  # so many numbered columns become one line of [channels]
-USUAL = {"skip": 0, "time_format": "", "separator": ",", "decimal": ".", "encoding": UTF_8}
 HEAD = """\
 # A case of livepde: which process, what is unknown, which channel is what.
 #   livepde check {case}     what is in here, and what its sensors can tell
@@ -165,7 +164,10 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
     """Return the format of the files as keys of [data], without defaults."""
     # Format keys of the first file hold for all; others state only what differs.
     first, *others = (_written(one, folder) for one in table.tables)
-    found = {key: value for key, value in first.items() if value != USUAL.get(key)}
+    usual = DataSpec.model_fields
+    found = {
+        key: value for key, value in first.items() if key == "time" or value != usual[key].default
+    }
     if others:
         own = [{key: v for key, v in other.items() if v != first.get(key)} for other in others]
         found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]

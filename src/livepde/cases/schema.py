@@ -24,8 +24,11 @@ from pydantic import (
 from livepde.fem import Scalar
 from livepde.laws import GradientLaw, Guards, Jumps, Replay, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
+from livepde.runs.live_loop import Backlog, Retention
 from livepde.runs.outcome import Bound, Sense
 from livepde.streams.csvfile import UTF_8
+from livepde.streams.intake import Policy
+from livepde.streams.mqtt import Broker
 
 __all__ = [
     "AutoSpec",
@@ -173,12 +176,12 @@ class MeshSpec(Spec):
 class BrokerSpec(Spec):
     """How to reach a message broker (MQTT)."""
 
-    host: Name = "localhost"
-    port: Annotated[int, Field(gt=0, lt=65536)] = 1883
+    host: Name = Broker.host
+    port: Annotated[int, Field(gt=0, lt=65536)] = Broker.port
     client_id: Name | None = None
     username: Name | None = None
     password_env: Name | None = None
-    tls: StrictBool = False
+    tls: StrictBool = Broker.tls
     ca_file: Name | None = None
     session: Quantity = "7 d"
 
@@ -290,12 +293,12 @@ class DataSpec(Spec):
 class IntakeSpec(Spec):
     """Policy for rows that are late, repeated, malformed or too fast."""
 
-    wait: Quantity = 0.0
-    tolerance: Quantity = 0.0
+    wait: Quantity = Policy.wait
+    tolerance: Quantity = Policy.tolerance
     leap: Quantity | None = None
-    repeated: Literal["first", "last"] = "first"
-    overflow: Literal["queue", "merge", "drop"] = "queue"
-    queue: PositiveInt = 1000
+    repeated: Literal["first", "last"] = Policy.repeated
+    overflow: Literal["queue", "merge", "drop"] = Backlog.overflow
+    queue: PositiveInt = Backlog.length
     silence: Quantity | None = None
 
 
@@ -545,7 +548,7 @@ class OutputSpec(Spec):
 
     fields_every: PositiveInt = 24
     retain: Quantity | None = None
-    thin: PositiveInt = 1
+    thin: PositiveInt = Retention.every
     smoothed: StrictBool = False
     mqtt: PublishSpec | None = None
 
