@@ -17,11 +17,7 @@ from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 from livepde.streams.names import no_file
 
-__all__ = [
-    "check_options",
-    "load_code",
-    "resolve",
-]
+__all__ = ["check_options", "load_code", "resolve"]
 
 
 def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equation:

@@ -20,14 +20,7 @@ from livepde.fem import (
 )
 from livepde.linalg import Array
 
-__all__ = [
-    "inside",
-    "layer_edges",
-    "mesh_of",
-    "off_nodes",
-    "sides_of",
-    "subdomain",
-]
+__all__ = ["inside", "layer_edges", "mesh_of", "off_nodes", "sides_of", "subdomain"]
 
 CELLS = 2_000_000  # of a mesh that a case describes itself
 

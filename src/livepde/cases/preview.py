@@ -24,14 +24,7 @@ from livepde.observation import Combined, Observation, Points
 from livepde.result import Estimate
 from livepde.verdict import REFINE, Shifts, discretised
 
-__all__ = [
-    "Advice",
-    "Identified",
-    "Preview",
-    "advise",
-    "linearised",
-    "preview",
-]
+__all__ = ["Advice", "Identified", "Preview", "advise", "linearised", "preview"]
 
 MOST_SAMPLES = 500
 NEVER = 1 << 60

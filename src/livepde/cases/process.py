@@ -35,14 +35,7 @@ from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Option, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount
 
-__all__ = [
-    "conditioned",
-    "drive_notes",
-    "held",
-    "model_of",
-    "options_of",
-    "process_notes",
-]
+__all__ = ["conditioned", "drive_notes", "held", "model_of", "options_of", "process_notes"]
 
 
 def options_of(frame: Frame) -> dict[str, Any]:

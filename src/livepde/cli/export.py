@@ -26,11 +26,7 @@ from livepde.errors import ConfigurationError
 if TYPE_CHECKING:
     from xarray import Dataset
 
-
-__all__ = [
-    "export",
-    "fmu",
-]
+__all__ = ["export", "fmu"]
 
 REPORT = ".html"
 

@@ -18,11 +18,7 @@ if TYPE_CHECKING:
     from livepde.runs import Table
     from livepde.verdict import Cause
 
-
-__all__ = [
-    "explain",
-    "report",
-]
+__all__ = ["explain", "report"]
 
 
 def report(
