@@ -319,10 +319,8 @@ class Case(Frame):
     @cached_property
     def dt_max(self) -> float:
         """The longest time step."""
-        longest = self.spec.steps.dt_max
-        if longest is None:
-            return float(np.inf)
-        return self.positive(longest, self.equation.time_unit, "steps.dt_max")
+        unit = self.equation.time_unit
+        return self.positive(self.spec.steps.dt_max, unit, "steps.dt_max", np.inf)
 
     @cached_property
     def clock(self) -> Clock:

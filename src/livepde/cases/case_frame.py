@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.cases.units import LARGEST, SMALLEST, convert
@@ -81,8 +83,10 @@ class Frame:
         """Return a quantity in the model's unit."""
         return convert(value, unit, self.where(key), difference=difference)
 
-    def positive(self, value: Any, unit: str, key: str) -> float:
-        """Return a difference or duration in the model's unit, which has to be positive."""
+    def positive(self, value: Any, unit: str, key: str, default: float = np.nan) -> float:
+        """Return a difference or duration in the model's unit, > 0; a default if there is none."""
+        if value is None:
+            return default
         number = self.convert(value, unit, key, difference=True)
         if not number > 0:
             raise self.error(key, f"got {value!r}; expected more than 0.")

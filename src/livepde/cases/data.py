@@ -59,6 +59,10 @@ __all__ = [
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
+UNSET = (
+    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
+    "the measurements."
+)
 
 
 def clock_of(frame: Frame, data: DataSpec | None = None) -> Clock:
@@ -125,22 +129,19 @@ def check_hours(frame: Frame, clock: Clock, source: Any) -> None:
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
     """Return the data of a file, whose ending tells its format."""
+    rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing}
     if path.suffix in JSON_LINES:
-        return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
+        return read_json_lines(path, columns, clock, **rows)
     if path.suffix == ".parquet":
         from livepde.streams.parquet import read_parquet
 
-        return read_parquet(path, columns, clock, every=spec.every, missing=spec.missing)
-    return read_csv(
-        path,
-        columns,
-        clock,
-        every=spec.every,
-        missing=spec.missing,
-        separator=spec.separator,
-        encoding=spec.encoding,
-        skip=spec.skip,
-    )
+        return read_parquet(path, columns, clock, **rows)
+    written: dict[str, Any] = {
+        "separator": spec.separator,
+        "encoding": spec.encoding,
+        "skip": spec.skip,
+    }
+    return read_csv(path, columns, clock, **rows, **written)
 
 
 def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> DataTable:
@@ -218,9 +219,9 @@ def _from_reader(
     except LivepdeError:
         raise
     except FileNotFoundError as error:
-        raise frame.error(
-            "data.reader", f"there is no file '{error.filename}'.{_unset(folder)}"
-        ) from None
+        remedy = "" if folder else f" {UNSET}"
+        text = f"there is no file '{error.filename}'.{remedy}"
+        raise frame.error("data.reader", text) from None
     except Exception as error:
         text = f"{spec.reader} failed with {type(error).__name__}: {error}."
         raise frame.error("data.reader", text) from error
@@ -233,11 +234,6 @@ def _from_reader(
     return tabulated(
         times, values, columns, clock, every=spec.every, missing=spec.missing, where=where
     )
-
-
-def _unset(folder: Path | None) -> str:
-    remedy = f" {VARIABLE} is not set; set it to the folder that holds the measurements."
-    return "" if folder else remedy
 
 
 def data_file(frame: Frame) -> Path:
@@ -254,22 +250,13 @@ def data_file(frame: Frame) -> Path:
 def _found(frame: Frame, given: str) -> Path:
     """Return where a file of the case is; relative names start at the case file."""
     if VARIABLE in given:
-        given = given.replace(VARIABLE, str(_data_folder(frame)))
+        if (folder := _measurements(frame)) is None:
+            raise frame.error("data.file", UNSET)
+        given = given.replace(VARIABLE, str(folder))
     path = frame.path.parent / Path(given).expanduser()
     if not path.is_file() and not frame.spec.data.follow:
         raise frame.error("data.file", str(no_file(path)))
     return path
-
-
-def _data_folder(frame: Frame) -> Path:
-    folder = _measurements(frame)
-    if folder is None:
-        raise frame.error(
-            "data.file",
-            f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that "
-            "holds the measurements.",
-        )
-    return folder
 
 
 def _measurements(frame: Frame) -> Path | None:
@@ -400,12 +387,9 @@ def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
     """Return limits of backlog and retention, and the seconds until a source is silent."""
     spec = frame.spec
     # Without these keys all estimates are kept, and no source counts as silent.
-    span = math.inf
-    if spec.output.retain is not None:
-        span = frame.positive(spec.output.retain, frame.equation.time_unit, "output.retain")
-    silence = math.inf
-    if spec.intake.silence is not None:
-        silence = frame.positive(spec.intake.silence, "s", "intake.silence")
+    unit, never = frame.equation.time_unit, math.inf
+    span = frame.positive(spec.output.retain, unit, "output.retain", never)
+    silence = frame.positive(spec.intake.silence, "s", "intake.silence", never)
     backlog = Backlog(spec.intake.overflow, spec.intake.queue)
     return backlog, Retention(span, spec.output.thin), silence
 
@@ -419,15 +403,12 @@ def policy_of(frame: Frame) -> Policy:
 
     habits = {}
     for name, channel in frame.spec.channels.items():
-        wait = 0.0
-        if channel.wait is not None:
-            wait = duration(channel.wait, f"channels.{name}.wait")
+        wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
         interpolated = channel.gaps == "interpolate"
         habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
     # Without a unit of time 30 days cannot be converted: then any pause is accepted.
     leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
-    if spec.leap is not None:
-        leap = frame.positive(spec.leap, unit, "intake.leap")
+    leap = frame.positive(spec.leap, unit, "intake.leap", leap)
     return Policy(
         wait=duration(spec.wait, "intake.wait"),
         tolerance=duration(spec.tolerance, "intake.tolerance"),

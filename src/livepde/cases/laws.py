@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import TypeVar
 
 from livepde.cases.case_channels import noise_of, unknowns_of
 from livepde.cases.case_frame import Frame
@@ -52,19 +50,21 @@ def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
 
 
 def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
-    time, memory = frame.equation.time_unit, float(np.inf)
-    if spec.memory is not None:
-        memory = frame.positive(spec.memory, time, "law.memory")
+    time = frame.equation.time_unit
+    memory = frame.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
     drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
-    more: dict[str, Any] = {
-        "gate": spec.gate,
-        "jumps": _jumps(frame, spec),
-        "guards": _chosen(Guards, spec.guards),
-        "shadows": _chosen(Shadows, spec.shadows),
-        "verdict": spec.verdict,
-    }
-    replay = _chosen(Replay, spec.replay)
-    return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)
+    return SensitivityLaw(
+        spec.modes,
+        _noise(frame, spec),
+        drift,
+        memory,
+        _chosen(Replay, spec.replay),
+        gate=spec.gate,
+        jumps=_jumps(frame, spec),
+        guards=_chosen(Guards, spec.guards),
+        shadows=_chosen(Shadows, spec.shadows),
+        verdict=spec.verdict,
+    )
 
 
 def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:

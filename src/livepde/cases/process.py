@@ -235,10 +235,8 @@ def _field(
     frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
 ) -> Field:
     # Default correlation length: a third of the extent along x.
-    length = float(np.ptp(mesh.p[0])) / 3
-    if spec.length is not None:
-        unit = frame.equation.length_unit
-        length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
+    third, key = float(np.ptp(mesh.p[0])) / 3, f"unknowns.{name}.length"
+    length = frame.positive(spec.length, frame.equation.length_unit, key, third)
 
     # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
     # pointwise variance of H^1 would be infinite, so that it takes H^2.
