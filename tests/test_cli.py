@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 import livepde
 from livepde import cli, runs
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.runs import Check, Outcome, Table
 
 COMMANDS = (

@@ -24,7 +24,7 @@ from benchmarks import fmu
 from benchmarks.__main__ import app as benchmarks
 from benchmarks.fmu import compare_fmu, running
 from livepde.cases import load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cases.units import in_si
 from livepde.cli import app
 from livepde.exchange import (

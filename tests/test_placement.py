@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.placement import Advice, advise
-from livepde.cases.preview import preview
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
+from livepde.cases.preview import Advice, advise, preview
 from livepde.cli import app
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from benchmarks.honest import honest
 from livepde import checkpoint, runs
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.runs import drive
 
 NOISE = 0.02
