@@ -17,9 +17,9 @@ def check_installed() -> None:
     """Raise `ConfigurationError` if the page cannot be shown for want of a package."""
     import importlib.util
 
-    if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "cheroot")):
+    if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "waitress")):
         raise ConfigurationError(
-            "The live page needs Dash, Plotly and cheroot: pip install 'livepde[dashboard]'."
+            "The live page needs Dash, Plotly and waitress: pip install 'livepde[dashboard]'."
         )
 
 
