@@ -20,7 +20,7 @@ from livepde.fem.fields import (
     interval,
     line,
 )
-from livepde.fem.forms import Form
+from livepde.fem.forms import Form, ignores
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
 from livepde.fem.meshes import (
     box,
@@ -35,7 +35,6 @@ from livepde.fem.meshes import (
 )
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
-from livepde.fem.reading import reads
 from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
@@ -85,6 +84,7 @@ __all__ = [
     "grid",
     "hermite",
     "hess",
+    "ignores",
     "interval",
     "line",
     "linear",
@@ -94,7 +94,6 @@ __all__ = [
     "positive",
     "quadratic",
     "read_mesh",
-    "reads",
     "rectangle",
     "smooth",
     "trace",

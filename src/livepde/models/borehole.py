@@ -121,7 +121,7 @@ def grouted_borehole(
             On("wall", lambda u, v, x: C_c / (2 * pi) * u * v),
             On("ground", lambda u, v, x: rho_0 * x[0] * u * v),
         ],
-        f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+        f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
         inputs=["Q"],
         time_unit="s",
         length_unit="m",

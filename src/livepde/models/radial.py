@@ -55,7 +55,7 @@ def borehole(
             {"k": k, "R_b": R_b},
             A=lambda q, u, v, x: q.k * x[0] * dot(grad(u), grad(v)),
             M=lambda u, v, x: rho_c * x[0] * u * v,
-            f=On("left", lambda x, t: x.inputs["Q"] / (2 * pi * H)),
+            f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
             inputs=["Q"],
             time_unit="s",
             length_unit="m",
@@ -66,7 +66,7 @@ def borehole(
         {"k": k, "R_b": R_b, "rho_c": rho_c},
         A=[
             lambda q, u, v, x: q.k / q.rho_c * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, u, v, x: -x.inputs["Q"] / (2 * pi * H * q.rho_c) * v),
+            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * H * q.rho_c) * v),
         ],
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
