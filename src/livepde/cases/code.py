@@ -11,7 +11,7 @@ from typing import Any
 
 from livepde.cases.read import beside, did_you_mean
 from livepde.errors import CaseError, LivepdeError
-from livepde.streams.names import no_file
+from livepde.streams.table import no_file
 
 __all__ = ["check_options", "load_code"]
 

@@ -32,8 +32,7 @@ from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
 from livepde.streams.join import join_tables
-from livepde.streams.names import no_file
-from livepde.streams.table import JSON_LINES
+from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = [
     "assimilation_start",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
@@ -33,9 +32,22 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
+from livepde.fem.notation import (
+    absolute,
+    ddot,
+    div,
+    dot,
+    grad,
+    hess,
+    maximum,
+    minimum,
+    mul,
+    positive,
+    trace,
+    transpose,
+)
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
-from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
 from livepde.fem.upwind import upwind

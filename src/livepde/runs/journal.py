@@ -54,7 +54,6 @@ from livepde.runs.database import (
     told,
     writer,
 )
-from livepde.runs.packing import layout_from, packed, unpacked
 from livepde.samples import noise_channel
 
 if TYPE_CHECKING:
@@ -146,7 +145,7 @@ class Journal:
         meta = self._meta()
         with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
-            self.layout = layout_from(meta["layout"])
+            self.layout = Layout.from_json(meta["layout"])
         self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._thinned = 0
@@ -381,7 +380,7 @@ class Journal:
         stays = "WHERE last > excluded.last"
         conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
         conflict += f"content = excluded.content, crc = excluded.crc {stays}"
-        self._insert("fields", number, int(last), packed(snapshot), conflict=conflict)
+        self._insert("fields", number, int(last), snapshot.to_bytes(), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
         """Keep the identifier's state after the last estimated sample, and commit."""
@@ -681,7 +680,7 @@ class Journal:
         layout = self.layout
         sizes = [len(layout.numbers), len(layout.sensors), len(layout.withheld or ())]
         values = np.frombuffer(numbers)
-        snapshot = None if content is None else unpacked(content)
+        snapshot = None if content is None else Snapshot.from_bytes(content)
         lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
         if len(values) != sum(sizes) or lengths - {self._vertices}:
             raise ValueError(f"the estimate at t = {t} has not the size of the others")

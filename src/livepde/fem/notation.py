@@ -1,8 +1,8 @@
-"""Piecewise smooth functions that complex-step differentiation handles correctly.
+"""Functions for weak forms: scikit-fem's helpers by their mathematical names, and branches.
 
 NumPy's abs of a complex number is its modulus, and max compares imaginary parts: both lose the
-derivative. The functions here select the branch by the real part, so that the complex step
-differentiates that branch.
+derivative of a complex step. The functions here select the branch by the real part, so that the
+complex step differentiates that branch.
 """
 
 from __future__ import annotations
@@ -10,8 +10,23 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from skfem.helpers import dd as hess
+from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
 
-__all__ = ["absolute", "maximum", "minimum", "positive"]
+__all__ = [
+    "absolute",
+    "ddot",
+    "div",
+    "dot",
+    "grad",
+    "hess",
+    "maximum",
+    "minimum",
+    "mul",
+    "positive",
+    "trace",
+    "transpose",
+]
 
 
 def absolute(a: Any) -> Any:
