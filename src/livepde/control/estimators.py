@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from livepde.checkpoint import packed, unpacked
+from livepde.control.goal import Known
 from livepde.control.kalman import Kalman
-from livepde.control.known import Known
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError, RunError
 from livepde.identifier import Identifier

@@ -45,12 +45,12 @@ from livepde.fem.notation import (
     positive,
     trace,
     transpose,
+    upwind,
 )
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
-from livepde.fem.upwind import upwind
 
 __all__ = [
     "START",
