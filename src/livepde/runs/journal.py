@@ -154,14 +154,11 @@ class Journal:
 
     def _stand(self) -> None:
         """Read the numbers of the last estimate and sample; raise `RunError` if some are lost."""
-        self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
-        self._current = self._last
+        self._last = self._current = self._highest("estimates")
         self._newest = max(self.accepted, *self._withdrawn(), 0)
         # A checkpoint is written after its estimate, so one without an estimate is damage.
-        kept = int(self._one("SELECT COALESCE(MAX(id), 0) FROM checkpoints"))
-        if kept > self._last:
-            text = f"the estimates after {self._last} are gone"
-            raise RunError(damaged(self.path, text))
+        if self._highest("checkpoints") > self._last:
+            raise RunError(damaged(self.path, f"the estimates after {self._last} are gone"))
 
     # --- opening -------------------------------------------------------------------------------
 
@@ -277,6 +274,10 @@ class Journal:
     def _one(self, command: str, *values: Any) -> Any:
         return self._read(command, *values)[0][0]
 
+    def _highest(self, table: str) -> int:
+        """Return the largest number of a record in a table, 0 without records."""
+        return int(self._one(f"SELECT COALESCE(MAX(id), 0) FROM {table}"))
+
     # --- writing -------------------------------------------------------------------------------
 
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
@@ -367,19 +368,15 @@ class Journal:
             conflict="ON CONFLICT (id) DO NOTHING",
         )
         if record.snapshot is not None:
-            self._keep(record.snapshot)
+            self.keep(record.snapshot, self._current)
         self._last = self._current
 
-    def keep(self, snapshot: Snapshot) -> None:
-        """Keep the fields of the last sample until `rewind` deletes them."""
-        self._keep(snapshot, last=True)
-
-    def _keep(self, snapshot: Snapshot, last: bool = False) -> None:
+    def keep(self, snapshot: Snapshot, number: int | None = None) -> None:
+        """Keep the fields of a sample; those of the last one (None) until `rewind` deletes them."""
+        last, number = number is None, self._last if number is None else number
         # Fields that are kept for good must not become temporary because they are the last, too.
-        number = self._last if last else self._current
-        stays = "WHERE last > excluded.last"
         conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
-        conflict += f"content = excluded.content, crc = excluded.crc {stays}"
+        conflict += "content = excluded.content, crc = excluded.crc WHERE last > excluded.last"
         self._insert("fields", number, int(last), snapshot.to_bytes(), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
@@ -403,8 +400,7 @@ class Journal:
         """
         if position is not None:
             # With the number of the sample, since the position of any later sample supersedes it.
-            stands = json.dumps([self.accepted, position])
-            self._say("position", stands)
+            self._say("position", json.dumps([self.accepted, position]))
         self._write(self._db.commit)
 
     def _say(self, key: str, value: str) -> None:
@@ -509,7 +505,7 @@ class Journal:
     @property
     def accepted(self) -> int:
         """Number of the last accepted sample, 0 before any."""
-        return int(self._one("SELECT COALESCE(MAX(id), 0) FROM samples"))
+        return self._highest("samples")
 
     @property
     def estimated(self) -> int:
@@ -565,7 +561,7 @@ class Journal:
         for (number,) in later:
             self._forget(int(number))
         self._write(self._db.commit)
-        self._last = self._current = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
+        self._last = self._current = self._highest("estimates")
 
     @property
     def position(self) -> str:
