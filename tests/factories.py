@@ -168,6 +168,11 @@ def advanced(
     return u
 
 
+def filter_alone(**options: Any) -> lp.SensitivityLaw:
+    """Return a sensitivity law without its iterated start, shadows and verdict, for speed."""
+    return lp.SensitivityLaw(**{"start_window": 0, "shadows": None, "verdict": False, **options})
+
+
 def observe(model: lp.Model, observation: lp.observation.Observation) -> Any:
     return observation.bind(model.state_space, model.X, model.parameter_space)
 
