@@ -498,7 +498,8 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
 def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
     model = MODELS[name]()
-    fleet = lp.Fleet(model, SENSORS, LAWS["gate, noise"], 3, withheld=lp.Points({"hidden": 0.4}))
+    law = lp.SensitivityLaw(gate=3.0, noise="auto", start_window=4, verdict=False)
+    fleet = lp.Fleet(model, SENSORS, law, 3, withheld=lp.Points({"hidden": 0.4}))
     kept = FleetRecords(model, 4)
     results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]
     for t, z, inputs in samples(fleet, 9):

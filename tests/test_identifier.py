@@ -34,7 +34,7 @@ HIDDEN = lp.Points({"c": 0.8}, unit="degC")
 
 def identifier(**options):
     options = {"withheld": HIDDEN, **options}
-    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(), **options)
+    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(start_window=4), **options)
 
 
 def sample(t=0.1, **changes):

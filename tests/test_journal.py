@@ -397,11 +397,12 @@ with Journal.create(None, (), livepde.records.Layout("", "", {}, {}, [], None, {
     pass
 if os.getuid() == 0:
     os.setuid(65534)
-try:
-    with Journal.open(Path(sys.argv[1]), write=len(sys.argv) > 2) as kept:
-        print(len(kept), len(kept.dataset().time))
-except livepde.errors.RunError as error:
-    print(error)
+for write in (False, True):
+    try:
+        with Journal.open(Path(sys.argv[1]), write=write) as kept:
+            print(len(kept), len(kept.dataset().time))
+    except livepde.errors.RunError as error:
+        print(error)
 """
 
 
@@ -435,8 +436,9 @@ def test_a_folder_that_may_only_be_read(shared, killed):
     for path in shared.glob("*"):
         path.chmod(0o644 if path.is_file() else 0o755)
     shared.chmod(0o555)
-    assert as_nobody(READ, shared / NAME) == "30 30\n"
-    assert "cannot be written" in as_nobody(READ, shared / NAME, "write")
+    read, write = as_nobody(READ, shared / NAME).splitlines()
+    assert read == "30 30"
+    assert "cannot be written" in write
     shared.chmod(0o755)
 
 
@@ -692,7 +694,7 @@ run.run()
 @pytest.mark.process
 def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(tmp_path):
     path, seen = tmp_path / NAME, 0
-    for _ in range(3):
+    for _ in range(2):
         child = subprocess.Popen([sys.executable, "-c", WRITER, tmp_path, Path(__file__).parent])
         goal = seen + 50
         while child.poll() is None and seen < goal:
@@ -706,7 +708,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
         child.wait()
         with Journal.open(path) as kept:
             assert len(list(kept)) >= seen
-    assert seen >= 150
+    assert seen >= 100
 
 
 @pytest.mark.long
