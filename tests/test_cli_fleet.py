@@ -279,6 +279,8 @@ def workers(parent: int) -> list[int]:
 @pytest.fixture
 def longer(alike):
     """Data that take a while: of eight times as many samples."""
+    case = Path("rod/case.toml")
+    case.write_text(case.read_text().replace("replay = false", "replay = false\nshadows = false"))
     for path in (Path("rod/rod.csv"), Path("rod/other.csv"), Path("rod/third.csv")):
         table = pd.read_csv(path)
         table = pd.concat([table] * 8, ignore_index=True)
