@@ -245,7 +245,7 @@ def test_check_shows_notes_and_failures(rod, monkeypatch):
     from livepde import diagnostics
 
     report = diagnostics.CheckReport(
-        "model", (diagnostics.CheckLine.at_most("transpose", 1.0, 1e-12, "mend it"),)
+        "model", (diagnostics.Check.at_most("transpose", 1.0, 1e-12, "mend it"),)
     )
     monkeypatch.setattr(diagnostics, "check_model", lambda *_, **__: report)
     code, output = call("check", rod)

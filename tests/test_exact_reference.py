@@ -1,4 +1,4 @@
-"""The law beside the independent implementation of the paper's method: `reproduce exact`.
+"""The law beside the independent implementation of the paper's method: the study `exact`.
 
 A part of the settings, meshes and rules of the experiment, with the bounds of all of it.
 """
@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments import exact, reference
+from experiments.reference_settings import SETTINGS
 from livepde import paper
-from livepde.reproduce import EXPERIMENTS, exact, reference
-from livepde.reproduce.reference_settings import SETTINGS
 
 pytestmark = pytest.mark.study
 
@@ -87,10 +87,9 @@ def test_nu_and_norms_do_not_depend_on_the_mesh(mesh):
     assert all(check.ok for check in checks), [check for check in checks if not check.ok]
 
 
-def test_energy_never_grows(monkeypatch):
+def test_energy_never_grows():
     short = {name: replace(setting, steps=60) for name, setting in exact.ENERGIES.items()}
-    monkeypatch.setattr(exact, "ENERGIES", short)
-    rows = exact.energies()
+    rows = exact.energies(short)
     assert len(rows) == 12
     checks = exact.energy_checks(rows)
     assert all(check.ok for check in checks), [check for check in checks if not check.ok]
@@ -111,5 +110,4 @@ def test_tables_have_a_row_for_each(found):
     assert [row[0] for row in table.rows] == list(CHOSEN)
     assert all(row[-1] == 0 for row in table.rows)
     assert len(SETTINGS) >= 16
-    assert EXPERIMENTS["exact"] is exact.EXACT
     exact._figure(dict.fromkeys(exact.DRAWN, found["partial"])).canvas.draw()

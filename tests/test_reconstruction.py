@@ -15,8 +15,8 @@ from skfem import (
 )
 
 import livepde as lp
+from experiments import seed_excited_noise as noisy
 from livepde.observation import Apriori, Discrepancy, Pseudoinverse, Tikhonov
-from livepde.reproduce import noisy
 
 ELEMENTS = [ElementLineHermite, ElementLineP1, ElementLineP2]
 MIDDLE = lambda x: (x[0] > 0.3) & (x[0] < 0.87)  # noqa: E731
@@ -349,7 +349,7 @@ def test_the_noisy_excited_twin_shows_what_smoothing_is_good_for(monkeypatch):
         return found[key]
 
     monkeypatch.setattr(noisy, "noisy_run", once)
-    outcome = noisy.SEED_EXCITED_NOISE.run()
+    outcome = noisy.seed_excited_noise()
     assert len(found) == 8
     assert outcome.ok, [check for check in outcome.checks if not check.ok]
     assert whole(0.01, 100, smoothing=True).error == outcome.tables[1].rows[0][2] <= 0.10

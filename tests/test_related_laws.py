@@ -10,11 +10,11 @@ from factories import excited, excited_q, excited_u, laplace, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
+from experiments.relatives import EXPECTED, LAWS, law, relatives
 from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
 from livepde.laws.metrics import ConstantMetric
 from livepde.laws.related_laws import _Linear
 from livepde.model import mass_form
-from livepde.reproduce.relatives import EXPECTED, LAWS, law
 from livepde.stepping import Newton
 from livepde.streams import Twin
 
@@ -135,9 +135,7 @@ def test_no_sensor_of_the_parameter(kind: Any) -> None:
 
 @pytest.mark.study
 def test_reproduction() -> None:
-    from livepde.reproduce import EXPERIMENTS
-
-    outcome = EXPERIMENTS["relatives"].run()
+    outcome = relatives()
     assert outcome.ok, [check.name for check in outcome.checks if not check.ok]
     assert len(outcome.checks) == len(EXPECTED) + 1
     assert sum("refused" in row for row in outcome.tables[0].rows) == 2

@@ -73,17 +73,15 @@ def report(
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
     """Take a run's samples again; print and write the theory report."""
     from livepde.diagnostics import theory_report
-    from livepde.runs import Table
 
     prepared = prepare_again(opened, data, allow_code)
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
-    shown = [Table(table.title, table.columns, table.rows) for table in found.tables]
     if as_json:
-        print_json(shown, [], found.notes, run=str(opened.path), theory=str(target))
+        print_json(found.tables, [], found.notes, run=str(opened.path), theory=str(target))
         return
     console = terminal()
     console.print(f"[bold]{escape(opened.title)}[/]  theory")
-    show(console, shown, [], found.notes)
+    show(console, found.tables, [], found.notes)
     console.print(f"Page: {escape(str(target))}", soft_wrap=True)

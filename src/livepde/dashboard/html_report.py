@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from livepde import runs
 from livepde.errors import ConfigurationError, RunError
 from livepde.runs import Check, Journal, Run, Table
-from livepde.runs.directory import CASE, JOURNAL, bound_text
+from livepde.runs.directory import CASE, JOURNAL
 from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
 
@@ -125,7 +125,7 @@ def _shown(table: Table) -> Table:
 
 def _checked(check: Check) -> tuple[str, ...]:
     result = "ok" if check.ok else "FAILED"
-    return check.name, f"{check.value:.5g}", f"{check.sense} {bound_text(check)}", result
+    return check.name, f"{check.value:.5g}", f"{check.sense} {check.bound_text}", result
 
 
 def _written(run: Run) -> str:
