@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from scipy.integrate import trapezoid
 from skfem import ElementLineP1
 
@@ -83,7 +84,7 @@ def test_the_potential_is_that_of_the_concentration_at_every_moment():
 
 def samples(sensors: lp.observation.Observation, noise: float) -> list[tuple[float, Any]]:
     model, rng = electrolyte(), np.random.default_rng(0)
-    observed = sensors.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, sensors)
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     for k in range(60):
         for j in range(10):  # the truth takes ten steps for each of the filter's

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -155,7 +156,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
         inputs=("I",),
         noise=noise,
     )
-    observed = voltage.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, voltage)
     identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, hold=True)
     rng = np.random.default_rng(0)
     c = model.initial(START)

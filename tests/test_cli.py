@@ -41,13 +41,6 @@ COMMANDS = (
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Work in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
 def rod(here):
     """The case of `livepde init`, short."""
     short_rod(here / "rod")

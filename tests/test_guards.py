@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import driven_rod, filter_alone, readings
+from factories import driven_rod, filter_alone, observe, readings
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -421,7 +421,7 @@ def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
 
 def test_probes_see_the_same_by_assembly_in_every_unit():
     model = reaction(lambda t: 1.0)
-    split = lp.Full().bind(model.state_space, model.X, model.parameter_space).split()
+    split = observe(model, lp.Full()).split()
     probes = Probes(model, split)
     q, *states = np.random.default_rng(0).standard_normal((3, model.X.dim))
     w = np.transpose(states)

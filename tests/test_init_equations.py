@@ -234,12 +234,6 @@ def simulated(case: Path, filled: Filled, given: dict[str, Any]) -> list[dict[st
     return table
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def test_every_equation_is_tried():
     assert set(FILLED) == set(EQUATIONS)
 

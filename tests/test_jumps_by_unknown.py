@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from skfem import ElementLineP1
 
 import livepde as lp
@@ -37,7 +38,7 @@ def rod(cells: int) -> lp.Model:
 def samples() -> list[tuple[float, Any]]:
     """Measurements of a truth on a finer mesh with smaller steps."""
     model, rng = rod(64), np.random.default_rng(0)
-    observed = lp.Points(POINTS).bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, lp.Points(POINTS))
     forward, u, found = ForwardStage(model), model.initial(0.0), []
     h = STEP / FINER
     for k in range(800):

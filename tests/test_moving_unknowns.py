@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import advanced, driven_rod, line, readings
+from factories import advanced, driven_rod, line, observe, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
@@ -434,7 +434,7 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         lp.LogNormal(2.0, 1.0),
         A=lambda q, u, v, x: q * u * v,
     )
-    full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    full = observe(model, lp.Full())
     excitation = Excitation(Spaces(model, full), window=0.5)
     for q, slope in ((None, 2.0), (np.array([5.0]), 5.0)):
         state = excitation.init()
