@@ -14,7 +14,7 @@ from livepde.fem import Inputs, Moment
 from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.linalg import Array
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, StageOfMembers
-from livepde.stepping.driven import DrivenVector
+from livepde.stepping.banded_stage import DrivenVector
 from livepde.stepping.member_stage import SeparateStages
 
 MESH = lp.interval(0.0, 1.0, 14)

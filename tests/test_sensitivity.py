@@ -269,7 +269,7 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
 
     def no_luck(filter_, x, span, options):
         zero, lost = np.zeros(1), Status("not_converged", "no luck")
-        return x, Assimilation(np.zeros((1, 1)), 0, lost, zero > 0.0, zero, zero)
+        return x, Assimilation(np.zeros((1, 1)), 0, lost, zero > 0.0, zero, 0.0)
 
     monkeypatch.setattr("livepde.laws.replay_slices.assimilate", no_luck)
     estimates = [ident.step(*sample) for sample in samples]
