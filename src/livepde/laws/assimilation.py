@@ -17,7 +17,7 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
-from livepde.verdict import Judge, Seen
+from livepde.verdict import Judge, ScoredSample
 
 __all__ = ["OK", "Assimilation", "MemberReports", "assimilate", "assimilate_at_once"]
 
@@ -214,18 +214,18 @@ def _judged(
     """Return the state before an update, with the sample added to the sums of the verdict."""
     prior = filter_.problem.model.latent.prior
 
-    def q() -> Array:
-        return filter_.estimate(x)
-
     def a() -> Array:
-        found: Array = filter_.reduction.reduced(q() - prior)
+        found: Array = filter_.reduction.reduced(x.q - prior) + x.da
         if filter_.shadows is not None:
             found = found - x.shadows.a[:, filter_.shadows.counted].sum(axis=1)
         return found
 
-    u = x.u + x.du
-    seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)
-    causes, ledger = judge.heard(x.ledger, seen)
+    def q() -> Array:
+        return filter_.estimate(x)
+
+    z, at, u = span.z1, span.end, x.u + x.du
+    sample = ScoredSample(x.C, x.causes, a, q, u, Y, d, used, z, predicted, noise, at)
+    causes, ledger = judge.add(x.ledger, sample)
     return changed(x, causes=causes, ledger=ledger)
 
 

@@ -164,47 +164,34 @@ class Dictionary:
     def __len__(self) -> int:
         return len(self.directions)
 
-    def moved(self, u: Array) -> Array:
-        """Return how readings change with shifts of their sensors, (members, axes * sensors)."""
-        if self.shifts is None:
-            return np.zeros((len(u), 0))
-        return self.shifts.of_readings(u)
+    def signals(self, noise: Array, change: Array, rate: Array, moved: Array) -> Array:
+        """Return the change of a reading along each direction of a sensor, in units of its noise.
 
-    def signals(
-        self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
-    ) -> Array:
-        """Return the change of a reading along each direction, (samples, directions of sensors).
-
-        In units of the noise. That of a drift is its slope.
+        Shape (members, samples, directions of sensors). That of a drift is its slope.
 
         Parameters
         ----------
         noise
-            Shape (samples, sensors).
-        h, first, last
-            Predictions now, at the start and of the sample before, (samples, sensors).
-        share
-            Usual interval between samples over this one, (samples,).
+            Shape (members, samples, sensors).
+        change, rate
+            Prediction less the first one, and prediction of the sample before less that of now, at
+            the usual interval between samples, (members, samples, sensors).
         moved
-            Shape (samples, axes * sensors).
+            Effect of shifts of the sensors, (members, samples, axes * sensors).
         """
-        samples, sensors = h.shape
-        parts: dict[str, Any] = {}
+        parts = [np.zeros((*noise.shape[:2], 0))]
         for kind in self.kinds:
             if kind == "offset":
-                parts[kind] = np.full((samples, sensors), OFFSET)
+                parts.append(np.full_like(noise, OFFSET))
             elif kind == "drift":
-                parts[kind] = np.full((samples, sensors), OFFSET / DRIFT)
+                parts.append(np.full_like(noise, OFFSET / DRIFT))
             elif kind == "gain":
-                parts[kind] = GAIN * (h - first) / noise
+                parts.append(GAIN * change / noise)
             elif kind == "lag":
-                rate = (last - h) * share[:, None]
-                parts[kind] = LAG * np.where(np.isfinite(rate), rate, 0.0) / noise
+                parts.append(LAG * np.where(np.isfinite(rate), rate, 0.0) / noise)
             else:
-                parts[kind] = moved / np.tile(noise, moved.shape[1] // sensors)
-        if not parts:
-            return np.zeros((samples, 0))
-        return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
+                parts.append(moved / np.tile(noise, moved.shape[2] // noise.shape[2]))
+        return np.concatenate(parts, axis=2)
 
 
 def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
