@@ -182,6 +182,8 @@ def _absorbed(
             np.where(used, d, 0.0),
             np.where(used, told, 0.0),
         )
+        if off is not None:
+            off = np.where(used[:, None], off, 0.0)
     if filter_.judge is not None:
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     new, made = filter_.update(x, Y, d)
@@ -192,7 +194,7 @@ def _absorbed(
     if options.adaptive:
         parts |= _learned(x, used, d, noise, made)
     if shadows is not None and off is not None:
-        parts["shadows"] = shadows.updated(x, new, made, used / noise, off, span.t1)
+        parts["shadows"] = shadows.updated(x, new, made.left, used / noise, off, span.t1)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite.
     sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
