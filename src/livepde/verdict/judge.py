@@ -283,6 +283,10 @@ class Judge:
     @staticmethod
     def _stuck(ledger: Ledger, z: Array) -> dict[str, Any]:
         """Return how often in a row sensors have shown the same value, and that value."""
+        before = np.concatenate([ledger.value[:, None], z[:, :-1]], axis=1)
+        # Most often all are shown, and none is that before.
+        if np.isfinite(z).all() and not (np.abs(z - before) <= SAME * np.abs(z)).any():
+            return {"stuck": np.zeros_like(ledger.stuck), "value": z[:, -1]}
         z = np.concatenate([ledger.value[:, None], z], axis=1)
         order, seen = np.arange(z.shape[1])[:, None], np.isfinite(z)
         latest = np.maximum.accumulate(np.where(seen, order, 0), axis=1)
@@ -383,7 +387,8 @@ class Judge:
         reached, q = ledger.reached.copy(), sample.q()
         for k in np.flatnonzero(behind).tolist():
             # Without a better guess, what the sensors showed first is where nothing is lost.
-            rest = float(np.nanmean(ledger.first[k])) if np.isfinite(ledger.first[k]).any() else 0.0
+            first = ledger.first[k, np.isfinite(ledger.first[k])]
+            rest = float(first.sum()) / max(len(first), 1)
             unit = self._unit(ledger, k, t)
             now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
             if not np.isfinite(reached[k, 1]):
@@ -435,7 +440,8 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
     sensors, k) and (..., k, 1).
     """
     rank, sensors = Y.shape[-2:]
-    Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
+    if not np.isfinite(Y).all():
+        Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
     small = rank < sensors
     Yt = Y.swapaxes(-1, -2)
     values, axes = np.linalg.eigh(Y @ Yt if small else Yt @ Y)
@@ -460,7 +466,9 @@ def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
 
 def _sensitivity(C: Array, Y: Array) -> Array:
     """Return how readings change with the unknowns, (..., k, sensors); zero where not known."""
-    known = np.isfinite(C).all(axis=(-2, -1)) & (np.abs(np.linalg.det(C)) > 0.0)
-    one = np.eye(C.shape[-1])
-    safe = np.where(known[..., None, None], C, one)
+    determinant = np.linalg.det(C)
+    known = np.isfinite(determinant) & (determinant != 0.0)
+    if known.all():
+        return np.asarray(np.linalg.solve(C, Y))
+    safe = np.where(known[..., None, None], C, np.eye(C.shape[-1]))
     return np.asarray(np.where(known[..., None, None], np.linalg.solve(safe, Y), 0.0))

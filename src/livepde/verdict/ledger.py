@@ -21,6 +21,7 @@ WINDOWS = (0, 64, 512)
 """Samples after which a window begins anew; 0: the window of all samples. The faults of a window
 begin with it, so that an old, sound record does not hide a fault that is new."""
 
+LENGTHS = np.array([length or np.inf for length in WINDOWS])
 BATCH = 16  # samples at most that wait until they are summed together
 ROOM = 2**16  # numbers at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
@@ -156,8 +157,7 @@ class Ledger:
     @property
     def due(self) -> Mask:
         """Windows that begin anew with the next sample, shape (members, windows)."""
-        lengths = np.array(WINDOWS[: self.age.shape[1]])
-        due: Mask = (lengths > 0) & (self.age >= lengths) | (self.age == 0)
+        due: Mask = (self.age >= LENGTHS[: self.age.shape[1]]) | (self.age == 0)
         return due
 
     def clipped(self, r: Array) -> Array:
