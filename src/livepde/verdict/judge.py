@@ -149,7 +149,12 @@ class Judge:
         # sums a copy and changes nothing. None waits before the first sample, too.
         if not (ledger.waiting % self.batch).all():
             M, ledger = self._batch_begun(ledger, sample)
-        more: dict[str, Any] = {}
+        if (
+            self.terms
+            and members <= MOST_MEMBERS
+            and not (ledger.reached[:, 1] >= sample.at.t).all()
+        ):
+            ledger = self._answered(ledger, sample)
         # In the order of `_at`; the rows that a square root lacks are zeros.
         row = [
             np.full((members, 1), sample.at.t),
@@ -163,9 +168,8 @@ class Judge:
         ]
         if self.dictionary.shifts is not None:
             row.append(self.dictionary.shifts.of_readings(sample.u))
-        if self.terms:
-            answers, more = self._answers(ledger, sample)
-            row.append(answers)
+        if self.terms:  # interpolated later on, many at once
+            row.append(np.full((members, self.terms * self.sensors), np.nan))
         if self.recorded:
             if sample.C.shape[1] == self.unknowns:
                 row += [sample.a(), sample.C.reshape(members, -1)]
@@ -173,11 +177,11 @@ class Judge:
                 row.append(np.zeros((members, self.unknowns * (1 + self.unknowns))))
         rows = ledger.rows.copy()
         rows[np.arange(members), ledger.waiting] = np.concatenate(row, axis=1)
-        more |= {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
         # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
         # [U C].
         one = self._eye[:, :r]
-        return one if members == 1 else np.repeat(one, members, axis=0), changed(ledger, **more)
+        after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
+        return one if members == 1 else np.repeat(one, members, axis=0), after
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
@@ -339,53 +343,43 @@ class Judge:
         And by what it is larger in each window, (members, batch, windows, directions): a drift
         begins with its window and grows by one unit with each sample.
         """
-        at, dictionary = self._at, self.dictionary
-        members, batch, _ = rows.shape
+        at, (members, batch, _) = self._at, rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
         # A sensor that is late by a sample shows the prediction of the sample before it.
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
-        rate = (last - h) * (ledger.times[:, 1:] / (t - before))[:, :, None]
-        noise = rows[:, :, at["noise"]]
-        noise = np.where(noise > 0.0, noise, 1.0)  # rows that are not filled yet
+        late = (last - h) * (ledger.times[:, 1:] / (t - before))[:, :, None]
         moved, change = rows[:, :, at["moved"]], h - ledger.first[:, None]
-        own = dictionary.signals(noise, change, rate, moved)
-        answers = rows[:, :, at["answers"]].reshape(members, batch, self.terms, self.sensors)
-        f = np.zeros((members, batch, self.sensors, len(dictionary)))
-        f[:, :, dictionary.own, np.arange(own.shape[2])] = own
-        f[..., self._process] = answers.swapaxes(-1, -2) / noise[..., None]
+        answers = self._answers(ledger)[:, :batch]
+        answers = answers.reshape(members, batch, self.terms, self.sensors)
+        f = self.dictionary.effects(rows[:, :, at["noise"]], change, late, moved, answers)
         f *= used[..., None]
-        f = np.where(np.isfinite(f), f, 0.0)
-        growth = np.ones((members, batch, self.windows, len(dictionary)))
+        f[~np.isfinite(f)] = 0.0  # the sample before is not known, or a row is not filled
+        growth = np.ones((members, batch, self.windows, len(self.dictionary)))
         age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
         growth[..., self._drift] = age[..., None]
         return f, growth
 
-    def _answers(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, dict[str, Any]]:
-        """Return the readings due to missing terms, (members, terms * sensors), and their states.
+    def _answers(self, ledger: Ledger) -> Array:
+        """Return readings due to missing terms at samples that wait, (members, batch, numbers)."""
+        known = ledger.rows[:, :, self._at["answers"]]
+        since = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
+        low, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
+        return np.where(np.isnan(known), low + since * slope, known)
+
+    def _answered(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
+        """Return the ledger with responses of the process that reach a sample at least.
 
         One step of the process answers for several samples, which interpolate between its ends.
         """
-        members, t = len(ledger.seen), sample.at.t
-        if members > MOST_MEMBERS:  # they cost a solve for each term and member
-            return np.zeros((members, self.terms * self.sensors)), {}
-        parts: dict[str, Any] = {}
-        behind = ~(ledger.reached[:, 1] >= t)
-        if behind.any():
-            parts = self._answered(ledger, sample, behind)
-            ledger = changed(ledger, **parts)
-        low, slope = ledger.readings[:, 0], ledger.readings[:, 1]
-        answers = low + (t - ledger.reached[:, 0])[:, None, None] * slope
-        return answers.reshape(members, -1), parts
-
-    def _answered(self, ledger: Ledger, sample: ScoredSample, behind: Mask) -> dict[str, Any]:
-        """Return the responses of some members of the process, which reach a sample at least."""
         process, t = self.dictionary.process, sample.at.t
         if process is None:
-            return {}
+            return ledger
+        rows = ledger.rows.copy()
+        rows[:, :, self._at["answers"]] = self._answers(ledger)
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached, q = ledger.reached.copy(), sample.q()
-        for k in np.flatnonzero(behind).tolist():
+        for k in np.flatnonzero(~(reached[:, 1] >= t)).tolist():
             # Without a better guess, what the sensors showed first is where nothing is lost.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
             rest = float(first.sum()) / max(len(first), 1)
@@ -402,7 +396,7 @@ class Judge:
             low = readings[k, 0] + (begin - reached[k, 0]) * readings[k, 1]
             readings[k] = low, (process.shown(p[k], now) - low) / h
             reached[k] = begin, begin + h
-        return {"process": p, "readings": readings, "reached": reached}
+        return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
 
 
 def _of_each(part: Array, members: int) -> Array:

@@ -205,31 +205,28 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     kept = ~(due & (old.age > 0))
     # The last sample before the batch comes first: products of successive values need it.
     before = old.before.copy()
-    before[:, 1:] *= np.repeat(kept, directions, axis=1)[:, :, None]
+    before[:, 1:].reshape(members, windows, -1)[~kept] = 0.0
     row = np.concatenate([before.swapaxes(1, 2)[:, None], whitened], axis=1)
-    r, g = row[..., 0], row[..., 1:]
+    now, earlier = row[:, 1:], row[:, :-1]
     present = np.concatenate([old.present[:, None], used], axis=1)
     # Such products count where both samples had a value.
     pair = present[:, 1:] * present[:, :-1]
-    following = r[:, :-1] * pair
+    if not pair.all():
+        earlier = earlier * pair[..., None]
     # Weights of g in two sums: of g_k r_k, and of g_k r_(k-1) + g_(k-1) r_k.
-    weights = np.zeros((2, *r.shape))
-    weights[0, :, 1:], weights[1, :, 1:] = r[:, 1:], following
-    weights[1, :, :-1] += r[:, 1:] * pair
-    crossed = weights.transpose(1, 3, 0, 2) @ g.swapaxes(1, 2)  # (members, sensors, 2, columns)
-    now, pairs = g[:, 1:], g[:, :-1] * pair[..., None]
-    parts = [
-        crossed[:, :, 0],
-        np.einsum("mbsc,mbsc->msc", now, now),
-        crossed[:, :, 1],
-        np.einsum("mbsc,mbsc->msc", now, pairs),
-    ]
-    found = np.stack(parts, axis=1).reshape(members, 4, sensors, windows, directions)
-    r = r[:, 1:]
-    told = np.stack([used, r, r * r, r * following, pair], axis=1).sum(axis=2)
+    weights = np.zeros((2, *row.shape[:3]))
+    weights[0, :, 1:], weights[1, :, 1:] = now[..., 0], earlier[..., 0]
+    weights[1, :, :-1] += now[..., 0] * pair
+    crossed = weights.transpose(1, 3, 0, 2) @ row.swapaxes(1, 2)  # (members, sensors, 2, columns)
+    squares = np.einsum("mbsc,mbsc->msc", now, now)
+    lagged = np.einsum("mbsc,mbsc->msc", now, earlier)
+    found = np.stack([crossed[:, :, 0], squares, crossed[:, :, 1], lagged], axis=1)
+    sums = found[..., 1:].reshape(members, 4, sensors, windows, directions)
+    r = now[..., 0].sum(axis=1)
+    parts = [used.sum(axis=1), r, squares[..., 0], lagged[..., 0], pair.sum(axis=1)]
     return {
-        "sums": old.sums * kept[:, None, :, None, None] + found.transpose(0, 1, 3, 4, 2),
-        "noise": old.noise * kept[:, None, :, None] + told[:, :, None],
+        "sums": old.sums * kept[:, None, :, None, None] + sums.transpose(0, 1, 3, 4, 2),
+        "noise": old.noise * kept[:, None, :, None] + np.stack(parts, axis=1)[:, :, None],
         "before": row[:, -1].swapaxes(1, 2),
         "present": used[:, -1],
     }
