@@ -234,7 +234,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             ),
         )
         if self.shadows is not None:
-            parts = problem, filter_.sensors, reduction, filter_.stage, self.shadows
+            parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")

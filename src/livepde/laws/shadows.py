@@ -17,6 +17,7 @@ readings.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -29,7 +30,6 @@ from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, put, take
-from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
@@ -220,9 +220,9 @@ class Shadow(ABC):
     def error(self, s: ShadowState, block: Block) -> Found:
         """Return the discretisation error of a block of steps."""
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
-        """Return the state after one more interval was read, before any estimate."""
-        return s
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
+        """Return fields of the state after one more interval was read, before any estimate."""
+        return {}
 
     def in_readings(self, s: ShadowState) -> Array | None:
         """Return the error of the readings beside that due to `ShadowState.u`; None if zero."""
@@ -306,7 +306,7 @@ class InputShadow(Shadow):
         nothing = np.zeros((1, self.channels))
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return the error of inputs by straight lines, and by values held in a gap."""
         length, change = span.t1 - span.t0, span.inputs1 - span.inputs0
         if len(length) < len(s):  # the members of a bank have their samples in common
@@ -320,10 +320,10 @@ class InputShadow(Shadow):
         # The second derivative is 2 (slope - s.slope)/(h + s.length), and the line lies above the
         # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
-        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
+        return {"slope": slope, "length": length, "bend": bend, "missed": s.missed + bend}
 
     @staticmethod
-    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> ShadowState:
+    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> dict[str, Any]:
         """Return the same where channels are held.
 
         In a gap a channel is expected to go on as before; once it has a value again the line across
@@ -340,7 +340,7 @@ class InputShadow(Shadow):
         some: Mask = np.asarray((gaps > 0.0).any(axis=(1, 2)))
         bend = np.where(some[:, None], 0.0, bend)
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
-        return changed(s, slope=slope, length=length, bend=bend, missed=missed)
+        return {"slope": slope, "length": length, "bend": bend, "missed": missed}
 
     def error(self, s: ShadowState, block: Block) -> Found:
         ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
@@ -376,7 +376,7 @@ class HeldInputShadow(InputShadow):
         s = super().begun(s, x, moment, given)
         return changed(s, held=np.full((1, 4, self.channels), np.nan))
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return the difference of held inputs to straight lines."""
         # Sums of squares of successive changes, and of differences of them: the ratio tells smooth
         # inputs from set points.
@@ -389,7 +389,7 @@ class HeldInputShadow(InputShadow):
         missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
         values = np.broadcast_to(span.inputs1, change.shape)
         held = np.stack([values, change, changes, differences], axis=1)
-        return changed(s, held=held, bend=missed, missed=s.missed + missed)
+        return {"held": held, "bend": missed, "missed": s.missed + missed}
 
 
 @dataclass(frozen=True, eq=False)
@@ -467,8 +467,11 @@ class ShadowSet:
 
     Attributes
     ----------
-    problem, sensors, reduction
+    problem, reduction
         Those of the filter.
+    rows
+        Function that returns the readings of rows of state and reduced unknowns, (members, rows,
+        sensors): `MemberSensors.rows`.
     shadows
         One for each row of `ShadowState.u`.
     refused
@@ -476,8 +479,8 @@ class ShadowSet:
     """
 
     problem: Problem
-    sensors: MemberSensors
     reduction: Reduction
+    rows: Callable[[FilterState, Array, Array, Moments], Array]
     shadows: tuple[Shadow, ...]
     refused: str = ""
 
@@ -485,8 +488,8 @@ class ShadowSet:
     def of(
         cls,
         problem: Problem,
-        sensors: MemberSensors,
         reduction: Reduction,
+        rows: Callable[[FilterState, Array, Array, Moments], Array],
         stage: MemberStage,
         options: Shadows,
         *,
@@ -507,7 +510,7 @@ class ShadowSet:
         if options.inputs and problem.model.channels:
             kind = HeldInputShadow if problem.control.hold else InputShadow
             found.append(kind(process, len(problem.channels)))
-        return cls(problem, sensors, reduction, tuple(found), refused)
+        return cls(problem, reduction, rows, tuple(found), refused)
 
     @cached_property
     def counted(self) -> slice:
@@ -538,19 +541,24 @@ class ShadowSet:
             Before and after the span; `end` with the errors of before, propagated.
         """
         s = end.shadows
-        fresh = s.count == s.last
-        if fresh.any():
-            s = _opened(s, fresh, x, span, "mesh" in self.kinds)
+        parts, jumps = _watched(s, x, end, span)
+        fresh = s.count == s.last  # members that begin a block
+        if np.count_nonzero(fresh):
+            rows = fresh[:, None]
+            parts["begun"] = np.where(fresh, span.t0, s.begun)
+            parts["inputs0"] = np.where(rows, span.inputs0, s.inputs0)
+            if "mesh" in self.kinds:
+                parts["u0"] = np.where(rows, x.u, s.u0)
         for shadow in self.shadows:
-            s = shadow.read(s, span)
-        s, jumps = _watched(s, x, end, span)
+            parts |= shadow.read(s, span)
+        s = changed(s, **parts)
         # After a jump of the drive the error of the step is another one at once.
         due = (s.count >= s.due) | jumps
         # What gaps miss counts at once: later it might cancel with that of the next one.
         if span.gaps is not None:
             due = due | (span.gaps > 0.0).any(axis=(1, 2))
         # A block is one step for all members in it, which therefore have to begin together.
-        for t in np.unique(s.begun[due]) if due.any() else ():
+        for t in sorted(set(s.begun[due].tolist())) if np.count_nonzero(due) else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
                 s = self._with_errors(s, x, end, span, jumps)
@@ -591,7 +599,7 @@ class ShadowSet:
     def seen(self, x: FilterState, at: Moments) -> Array:
         """Return by how much predictions are off, (members, shadows, sensors)."""
         s = x.shadows
-        seen = self.sensors.rows(x, s.u, s.a, at)
+        seen = self.rows(x, s.u, s.a, at)
         for row, shadow in enumerate(self.shadows):
             more = shadow.in_readings(s)
             if more is not None:
@@ -621,12 +629,12 @@ class ShadowSet:
         half = off @ gain
         parts = {"u": s.u - half @ new.U, "a": s.a - half @ new.C}
         since = t - s.begun
-        if s.gains.size and since.any():
+        if s.gains.size and np.count_nonzero(since):
             # A sample multiplies the effect of earlier ones by I - K H, for which the share of the
             # variance that it leaves stands: the full product would need a matrix for each sensor.
-            before, after = (np.einsum("brk,brk->bk", C, C) for C in (x.C, new.C))
-            share = (after / np.maximum(before, TINY))[:, None]
-            parts["gains"] = share * s.gains + since[:, None, None] * (gain @ new.C)
+            share = np.einsum("brk,brk->bk", new.C, new.C)
+            share /= np.maximum(np.einsum("brk,brk->bk", x.C, x.C), TINY)
+            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ new.C)
         return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
@@ -684,27 +692,20 @@ class ShadowSet:
 
 def _watched(
     s: ShadowState, x: FilterState, end: FilterState, span: Span
-) -> tuple[ShadowState, Mask]:
-    """Return members after one more step, and those of which the rate of the state jumped in it."""
+) -> tuple[dict[str, Any], Mask]:
+    """Return fields after one more step, and members whose rate of the state jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
-    count, differs = s.count + 1, np.sqrt((more * more).sum(axis=1))
+    count, differs = s.count + 1, np.sqrt(np.einsum("mn,mn->m", more, more))
     most = np.where(count > CALM + 1, JUMP * s.usual, np.inf)  # in the first steps none is known
     jumps = differs > most
     # A jump does not count as usual.
     weight = WEIGHTS[np.minimum(count, USUAL)]
     usual = s.usual + (np.minimum(differs, most) - s.usual) * weight
-    parts = {"rate": rate, "usual": usual, "count": count}
-    if jumps.any():
+    parts: dict[str, Any] = {"rate": rate, "usual": usual, "count": count}
+    if np.count_nonzero(jumps):
         parts["jumped"] = np.where(jumps, count, s.jumped)
-    return changed(s, **parts), jumps
-
-
-def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:
-    """Return members of which some begin a block of steps with a span."""
-    rows = fresh[:, None]
-    begun, u0 = np.where(fresh, span.t0, s.begun), np.where(rows, x.u, s.u0) if mesh else s.u0
-    return changed(s, begun=begun, u0=u0, inputs0=np.where(rows, span.inputs0, s.inputs0))
+    return parts, jumps
 
 
 def _part(span: Span, group: IntArray) -> Span:

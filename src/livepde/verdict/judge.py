@@ -40,7 +40,7 @@ from livepde.verdict.missing_terms import Now, stride
 
 __all__ = ["Judge", "ScoredSample"]
 
-MOST_MEMBERS = 16  # of a bank that are judged; a fleet of more is not
+MOST_MEMBERS = 16  # of a bank in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
 
@@ -141,19 +141,20 @@ class Judge:
         counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
 
+    def answered(self, members: int) -> bool:
+        """Return whether missing terms are looked for: each costs a solve for each member."""
+        return self.terms > 0 and members <= MOST_MEMBERS
+
     def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
         """Return M of the next sample before its update, the identity, and the ledger."""
         M = sample.M
         members, r, _ = M.shape
         # A batch is summed when the next sample comes, so that whoever reads the verdict in between
         # sums a copy and changes nothing. None waits before the first sample, too.
-        if not (ledger.waiting % self.batch).all():
+        if np.count_nonzero(ledger.waiting % self.batch) < members:
             M, ledger = self._batch_begun(ledger, sample)
-        if (
-            self.terms
-            and members <= MOST_MEMBERS
-            and not (ledger.reached[:, 1] >= sample.at.t).all()
-        ):
+        reached = ledger.reached[:, 1] >= sample.at.t
+        if self.answered(members) and np.count_nonzero(reached) < members:
             ledger = self._answered(ledger, sample)
         # In the order of `_at`; the rows that a square root lacks are zeros.
         row = [

@@ -156,7 +156,7 @@ class Process:
 
     def begun(self) -> Array:
         """Return the responses at the start, (terms, n): that to another initial state."""
-        p = self._lifts.copy()
+        p: Array = self._lifts.copy()
         p[[term.kind == "initial" for term in self.terms]] = self.level * self.model.X.free
         return p
 
@@ -170,7 +170,8 @@ class Process:
                 known[k] += term.load(now)
         free = self.model.X.free
         solved: Array = factor.solve((known * free).T).T
-        return solved * free + self._lifts
+        found: Array = solved * free + self._lifts
+        return found
 
     def shown(self, p: Array, now: Now) -> Array:
         """Return the readings of the responses, shape (terms, sensors)."""
