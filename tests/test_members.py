@@ -37,13 +37,13 @@ MODELS = {
     "ends in time": rod({"left": lambda x, t: np.sin(t) + 0.0 * x[0], "right": 0.0}),
     "no ends": rod({}),
     "source in time": rod({"left": 0.0}, lambda x, t: np.cos(3.0 * t) * x[0]),
-    "curved in inputs": rod({"left": 0.0}, lambda x, t: x.inputs["T_0"] ** 2, inputs=["T_0"]),
+    "curved in inputs": rod({"left": 0.0}, lambda x, _: x.inputs["T_0"] ** 2, inputs=["T_0"]),
     "unknown and input": rod(
         {"left": 0.0},
         A=[
             lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
             lambda q, u, v, x: q.s * u * v,
-            lambda q, u, v, x: -q.s * x.inputs["T_0"] * v,
+            lambda q, _, v, x: -q.s * x.inputs["T_0"] * v,
         ],
         inputs=["T_0"],
     ),
