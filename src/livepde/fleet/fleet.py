@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engines import BlockEngine, FleetEngine, SeparateEngine
+from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
@@ -295,7 +295,7 @@ class Fleet:
         held: dict[str, Array],
     ) -> FleetEstimate:
         state, engine, error = self._state, self._engine, withheld
-        read = lambda: engine.beliefs(state)  # noqa: E731
+        read: Callable[[], Beliefs] = lambda: engine.beliefs(state)  # noqa: E731
         if self.withheld is not None:
             beliefs = read()
             read = lambda: beliefs  # noqa: E731
