@@ -156,7 +156,7 @@ class Filter:
 
     def unknowns_after(self, x: FilterState, h: float) -> FilterState:
         """Return q, da, C and the shifts by shadows after a time h; all else is that of before."""
-        if not self.moves or h == 0.0:
+        if h == 0.0:
             return x
         drifts = self.drifts(x.member)
         if not (self.reduction.moves or drifts.any()):  # members of a bank, of which others drift
@@ -212,7 +212,7 @@ class Filter:
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept = self.predict_unknowns(x, stop - start), x.kept
+        end, kept = self.predict_unknowns(x, stop - start) if self.moves else x, x.kept
         deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
         off: Mask = np.zeros(len(x.member), dtype=bool)
         if deviates:
@@ -302,7 +302,7 @@ class Filter:
         the linear filter: an excess beyond them stays in da and du, so that no information of the
         data is lost.
         """
-        estimate = self.estimate(x)
+        estimate = x.q + x.da @ self.reduction.Phi.T
         within = self.reduction.bounded(estimate)
         da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
