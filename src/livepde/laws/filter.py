@@ -302,7 +302,7 @@ class Filter:
         the linear filter: an excess beyond them stays in da and du, so that no information of the
         data is lost.
         """
-        estimate = x.q + x.da @ self.reduction.Phi.T
+        estimate = x.q + x.da.dot(self.reduction.Phi.T)
         within = self.reduction.bounded(estimate)
         da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
