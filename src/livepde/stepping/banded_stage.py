@@ -270,7 +270,7 @@ class DrivenVector:
         """Return the vector of each member, shape (members, n); (1, n) if the same for all."""
         if self.responses is not None:
             base, changes = self.responses
-            return base if self.constant else base + at.inputs[:, : len(changes)] @ changes
+            return base if self.constant else base + at.inputs[:, : len(changes)].dot(changes)
         if len(at.inputs) == 1:
             return self.vector(at.member(0))[None]
         base = self._at(at.t, np.zeros(len(self.channels)))
