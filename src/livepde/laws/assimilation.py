@@ -141,7 +141,8 @@ def absorb(
 
     Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
     """
-    predicted, Y = filter_.sensors.observe(x, span.end)
+    at = span.end
+    predicted, Y = filter_.sensors.observe(x, at)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
     whole, measured = np.count_nonzero(used) == used.size, None
@@ -163,7 +164,7 @@ def absorb(
     shadows, off = filter_.shadows, None
     expected, told = e, d
     if shadows is not None:
-        off = shadows.seen(x, span.end)
+        off = shadows.seen(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         known = off[:, shadows.counted].sum(axis=1) / noise
@@ -186,11 +187,10 @@ def absorb(
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     parts["innovations"] = x.innovations.add(e, measured, newest)
     new, made = filter_.update(x, Y, d, **parts)
-    if options.adaptive:
-        new = changed(new, **_learned(x, used, d, noise, made))
+    learned: dict[str, Any] = _learned(x, used, d, noise, made) if options.adaptive else {}
     if shadows is not None and off is not None:
-        followed = shadows.updated(x, new, made.left, used / noise, off, span.t1)
-        new = changed(new, shadows=followed)
+        learned["shadows"] = shadows.updated(x, new, made.left, used / noise, off, span.t1)
+    new = changed(new, **learned) if learned else new
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
