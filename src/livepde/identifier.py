@@ -436,7 +436,7 @@ class Identifier:
         judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        if not names and not (inputs and gaps.counts[1:].any()):
+        if not names and not np.count_nonzero(gaps.counts[1:]):
             return judge
 
         def found() -> Verdict:
