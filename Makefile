@@ -55,7 +55,7 @@ test-fast: $(READY)  ## Run those that take a fraction of a second each
 test-system: $(READY)  ## Run those with programs of their own, brokers, browsers and pages
 	@$(BIN)/$(PYTEST) $(SYSTEM)
 
-test-long: $(READY)  ## Run those that take several seconds each
+test-long: $(READY)  ## Run those that take longer, which CI runs, too
 	@$(BIN)/$(PYTEST) $(LONG)
 
 test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too

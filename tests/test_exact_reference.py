@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from factories import observe
 
 from experiments import exact, reference
 from experiments.reference_settings import SETTINGS
@@ -41,7 +42,7 @@ def test_law_and_reference_have_the_same_data():
         np.testing.assert_array_equal(samples.z, run.Z[:, columns])
         np.testing.assert_array_equal(samples.loads, run.F)
         model, observation = samples.build()
-        observed = observation.bind(model.state_space, model.X, model.parameter_space)
+        observed = observe(model, observation)
         np.testing.assert_array_equal(observed.G @ run.Z[2], samples.z[2])
         mass = model.mass.toarray()[np.ix_(samples.at.X.free, samples.at.X.free)]
         np.testing.assert_allclose(mass, samples.at.M, atol=1e-15)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from factories import laplace, line, reaction
+from factories import laplace, line, observe, reaction
 from skfem import (
     ElementLineHermite,
     ElementLineP1,
@@ -27,7 +27,7 @@ def rod(element=ElementLineHermite, cells=20, dirichlet=None):
 
 
 def bind(model, observation):
-    return observation.bind(model.state_space, model.X, model.parameter_space)
+    return observe(model, observation)
 
 
 def kernel(cells=20, width=0.1):

@@ -316,7 +316,7 @@ def test_jacobian_is_the_derivative(rule, nu):
 )
 def test_energy_never_grows_with_full_data(rule, base):
     for gain in (1.0, 100.0, 1e4):
-        levels = energy(run(replace(base, gain=gain, nodes=16, steps=60, **rule)))
+        levels = energy(run(replace(base, gain=gain, nodes=16, steps=30, **rule)))
         assert (np.diff(levels) <= 1e-12 * levels[0]).all()
 
 
