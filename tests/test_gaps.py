@@ -13,7 +13,7 @@ from live_rod import CLOCK
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.live_case import Wiring
+from livepde.cases.live_case import LiveCase
 from livepde.cli.run import batch, concluded, writer_of
 from livepde.streams import DataTable, FillGaps
 from livepde.streams.gaps import bridged, fill_table, filled_column, find_spikes
@@ -348,7 +348,7 @@ def test_beside_a_process_the_wait_decides(tmp_path, wait, known):
     rows = [{"t": SECONDS * k, "left": v, "T": 20.0} for k, v in enumerate(u.tolist())]
     del rows[50]["left"]
     journal = tmp_path / "journal.sqlite"
-    with Wiring(cases.load(path), Rows(rows), path=journal) as wiring:
+    with LiveCase(cases.load(path), Rows(rows), path=journal) as wiring:
         live = wiring.live()
         live.run()
     with runs.Journal.open(journal) as kept:

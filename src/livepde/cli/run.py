@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.live import Beside, beside
+from livepde.cli.live import LiveOptions, beside
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
@@ -128,7 +128,7 @@ def run(
     goes_on = own or source is sys.stdin
     # What is sent to a run that is gone on with begins anywhere: times count from the first start.
     live = own or realtime or (resume and source is sys.stdin)
-    how = Beside(source, goes_on, speed, listen, watch, token, estimates)
+    how = LiveOptions(source, goes_on, speed, listen, watch, token, estimates)
     folder = _run_directory(loaded, out, resume)
     _refuse(how, live, as_json)
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
@@ -171,7 +171,7 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
     return out
 
 
-def _refuse(how: Beside, live: bool, as_json: bool) -> None:
+def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
     """Refuse options that do not belong together, before anything is read."""
     beside_only = {
         "--speed": how.speed is not None,
