@@ -2,6 +2,7 @@
 
 <!-- command line -->             the help of all commands
 <!-- benchmarks -->               the help of all benchmarks
+<!-- experiments -->              the help of all studies
 <!-- keys of a case -->           tables of all keys of a case file
 <!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
 """
@@ -53,6 +54,11 @@ def command_line(module: str = "livepde.cli", name: str = "livepde") -> str:
 def benchmarks() -> str:
     """Return the help of all benchmarks."""
     return command_line("benchmarks.__main__", "python -m benchmarks")
+
+
+def experiments() -> str:
+    """Return the help of all studies."""
+    return command_line("experiments.__main__", "python -m experiments")
 
 
 def members(room: str) -> str:
@@ -165,5 +171,6 @@ SIMPLE = {
 WRITERS = {
     "<!-- command line -->": command_line,
     "<!-- benchmarks -->": benchmarks,
+    "<!-- experiments -->": experiments,
     "<!-- keys of a case -->": keys_of_a_case,
 }

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tomlkit
+from factories import short_rod
 
 import livepde as lp
 from livepde import cases
@@ -27,7 +28,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 @pytest.fixture
 def rod(tmp_path):
     """Return (edit the template's text) -> path of a case."""
-    case, _ = write_template(tmp_path / "rod")
+    case = short_rod(tmp_path / "rod", 91, replay=True)
 
     def edited(*changes: tuple[str, str]) -> Path:
         text = case.read_text()
@@ -106,8 +107,8 @@ def test_pint_is_loaded_only_for_a_case():
 
 
 @pytest.mark.slow
-def test_template_runs_and_finds_the_truth(rod):
-    prepared, data = result_of(rod())
+def test_template_runs_and_finds_the_truth(tmp_path):
+    prepared, data = result_of(write_template(tmp_path / "rod")[0])
     case = prepared.case
     assert all(check.ok for check in checks_of(case.expected, data))
     assert not case.notes
@@ -386,7 +387,7 @@ def test_constant_boundary_and_initial_value(rod):
 def test_every_and_assimilate_from(rod):
     path = rod(("time_unit = ", 'every = 2\nassimilate_from = "10 min"\ntime_unit = '))
     prepared, data = result_of(path)
-    assert data.sizes["time"] == 91
+    assert data.sizes["time"] == 46
     assert prepared.assimilate_from == 600.0
     assert float(data.alpha[14]) == 5e-5  # at t = 560 s
     assert float(data.alpha[16]) != 5e-5
@@ -1023,10 +1024,10 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
         ("rod.csv", "none.csv", "there is no file"),
         ('frame["time_s"]', "[]", "holds no samples"),
         ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is earlier"),
-        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (181,); there are 180 times"),
+        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (91,); there are 90 times"),
         ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
         ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
-        ("frame[key] + noise * rng", "['a'] * 181 or rng", "does not hold numbers only"),
+        ("frame[key] + noise * rng", "['a'] * 91 or rng", "does not hold numbers only"),
     ],
 )
 def test_readers_that_fail(rod, monkeypatch, old, new, named):
@@ -1062,7 +1063,7 @@ def test_semicolons(rod):
     with pytest.raises(lp.errors.DataError, match="say separator = ';'"):
         cases.load(path).prepare()
     prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
-    assert len(prepared.stream) == 181
+    assert len(prepared.stream) == 91
 
 
 def test_options_that_are_text_or_booleans(rod):

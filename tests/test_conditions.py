@@ -266,7 +266,7 @@ def test_a_source_with_a_constant_input_is_assembled_once() -> None:
         field,
         {"a": lp.Normal()},
         A=lambda q, u, v, x: q.a * u * v,
-        f=lp.On("left", lambda x, t: x.inputs["Q"]),
+        f=lp.On("left", lambda x, _: x.inputs["Q"]),
         inputs=["Q"],
     )
     assert source.with_constant_inputs({"Q": 2.0}).form_F.constant

@@ -27,12 +27,6 @@ Zeit;Tiefe 5 cm [°C];Fühler (0,2 m);Bemerkung
 """
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def begun(text: str, encoding: str = "utf-8", equation: str = "heat") -> dict:
     """Return the document of the case for a table."""
     Path("my.csv").write_bytes(text.encode(encoding))

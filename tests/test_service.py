@@ -77,12 +77,6 @@ def table(*chosen: dict[str, object]) -> str:
     return "".join(",".join(str(cell) for cell in one.values()) + "\n" for one in chosen)
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
     Path("case.toml").write_text(CASE.format(data=data, intake=intake, habit=habit))
     return "case.toml"

@@ -12,7 +12,7 @@ from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.models import heat
-from livepde.runs.judgement import doubts
+from livepde.runs.run_verdict import doubts
 from livepde.stepping import Alexander2, ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 
@@ -126,6 +126,16 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
     predicted, actual = coarse.diagnostics.shifts.by("step")[label], (coarse.q - fine.q)[0]
     assert abs(actual) > 2.0 * fine.q_std[0]
     assert predicted == pytest.approx(actual, rel=0.4)
+
+
+@pytest.mark.slow
+def test_the_shift_of_an_unknown_that_hardly_moves_is_that_of_a_constant_one() -> None:
+    """Richardson's two steps halve that of an unknown that moves as well, and do not quarter it."""
+    found = []
+    for k in ({}, {"evolution": lp.RandomWalk(1e-9)}):
+        given = lp.Identifier(rod(10, **k), SENSORS, lp.SensitivityLaw(), u0=0.0)
+        found.append(shifts(ran(given, samples()[:60]), "step"))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.05)
 
 
 @pytest.mark.slow

@@ -37,9 +37,8 @@ from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.join import join_tables
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
-from livepde.streams.names import no_file
 from livepde.streams.sources import Follow, Lines, RowSource
-from livepde.streams.table import JSON_LINES
+from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = [
     "Data",

@@ -15,7 +15,7 @@ from livepde.errors import CaseError, LivepdeError
 from livepde.fem import linear
 from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
-from livepde.streams.names import no_file
+from livepde.streams.table import no_file
 
 __all__ = ["check_options", "load_code", "resolve"]
 

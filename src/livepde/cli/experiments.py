@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from livepde.runs import Outcome, RunWriter
 
-__all__ = ["demo", "reproduce"]
+__all__ = ["conducted", "demo", "reproduce"]
 
 
 def demo(out: OutOption = None) -> None:
@@ -50,6 +50,21 @@ def demo(out: OutOption = None) -> None:
     for name in _finish(writer, outcome, console):
         console.print(f"Figure: {folder / name}.png", soft_wrap=True)
     console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
+
+
+def conducted(
+    run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str
+) -> Outcome:
+    """Run an experiment, keep its outcome in a new run directory if one is named, and return it."""
+    from livepde.runs import RunWriter
+
+    writer = None
+    if out is not None:
+        writer = RunWriter.create(out, version=__version__, command=list(command), title=title)
+    outcome = run()
+    if writer is not None:
+        _finish(writer, outcome, terminal(err=True))
+    return outcome
 
 
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
@@ -92,7 +107,6 @@ def reproduce(
     Example:  livepde reproduce seed --json
     """
     from livepde.reproduce import EXPERIMENTS
-    from livepde.runs import RunWriter
 
     if name == "list":
         for item in EXPERIMENTS.values():
@@ -100,12 +114,7 @@ def reproduce(
         return
     experiment = named(name, EXPERIMENTS, "experiment")
     command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
-    writer = None
-    if out is not None:
-        writer = RunWriter.create(
-            out, version=__version__, command=command, title=experiment.summary
-        )
-    outcome = experiment.run(truth, progress=not as_json)
-    if writer is not None:
-        _finish(writer, outcome, terminal(err=True))
+    outcome = conducted(
+        lambda: experiment.run(truth, progress=not as_json), out, command, experiment.summary
+    )
     report_outcome(outcome, command, as_json)

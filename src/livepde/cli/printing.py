@@ -176,12 +176,10 @@ def _cell(value: Any) -> str:
 
 
 def _print_checks(console: Console, checks: Sequence[Check]) -> None:
-    from livepde.runs.directory import bound_text
-
     if not checks:
         return
     grid = RichTable.grid(padding=(0, 2))
     for item in checks:
         mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
-        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, bound_text(item))
+        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
     console.print(grid)

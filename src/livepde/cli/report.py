@@ -82,16 +82,14 @@ def report(
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
     """Take a run's samples again; print and write the theory report."""
     from livepde.diagnostics import theory_report
-    from livepde.runs import Table
 
     prepared = prepare_again(opened, data, allow_code)
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
-    shown = [Table(table.title, table.columns, table.rows) for table in found.tables]
     title, page = f"[bold]{escape(opened.title)}[/]  theory", f"Page: {escape(str(target))}"
     where = {"run": str(opened.path), "theory": str(target)}
-    present(shown, [], found.notes, as_json=as_json, title=title, lines=[page], **where)
+    present(found.tables, [], found.notes, as_json=as_json, title=title, lines=[page], **where)
 
 
 def explain(

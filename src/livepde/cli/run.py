@@ -120,7 +120,7 @@ def run(
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs.logs import configure
+    from livepde.runs.standard_streams import configure
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
