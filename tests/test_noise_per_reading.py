@@ -15,7 +15,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde import cases
 from livepde.cases.live_case import LiveCase
-from livepde.cases.members_together import blocks
+from livepde.cases.member_blocks import blocks
 from livepde.errors import CaseError, ConfigurationError, SampleError
 from livepde.models import heat
 from livepde.runs.drive import drive, journal_of

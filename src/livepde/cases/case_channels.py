@@ -54,6 +54,7 @@ INTERPOLATED = ("interpolate", "interpolate-exact")
 
 Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, ChannelSpec]]
 """(kind of sensor, component of the state) -> its channels."""
+MEMBERS = 10_000  # channels of one `each`
 
 
 def columns_of(case: CaseContent) -> dict[str, Column]:
@@ -347,9 +348,6 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
             "the first sample; start later, or give a number."
         )
     return present
-
-
-MEMBERS = 10_000  # channels of one `each`
 
 
 def expanded(case: CaseContent) -> CaseContent:

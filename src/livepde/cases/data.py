@@ -62,6 +62,9 @@ UNSET = (
     f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
     "the measurements."
 )
+LOG = logging.getLogger("livepde.run")
+LEAP = "30 d"  # after a longer pause a second row has to confirm the time
+Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
 
 def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
@@ -291,12 +294,6 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
         text = f"got '{value}'; expected a date as 2025-04-01 12:00."
         raise case.error("data.assimilate_from", text)
     return (stamp - since_1970(origin)) * clock.second
-
-
-LOG = logging.getLogger("livepde.run")
-LEAP = "30 d"  # after a longer pause a second row has to confirm the time
-
-Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
 
 def source_of(case: CaseContent, data: Data, position: str) -> RowSource:

@@ -50,6 +50,59 @@ VALUES = """\
 # or has a flux or an exchange: [boundary], as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
 # A value given at a boundary: role = "boundary", at = its name, as "left"; others are closed."""
+TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
+NOISE = 0.05
+CASE = """\
+# A case of livepde: which process, what is unknown, which channel is what.
+#   livepde check {0}     what is in here, and what its sensors can tell
+#   livepde run {0}       identify; writes a run directory
+# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
+# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.
+title = "A metal rod, heated and cooled at its left end"
+equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
+                               # or your own as "file.py:function" (run it with --allow-code)
+initial = "interpolate"        # from the first sample; or a number such as "20 degC"
+
+[mesh]
+from = 0
+to = "40 cm"
+cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
+
+[data]
+file = "rod.csv"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
+time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
+time_unit = "s"
+# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
+# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
+# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
+
+[unknowns.alpha]               # names are those of the equation
+prior = "5e-5 m^2/s"           # what you would have said without data ...
+std = "3e-5 m^2/s"             # ... and how far off that may be
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
+# as a field: field = true, length = "10 cm"   (and no bounds)
+
+[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
+T_left = {{ role = "boundary", column = "T_left", at = "left" }}
+T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
+T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
+T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
+T_right = {{ role = "boundary", column = "T_right", at = "right" }}
+
+[law]
+kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
+replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
+                               # kind = "auto" finds out, and needs no noise either
+
+[steps]
+scheme = "alexander2"          # second order; or "implicit-euler"
+dt_max = "20 s"                # longer intervals between samples are divided
+
+[expect]                       # of these very data: drop it, or say what you expect of yours
+alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
+rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
+"""
 
 
 @dataclass(frozen=True)
@@ -381,61 +434,6 @@ def _range(values: Array) -> str:
         return "nothing"
     told = f"{present.min():.4g} to {present.max():.4g}"
     return f"{told}, {missing} missing" if missing else told
-
-
-TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
-NOISE = 0.05
-CASE = """\
-# A case of livepde: which process, what is unknown, which channel is what.
-#   livepde check {0}     what is in here, and what its sensors can tell
-#   livepde run {0}       identify; writes a run directory
-# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
-# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.
-title = "A metal rod, heated and cooled at its left end"
-equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
-                               # or your own as "file.py:function" (run it with --allow-code)
-initial = "interpolate"        # from the first sample; or a number such as "20 degC"
-
-[mesh]
-from = 0
-to = "40 cm"
-cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
-
-[data]
-file = "rod.csv"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
-time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
-time_unit = "s"
-# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
-# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
-# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
-
-[unknowns.alpha]               # names are those of the equation
-prior = "5e-5 m^2/s"           # what you would have said without data ...
-std = "3e-5 m^2/s"             # ... and how far off that may be
-bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
-# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
-# as a field: field = true, length = "10 cm"   (and no bounds)
-
-[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
-T_left = {{ role = "boundary", column = "T_left", at = "left" }}
-T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
-T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
-T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
-T_right = {{ role = "boundary", column = "T_right", at = "right" }}
-
-[law]
-kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
-                               # kind = "auto" finds out, and needs no noise either
-
-[steps]
-scheme = "alexander2"          # second order; or "implicit-euler"
-dt_max = "20 s"                # longer intervals between samples are divided
-
-[expect]                       # of these very data: drop it, or say what you expect of yours
-alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
-rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
-"""
 
 
 def write_template(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from livepde.runs import Driven, RunWriter
     from livepde.runs.live_loop import Live, Sink
 
-__all__ = ["LiveOptions", "beside"]
+__all__ = ["LiveOptions", "run_live"]
 
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
@@ -71,7 +71,7 @@ class LiveOptions:
         return 1.0 if self.speed is None else self.speed
 
 
-def beside(
+def run_live(
     case: Case, how: LiveOptions, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case in its run directory until its source ends or a signal comes.

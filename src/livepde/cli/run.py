@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.live import LiveOptions, beside
+from livepde.cli.live import LiveOptions, run_live
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from livepde.identifier import Identifier
     from livepde.runs import Check, Driven, RunWriter, Table
 
-__all__ = ["batch", "concluded", "run", "writer_of"]
+__all__ = ["concluded", "run", "run_batch", "writer_of"]
 
 
 class LogKind(StrEnum):
@@ -135,9 +135,9 @@ def run(
     with ExitStack() as stack:
         if live:
             configure(log.value)
-            writer, taken = beside(loaded, how, folder, write, stack)
+            writer, taken = run_live(loaded, how, folder, write, stack)
         else:
-            writer, taken = batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
+            writer, taken = run_batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
         prepared, driven = taken
         found = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
@@ -227,7 +227,7 @@ def writer_of(
     )
 
 
-def batch(
+def run_batch(
     prepared: Prepared,
     folder: Path,
     write: Callable[[], RunWriter],
