@@ -37,7 +37,6 @@ from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
 
 __all__ = [
-    "calibrated",
     "columns_of",
     "expanded",
     "initial_of",
@@ -109,7 +108,7 @@ def observation_of(case: CaseContent, role: str) -> Observation | None:
     }
     if any(item.offset or item.gain or item.correlated for item in channels.values()):
         whole = _whole(case, kinds, {})
-        return calibrated(case, whole, names, **outer)
+        return _calibrated(case, whole, names, **outer)
     return _whole(case, kinds, outer)
 
 
@@ -495,7 +494,7 @@ def _common(case: CaseContent, given: Mapping[str, Any], key: str) -> Any:
     return value
 
 
-def calibrated(
+def _calibrated(
     case: CaseContent, base: Observation, names: Sequence[str], **options: Any
 ) -> Observation:
     """Return the readings: gain * (reading of the base) + offset + correlated."""

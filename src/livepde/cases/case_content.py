@@ -25,14 +25,7 @@ from livepde.fem import (
 from livepde.linalg import Array
 from livepde.models import Equation, Option
 
-__all__ = [
-    "CaseContent",
-    "inside",
-    "layer_edges",
-    "off_nodes",
-    "sides_of",
-    "subdomain",
-]
+__all__ = ["CaseContent", "inside", "off_nodes", "sides_of", "subdomain"]
 
 CELLS = 2_000_000  # of a mesh that a case describes itself
 
@@ -179,10 +172,10 @@ def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | 
         [case.convert(node, unit, "mesh.y") for node in y],
     )
     if not isinstance(spec.cells, tuple):
-        check_cells(float(len(sides[0])) * len(sides[1]), case.where("mesh"))
+        _check_cells(float(len(sides[0])) * len(sides[1]), case.where("mesh"))
         with case.located("mesh", SpaceError):
             return grid(*sides)
-    check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
+    _check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
     with case.located("mesh", SpaceError):
         if isinstance(spec.spacing, tuple):
             return _graded(case, sides, spec.cells, [one == "geometric" for one in spec.spacing])
@@ -194,7 +187,7 @@ def _interval(case: CaseContent) -> Any:
     """Return an interval of cells, with nodes at the ends of layers."""
     spec, unit = case.spec.mesh, case.equation.length_unit
     cells: Any = spec.cells  # the schema allows only a number here
-    check_cells(cells, case.where("mesh.cells"))
+    _check_cells(cells, case.where("mesh.cells"))
     start = case.convert(spec.start, unit, "mesh.from")
     stop = case.convert(spec.stop, unit, "mesh.to")
     if not start < stop:
@@ -204,7 +197,7 @@ def _interval(case: CaseContent) -> Any:
     # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
     # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
     plain = interval(start, stop, cells, geometric=geometric)
-    edges = [edge for _, edge in layer_edges(case)]
+    edges = [edge for _, edge in _layer_edges(case)]
     through = _fitted(plain.p[0], edges)
     mesh = interval(start, stop, cells, geometric=geometric, through=through)
     own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
@@ -230,7 +223,7 @@ def _check_graded(case: CaseContent, start: float, geometric: bool) -> None:
         raise case.error("mesh.spacing", "'geometric' needs from > 0.")
 
 
-def layer_edges(case: CaseContent) -> list[tuple[str, float]]:
+def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
     """Return the ends of layers of an interval, of unknowns and of sources, each with its name."""
     given: list[tuple[str, str, Any]] = [
         (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
@@ -268,7 +261,7 @@ def _inside(nodes: Array, edge: float) -> bool:
     return bool(nodes.min() + slack < edge < nodes.max() - slack)
 
 
-def check_cells(number: float, where: str) -> None:
+def _check_cells(number: float, where: str) -> None:
     """Refuse a mesh that is too large to be built here."""
     if number > CELLS:
         raise CaseError(
@@ -282,7 +275,7 @@ def off_nodes(case: CaseContent, nodes: Array) -> list[str]:
     within = 1e-6 * np.ptp(nodes)
     crossed = dict.fromkeys(
         what
-        for what, edge in layer_edges(case)
+        for what, edge in _layer_edges(case)
         if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
     )
     return list(crossed)

@@ -17,10 +17,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from livepde.cases.case_content import CaseContent
-from livepde.cases.equations import check_options, load_code
+from livepde.cases.equations import check_options, load_code, own_code
 from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
-from livepde.errors import LivepdeError
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -222,17 +221,13 @@ def _from_reader(
     """Return the data of the user's function: times, and a mapping from column to values."""
     spec, where = case.spec.data, case.where(f"data.reader: {case.spec.data.reader}")
     folder = _measurements(case)
-    try:
-        found = reader(folder or case.path.parent, **spec.options)
-    except LivepdeError:
-        raise
-    except FileNotFoundError as error:
-        remedy = "" if folder else f" {UNSET}"
-        text = f"there is no file '{error.filename}'.{remedy}"
-        raise case.error("data.reader", text) from None
-    except Exception as error:
-        text = f"{spec.reader} failed with {type(error).__name__}: {error}."
-        raise case.error("data.reader", text) from error
+    with own_code(where):
+        try:
+            found = reader(folder or case.path.parent, **spec.options)
+        except FileNotFoundError as error:
+            remedy = "" if folder else f" {UNSET}"
+            text = f"there is no file '{error.filename}'.{remedy}"
+            raise case.error("data.reader", text) from None
     match found:
         case (times, Mapping() as values):
             pass

@@ -23,11 +23,9 @@ from livepde.stepping import Advance, Alexander2, simulate
 __all__ = [
     "PLACES",
     "FoundChannel",
-    "case_for",
     "channels_in",
     "check_free",
     "files_for",
-    "places_for",
     "write_files",
     "write_template",
 ]
@@ -132,7 +130,7 @@ class FoundChannel:
         return bool(self.given["role"] == "sensor")
 
 
-def case_for(table: Measured, folder: Path, equation: Equation) -> str:
+def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     """Return the text of a case in `folder` that equation and table tell; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
@@ -155,7 +153,7 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
     return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
 
 
-def places_for(found: list[FoundChannel], equation: Equation) -> str:
+def _places_for(found: list[FoundChannel], equation: Equation) -> str:
     """Return the table of positions that is to be filled in; empty if no channel names one."""
     columns = [c for item in found if item.given.get("positions") == PLACES for c in item.columns]
     axes = "xyz"[: equation.dimension]
@@ -469,8 +467,8 @@ def write_template(
 
 def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, str]:
     """Return name -> text of the files of a case for a table."""
-    places = places_for(channels_in(table, equation), equation)
-    return {"case.toml": case_for(table, folder, equation), **({PLACES: places} if places else {})}
+    places = _places_for(channels_in(table, equation), equation)
+    return {"case.toml": _case_for(table, folder, equation), **({PLACES: places} if places else {})}
 
 
 def check_free(folder: Path, names: Iterable[str]) -> None:

@@ -35,18 +35,12 @@ __all__ = [
     "BoundarySpec",
     "CaseSpec",
     "ChannelSpec",
-    "CorrelatedSpec",
     "DataSpec",
     "EvolutionSpec",
     "GradientSpec",
-    "MeshSpec",
-    "RegionSpec",
     "SensitivitySpec",
-    "SourceSpec",
-    "StepsSpec",
     "TikhonovSpec",
     "UnknownSpec",
-    "VariantSpec",
 ]
 
 
