@@ -42,7 +42,6 @@ __all__ = [
     "SampleError",
     "SpaceError",
     "TimeOrderError",
-    "optional",
 ]
 
 
