@@ -95,7 +95,7 @@ def test_equals_separate_identifiers(model, rule):
 def test_goes_on_from_a_dump_at_any_batch(rule):
     """With identical numbers, and at its offset."""
     model, chosen = rod(), lp.AutoLaw() if rule == "auto" else LAWS[rule]
-    pieces = batches(stream(model, 12))
+    pieces = batches(stream(model, 9))
     whole, others = shard(model, chosen), [shard(model, chosen) for _ in range(2)]
     dumps, found = [], []
     for offset, batch in pieces:

@@ -66,7 +66,7 @@ def powered(x: Any, t: float) -> Any:
     return x.inputs["power"] * x[0]
 
 
-def rod(cells: int = 30, **options: Any) -> lp.Model:
+def rod(cells: int = 16, **options: Any) -> lp.Model:
     """Return a rod with two unknowns, whose left end and source change with time."""
     unknowns = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
     given = {"unknowns": unknowns, "A": conduction, "f": heating, **options}
@@ -92,11 +92,11 @@ def nonlinear_rod() -> lp.Model:
 
 
 def field_rod() -> lp.Model:
-    return reaction(line(30), ElementLineP1(), f=heating)
+    return reaction(line(16), ElementLineP1(), f=heating)
 
 
 def powered_field() -> lp.Model:
-    return reaction(line(30), ElementLineP1(), f=powered, inputs=("power",))
+    return reaction(line(16), ElementLineP1(), f=powered, inputs=("power",))
 
 
 def square() -> lp.Model:
