@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from livepde.cases.new_case import write_template
 from skfem import (
     ElementHex1,
     ElementLineHermite,
@@ -26,7 +27,6 @@ from skfem import (
 )
 
 import livepde as lp
-from livepde.cases.template import write_template
 from livepde.stepping import ForwardStage, advance
 
 

@@ -17,7 +17,7 @@ import livepde as lp
 from benchmarks import alarms
 from benchmarks.__main__ import app as benchmarks
 from livepde import cases, runs
-from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
+from livepde.cases.new_case import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
 from livepde.models import heat

@@ -12,7 +12,7 @@ from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.cases import load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
 

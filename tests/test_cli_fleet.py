@@ -20,7 +20,7 @@ from patience import PATIENCE
 
 from livepde import Fleet, cases, runs
 from livepde.cases import members_together
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
 from livepde.runs import JOURNAL, Journal

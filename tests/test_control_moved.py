@@ -36,7 +36,7 @@ def rod(kind: str) -> lp.Model:
         lp.Field(mesh, lp.linear(mesh), dirichlet={"right": lp.Channel("sink")}),
         {"k": unknown(kind, mesh)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-        f=lp.On("left", lambda x, t: 1e5 * x.inputs["heat"]),
+        f=lp.On("left", lambda x, _: 1e5 * x.inputs["heat"]),
         M=lambda u, v, x: 3.6e6 * u * v,
         inputs=["heat"],
         **(radiates if kind == "radiating" else {}),

@@ -62,7 +62,7 @@ def test_without_a_suspect_there_is_nothing_to_test(tmp_path, monkeypatch):
 @pytest.mark.long
 def test_what_a_cause_frees_is_a_setting_of_a_case(biased):
     from livepde import cases, runs
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
 
     findings = runs.verdict(runs.open(biased).dataset).findings
     settings = {cause.setting for item in findings for cause in item.causes if cause.setting}

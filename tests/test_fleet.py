@@ -40,7 +40,7 @@ def sources():
     return lp.Model(
         lp.Field(line(12), ElementLineP2(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
-        A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
+        A=lambda q, _, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
         B=laplace,
     )
 
@@ -74,7 +74,7 @@ def walks():
         unknowns,
         A=[
             lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v,
-            lambda q, u, v, x: -q.c * x[0] * v - q.d * np.sin(x.t) * v,
+            lambda q, _, v, x: -q.c * x[0] * v - q.d * np.sin(x.t) * v,
         ],
     )
 
@@ -296,7 +296,7 @@ def curved_in_inputs():
         lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-        f=lambda x, t: x.inputs["T_0"] ** 2,
+        f=lambda x, _: x.inputs["T_0"] ** 2,
         inputs=["T_0"],
     )
 

@@ -27,7 +27,7 @@ def rod(law, **unknown):
         lp.Field(line(10), ElementLineP1(), dirichlet={"left": 0.0, "right": lp.Channel("T_end")}),
         {"k": lp.Scalar(lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0)), **unknown)},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-        f=lambda x, t: x.inputs["heat"],
+        f=lambda x, _: x.inputs["heat"],
         inputs=("heat",),
     )
     return lp.Identifier(model, SENSORS, law, withheld=HIDDEN)
@@ -39,7 +39,7 @@ def plate(law):
         lp.Field(mesh, ElementTriP1(), dirichlet={"left": lp.Channel("T_end")}),
         {"k": lp.Normal(0.2, std=0.05, bounds=(0.01, 5.0))},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + 0.1 * u * q.k * v,
-        f=lambda x, t: x.inputs["heat"],
+        f=lambda x, _: x.inputs["heat"],
         inputs=("heat",),
     )
     sensors = lp.Points({"a": (0.3, 0.4), "b": (0.6, 0.7)}, noise=0.01)

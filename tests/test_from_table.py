@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.data_sources import source_of
+from livepde.cases.data import source_of
 from livepde.cases.measured import measured
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
 
@@ -674,7 +674,7 @@ def test_several_tables_are_not_followed(here):
         cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
     case = cases.load("mine/case.toml", settings=FILES)
     with pytest.raises(lp.errors.CaseError, match="a process is followed in one: name it"):
-        source_of(case.frame, None, "")
+        source_of(case, None, "")
 
 
 @pytest.mark.parametrize(

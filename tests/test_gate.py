@@ -7,7 +7,7 @@ import pytest
 
 import livepde as lp
 from livepde.models import heat
-from livepde.runs.judgement import doubts
+from livepde.runs.run_verdict import doubts
 
 NOISE = 0.05
 LAWS = {"sensitivity": lp.SensitivityLaw, "auto": lp.AutoLaw}

@@ -12,8 +12,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws.excitation_gate import ExcitationLevel, Probes, pairs
-from livepde.laws.guards import Scale
 from livepde.laws.history import added, empty_log, opened
+from livepde.laws.sensitivity_state import Scale
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
 from livepde.stepping import ForwardStage, Interval, Span

@@ -21,7 +21,7 @@ def rod(**options):
         ),
         {"k": lp.Scalar(lp.Normal(1.0, std=0.5, bounds=(0.1, 5.0)), unit="m^2/s")},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["heat"] * v * 0,
-        f=lambda x, t: x.inputs["heat"],
+        f=lambda x, _: x.inputs["heat"],
         inputs=("heat",),
         time_unit="s",
         **options,

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import cases
 from livepde.cases.measured import measured
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.fem import Inputs, Moment
 from livepde.models import EQUATIONS
@@ -224,7 +224,7 @@ def simulated(case: Path, filled: Filled, given: dict[str, Any]) -> list[dict[st
 
     q = model.initial_parameter(filled.truth)
     control = Advance(prepared.case.scheme, filled.step / 4)
-    columns = {name: item.column for name, item in prepared.case.frame.roles("sensor").items()}
+    columns = {name: item.column for name, item in prepared.case.roles("sensor").items()}
     u0 = prepared.u0
     for k, (time, u) in enumerate(simulate(model, q, u0, t.tolist(), control, channels)):
         read = seen.predict(u, q, Moment(time, Inputs(channels(time))))

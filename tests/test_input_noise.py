@@ -19,7 +19,7 @@ SENSORS = {"T_1": 0.1, "T_5": 0.5}
 
 def rod(std: float = 0.3, flux: bool = False, cube: float = 0.0) -> lp.Model:
     """Return a rod whose left end or source arrives with the stream."""
-    sources = [0.0, lp.On("right", lambda x, t: x.inputs["Q"])] if flux else 0.0
+    sources = [0.0, lp.On("right", lambda x, _: x.inputs["Q"])] if flux else 0.0
     return lp.Model(
         state=lp.Field(
             lp.interval(0.0, 1.0, 20),

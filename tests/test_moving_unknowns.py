@@ -15,8 +15,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview
-from livepde.cases.template import write_template
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import CONSTANT
 from livepde.laws import replay_slices

@@ -11,8 +11,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.placement import Advice, advise
-from livepde.cases.preview import preview
+from livepde.cases.preview import Advice, advise, preview
 from livepde.cli import app
 
 pytestmark = pytest.mark.slow

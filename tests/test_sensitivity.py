@@ -19,7 +19,7 @@ def source_model(**options):
     return lp.Model(
         lp.Field(line(16), ElementLineP2(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
-        A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
+        A=lambda q, _, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
         B=laplace,
         **options,
     )
@@ -214,7 +214,7 @@ def test_a_sensor_that_sees_a_parameter():
     model = lp.Model(
         lp.Field(line(10), ElementLineP1(), dirichlet={"boundary": 0.0}),
         {"s": lp.Normal(0.0, std=2.0), "offset": lp.Normal(0.0, std=1.0)},
-        A=lambda q, u, v, x: -q.s * np.sin(x.t) * v,
+        A=lambda q, _, v, x: -q.s * np.sin(x.t) * v,
         B=laplace,
     )
     sensors = lp.Points(
@@ -269,7 +269,7 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
 
     def no_luck(filter_, x, span, options):
         zero, lost = np.zeros(1), Status("not_converged", "no luck")
-        return x, Assimilation(np.zeros((1, 1)), 0, lost, zero > 0.0, zero, zero)
+        return x, Assimilation(np.zeros((1, 1)), 0, lost, zero > 0.0, zero, 0.0)
 
     monkeypatch.setattr("livepde.laws.replay_slices.assimilate", no_luck)
     estimates = [ident.step(*sample) for sample in samples]

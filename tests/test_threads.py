@@ -62,7 +62,7 @@ def heating(x: Any, t: float) -> Any:
     return 1.0 + np.sin(3.0 * t) * np.sin(np.pi * x[0])
 
 
-def powered(x: Any, t: float) -> Any:
+def powered(x: Any, _: float) -> Any:
     return x.inputs["power"] * x[0]
 
 

@@ -18,7 +18,7 @@ from livepde.diagnostics import check_model
 from livepde.errors import ConfigurationError, LawError, SpaceError
 from livepde.fem import FunctionSpace, Latent
 from livepde.fem.evolution import CONSTANT
-from livepde.fem.transforms import Log, Logit
+from livepde.fem.priors import Log, Logit
 from livepde.laws.reduction import Reduction
 from livepde.stepping import ForwardStage
 

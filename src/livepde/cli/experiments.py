@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.options import JsonOption, OutOption, names_in
+from livepde.cli.options import JsonOption, OutOption, names_in, option
 from livepde.cli.printing import can_draw, named, report_outcome, show, terminal
 
 if TYPE_CHECKING:
@@ -91,16 +91,15 @@ def reproduce(
     ],
     truth: Annotated[
         str | None,
-        typer.Option(
-            help="Where the data come from: discrete (the same scheme), fine (a finer grid), "
-            "analytic (a formula).",
-            show_default=False,
+        option(
+            "Where the data come from: discrete (the same scheme), fine (a finer grid), "
+            "analytic (a formula)."
         ),
     ] = None,
     as_json: JsonOption = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="Keep dataset and figures in a new run directory.", show_default=False),
+        option("Keep dataset and figures in a new run directory."),
     ] = None,
 ) -> None:
     """Run a published or stated experiment and compare it with its expected numbers.

@@ -15,8 +15,7 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.canvas import unit_label
-from livepde.dashboard.times import at_time, when_axis
+from livepde.dashboard.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
 from livepde.plots.dataset import (
     field_names,

@@ -18,7 +18,7 @@ from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
 
 if TYPE_CHECKING:
-    from livepde.dashboard.times import TimeAxis
+    from livepde.dashboard.canvas import TimeAxis
 
 __all__ = ["page_of", "write_report"]
 
@@ -57,9 +57,8 @@ def page_of(run: Run) -> str:
         raise ConfigurationError(
             "A report as HTML needs Plotly and Jinja2: pip install 'livepde[dashboard]'."
         ) from None
-    from livepde.dashboard.canvas import CONFIG
+    from livepde.dashboard.canvas import CONFIG, when_axis
     from livepde.dashboard.panels import SECTIONS, panels
-    from livepde.dashboard.times import when_axis
 
     data = run.dataset
     if not data.sizes["time"]:

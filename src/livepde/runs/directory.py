@@ -32,8 +32,8 @@ from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.judgement import verdict, verdict_table
 from livepde.runs.outcome import Check, FigureFactory, Table, attempted
+from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
 
