@@ -79,7 +79,7 @@ PAIRS = [
 @pytest.mark.parametrize(("model", "rule"), PAIRS)
 def test_equals_separate_identifiers(model, rule):
     built, chosen = MODELS[model](), lp.AutoLaw() if rule == "auto" else LAWS[rule]
-    items = stream(built, {"walks": 8}.get(model, 16))
+    items = stream(built, 10)
     one = shard(built, chosen)
     assert bool(one.note) == (rule == "auto")
     q, q_std, innovation, status = run(one, batches(items))

@@ -178,7 +178,7 @@ CASES = {
     "gradient, smoothed": Case(lp.GradientLaw(gain=10.0), field_rod, smoothed, missing=0.02),
     "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner, samples=5),
     "gradient, nonlinear plate": Case(lp.GradientLaw(gain=10.0), plate, inner),
-    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=3),
+    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=2),
     "auto gain": Case(lp.GradientLaw(gain="auto"), field_rod, inner),
     "auto gain, chosen smoothing": Case(
         lp.GradientLaw(gain="auto"), field_rod, lp.Full, missing=0.01
@@ -194,7 +194,7 @@ CASES = {
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
     "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages),
     "sensitivity, large square": Case(
-        lp.SensitivityLaw(modes=3), large_square, averages, samples=3
+        lp.SensitivityLaw(modes=3), large_square, averages, samples=2
     ),
     "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=6),
     "guards and jumps": Case(GUARDED, powered_rod, samples=6),
