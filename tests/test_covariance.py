@@ -45,7 +45,7 @@ def inflated(x, factor):
 def test_nothing_changes_where_innovations_are_as_expected():
     work, x = learned()
     assert x.innovations.inflation == 1.0
-    U, C = robust_factors(work.filter, x)
+    U, C = robust_factors(work.filter.reduction, x)
     assert U is x.U
     assert C is x.C
 
@@ -57,7 +57,7 @@ def test_the_sandwich_of_a_known_direction():
     scale = float(wide.innovations.inflation[0])
     assert scale > 2.5
     P = covariance(x.C)
-    V = covariance(robust_factors(work.filter, wide)[1])
+    V = covariance(robust_factors(work.filter.reduction, wide)[1])
     F = np.linalg.inv(P) - np.eye(2)
     np.testing.assert_allclose(V, P @ (np.eye(2) + scale**2 * F) @ P, rtol=1e-8, atol=1e-12)
 
@@ -66,7 +66,7 @@ def test_the_sandwich_of_a_known_direction():
 def test_what_no_sensor_sees_keeps_its_prior():
     work, x = learned()
     for scale in (2.0, 30.0, 1e6):
-        V = covariance(robust_factors(work.filter, inflated(x, scale))[1])
+        V = covariance(robust_factors(work.filter.reduction, inflated(x, scale))[1])
         assert V[1, 1] == pytest.approx(1.0, rel=1e-10)
         assert np.linalg.eigvalsh(V).max() <= 1.0 + 1e-10
 
@@ -75,7 +75,7 @@ def test_what_no_sensor_sees_keeps_its_prior():
 def test_a_walk_is_no_wider_than_its_prior_of_now():
     work, x = learned(lp.RandomWalk(2.0))
     age = float(x.age[0])
-    V = covariance(robust_factors(work.filter, inflated(x, 100.0))[1])
+    V = covariance(robust_factors(work.filter.reduction, inflated(x, 100.0))[1])
     F = work.filter.reduction.transition(age)
     gained = work.filter.reduction.gained(age, np.ones((1, 2)), np.zeros(1))[0]
     prior = F @ F.T + np.diag(gained)
@@ -87,7 +87,7 @@ def test_a_walk_is_no_wider_than_its_prior_of_now():
 def test_the_state_widens_with_the_unknowns():
     work, x = learned()
     wide = inflated(x, 3.0)
-    U, C = robust_factors(work.filter, wide)
+    U, C = robust_factors(work.filter.reduction, wide)
     sensitivity = np.linalg.lstsq(x.C[0], x.U[0], rcond=None)[0]
     np.testing.assert_allclose(U[0], C[0] @ sensitivity, rtol=1e-7, atol=1e-10)
 
@@ -96,5 +96,5 @@ def test_the_state_widens_with_the_unknowns():
 def test_a_factor_that_is_not_finite_stays_as_it_is():
     work, x = learned()
     broken = changed(inflated(x, 3.0), C=np.full_like(x.C, np.nan))
-    _, C = robust_factors(work.filter, broken)
+    _, C = robust_factors(work.filter.reduction, broken)
     assert np.isnan(C).all()

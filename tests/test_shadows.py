@@ -129,6 +129,16 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
 
 
 @pytest.mark.slow
+def test_the_shift_of_an_unknown_that_hardly_moves_is_that_of_a_constant_one() -> None:
+    """Richardson's two steps halve that of an unknown that moves as well, and do not quarter it."""
+    found = []
+    for k in ({}, {"evolution": lp.RandomWalk(1e-9)}):
+        given = lp.Identifier(rod(10, **k), SENSORS, lp.SensitivityLaw(), u0=0.0)
+        found.append(shifts(ran(given, samples()[:60]), "step"))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.05)
+
+
+@pytest.mark.slow
 def test_the_second_order_scheme_is_shifted_little() -> None:
     estimate = ran(identifier(), samples())
     actual = estimate.q - reference().q

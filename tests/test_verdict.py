@@ -256,7 +256,7 @@ def test_directions_move_the_estimate_by_what_they_say():
 
     identifier, plain = estimated(0.0)
     judge, x = identifier._work.filter.judge, identifier._state.now
-    w, _ = judge.settled(x.ledger, x.causes)
+    w, _ = judge.summed_up(x.ledger, x.causes)
     kinds = [(d.kind, d.subject) for d in judge.dictionary.directions]
     moved = float(x.C[0].T[0] @ w[0][:, kinds.index(("offset", "B"))])
     _, off = estimated(3.0 * NOISE)

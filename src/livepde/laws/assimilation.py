@@ -17,7 +17,7 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
-from livepde.verdict import Judge, Seen
+from livepde.verdict import Judge, ScoredSample
 
 __all__ = ["OK", "Assimilation", "MemberReports", "absorb", "assimilate"]
 
@@ -180,6 +180,8 @@ def absorb(
     if not whole:  # missing values take part as zeros, which carry no information
         Y = np.where(used[:, None], Y, 0.0)
         d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
+        if off is not None:
+            off = np.where(used[:, None], off, 0.0)
     if filter_.judge is not None:
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     parts["innovations"] = x.innovations.add(e, measured, newest)
@@ -187,7 +189,7 @@ def absorb(
     if options.adaptive:
         new = changed(new, **_learned(x, used, d, noise, made))
     if shadows is not None and off is not None:
-        followed = shadows.updated(x, new, made, used / noise, off, span.t1)
+        followed = shadows.updated(x, new, made.left, used / noise, off, span.t1)
         new = changed(new, shadows=followed)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
@@ -214,18 +216,18 @@ def _judged(
     """Return the state before an update, with the sample added to the sums of the verdict."""
     prior = filter_.problem.model.latent.prior
 
-    def q() -> Array:
-        return filter_.estimate(x)
-
     def a() -> Array:
-        found: Array = filter_.reduction.reduced(q() - prior)
+        found: Array = filter_.reduction.reduced(x.q - prior) + x.da
         if filter_.shadows is not None:
             found = found - x.shadows.a[:, filter_.shadows.counted].sum(axis=1)
         return found
 
-    u = x.u + x.du
-    seen = Seen(x.C, x.causes, a, q, u, Y, d, used, span.z1, predicted, noise, span.end)
-    causes, ledger = judge.heard(x.ledger, seen)
+    def q() -> Array:
+        return filter_.estimate(x)
+
+    z, at, u = span.z1, span.end, x.u + x.du
+    sample = ScoredSample(x.C, x.causes, a, q, u, Y, d, used, z, predicted, noise, at)
+    causes, ledger = judge.add(x.ledger, sample)
     return changed(x, causes=causes, ledger=ledger)
 
 

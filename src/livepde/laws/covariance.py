@@ -6,12 +6,13 @@ import numpy as np
 
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
+from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 
 __all__ = ["reported_factors", "robust_factors"]
 
 
-def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
+def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     """Return a square root [U C] of the robust covariance, (members, r, n) and (members, r, k).
 
     The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), with the prior inside: in
@@ -29,7 +30,7 @@ def robust_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
         return x.U, x.C
     k = x.C.shape[2]
     finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
-    C = filter_.reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
+    C = reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
     # In the principal axes of the posterior relative to the prior each direction has its share p of
     # its own, `left` squared.
     rotation, left, _ = np.linalg.svd(C)
@@ -49,7 +50,7 @@ def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
 
     It has one row more for the discretisation error, where shadows follow it.
     """
-    U, C = robust_factors(filter_, x)
+    U, C = robust_factors(filter_.reduction, x)
     if filter_.shadows is None:
         return U, C
     u, a = filter_.shadows.widening(x)

@@ -15,27 +15,24 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
 
-from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
-from livepde.laws.shadow_state import ShadowState
-from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, BlockFactor, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
-    Moments,
     Span,
     StageOfMembers,
     StepFailed,
@@ -43,7 +40,7 @@ from livepde.stepping import (
 )
 from livepde.verdict import Judge
 
-__all__ = ["Filter", "FollowedErrors", "MeanFilter", "Update", "contraction"]
+__all__ = ["Filter", "Update", "contraction"]
 
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
@@ -78,41 +75,6 @@ class Update(NamedTuple):
         return spread
 
 
-class FollowedErrors(Protocol):
-    """Errors of the discretisation, followed beside a filter: `livepde.laws.shadows`."""
-
-    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
-        """Return the filter state of one member at the start; None stands for no moment yet."""
-        ...
-
-    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
-        """Return the state after a span, from those before and after, with the errors in it."""
-        ...
-
-    def seen(self, x: FilterState, at: Moments) -> Array:
-        """Return by how much predictions are off, (members, errors, sensors)."""
-        ...
-
-    @property
-    def counted(self) -> Mask:
-        """Which of them are errors, (errors,): others are followed for the verdict alone."""
-        ...
-
-    def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
-    ) -> ShadowState:
-        """Return the filter state after a sample; weights: one over noise, (members, sensors)."""
-        ...
-
-    def diagnostics(self, x: FilterState) -> Diagnostics[Array]:
-        """Return the shifts of the unknowns by the errors, numbers of shape (members,)."""
-        ...
-
-    def widening(self, x: FilterState) -> tuple[Array, Array]:
-        """Return the row of [U C] that is reported for all of them, (members, 1, n or k)."""
-        ...
-
-
 @dataclass(frozen=True, eq=False)
 class Filter:
     """Predicts and updates, linear about the point of a `FilterState`.
@@ -137,7 +99,7 @@ class Filter:
     judge
         Keeps the sums behind the verdict; None: there is no verdict.
     shadows
-        Estimator of the discretisation error beside the filter; None: the error is not followed.
+        Discretisation errors that are followed beside the filter; None: none is.
     """
 
     problem: Problem
@@ -150,7 +112,7 @@ class Filter:
     drift: Array
     fading: float = np.inf
     judge: Judge | None = None
-    shadows: FollowedErrors | None = None
+    shadows: ShadowSet | None = None
 
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""
@@ -412,23 +374,6 @@ class Filter:
         causes = rotation.transpose(0, 2, 1) @ x.causes
         causes = np.concatenate([causes[:, :k], leading @ causes[:, k:]], axis=1)
         return changed(x, U=U, C=C, past=past, causes=causes)
-
-
-class MeanFilter(Filter):
-    """The filter without covariance: it predicts the mean alone."""
-
-    @classmethod
-    def of(cls, filter_: Filter) -> MeanFilter:
-        """Return the same filter without covariance, noise of inputs, judge and shadows."""
-        parts = {item.name: getattr(filter_, item.name) for item in fields(filter_)}
-        return cls(**(parts | {"judge": None, "shadows": None}))
-
-    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
-        """Return the filter state with the mean of the unknowns predicted over a time h."""
-        if not self.moves or h == 0.0:
-            return x
-        F = self.reduction.transition(h)
-        return changed(x, q=self.reduction.predict(x.q, h), da=x.da @ F.T, age=x.age + h)
 
 
 def _extended(rows: Array, count: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -104,20 +104,28 @@ class HalvedMesh:
             return np.zeros_like(coarse)
         return np.asarray(self.model.initial(given, moment) - coarse)
 
-    def seen(self, u: Array, q: Array, difference: Array, moment: Moment) -> Array:
-        """Return the difference in the readings for one of the state there, shape (sensors,).
+    def seen(self, u: Array, q: Array, difference: Array, moment: Callable[[int], Moment]) -> Array:
+        """Return the differences in the readings for those of the states there.
+
+        Shape (members, sensors).
 
         Parameters
         ----------
         u, q
-            State and latent parameter of the mesh, about which sensors are linear.
+            States and latent parameters of the mesh, about which sensors are linear.
+        difference
+            Shape (members, N).
+        moment
+            Time and inputs of a member.
         """
         if self.G is not None:
-            return np.asarray(self.G @ difference)
+            return np.asarray((self.G @ difference.T).T)
         # Sensors without one constant matrix: their derivative at the prolonged state.
-        physical = self.model.latent.value(self.unknowns @ q)
-        H_u, _ = self.observed.jacobian(self.prolonged(u[None])[0], physical, moment)
-        return np.asarray(H_u @ difference)
+        at, found = self.prolonged(u), []
+        for k, more in enumerate(difference):
+            physical = self.model.latent.value(self.unknowns @ q[k])
+            found.append(self.observed.jacobian(at[k], physical, moment(k))[0] @ more)
+        return np.array(found)
 
 
 def refusal(problem: Problem, largest: int) -> str:

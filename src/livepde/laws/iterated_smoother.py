@@ -53,12 +53,15 @@ class _Pass:
         The filter after the last sample.
     misfit
         Minus twice the logarithm of the probability of the trajectory, up to a constant.
+    work
+        Parts of the law that took the samples.
     """
 
     trajectory: Array
     smoothed: Array
     x: FilterState
     misfit: float
+    work: SensitivityWork
 
 
 def iterate_starts(
@@ -105,27 +108,37 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     log = state.log[:, int(state.window[0]) :]
     opening = first_interval(log, problem.channels)
     intervals = intervals_since(log, problem.channels)
+    whole = bare = _Samples(work, state, opening, intervals)
     # A search needs neither the ledger nor the errors of the discretisation, which cost as much
-    # again: the last pass alone follows them.
-    samples = _Samples(work.unaccompanied, state.unaccompanied, opening, intervals)
+    # again: the last pass alone follows them. That is most often the first one, where the filter
+    # has explained the samples.
+    if work.filter.judge is not None or work.filter.shadows is not None:
+        bare = _Samples(work.unaccompanied, state.unaccompanied, opening, intervals)
+    samples = whole if _explained(state.now) else bare
     ends: list[_Pass] = []
-    for trajectory in _beginnings(samples, (1 + len(intervals), state.now.C.shape[2])):
-        one = samples.about(trajectory)
+    for trajectory in _beginnings(bare, (1 + len(intervals), state.now.C.shape[2])):
+        one, samples = samples.about(trajectory), bare
         if one is None:
             continue
-        ends.append(_descended(samples, one))
+        ends.append(_descended(bare, one))
         # Gauss-Newton steps end in a local minimum: other beginnings are spared only if this one
         # explains the samples, and either these are many or its first linearisation held.
-        if samples.explained(ends[-1]) and (len(intervals) >= ENOUGH or _holds(one)):
+        if bare.explained(ends[-1]) and (len(intervals) >= ENOUGH or _holds(one)):
             break
     if not ends:
         return None
-    trajectory = min(ends, key=lambda one: one.misfit).trajectory
-    best = _Samples(work, state, opening, intervals).about(trajectory)
-    if best is None:
+    best = min(ends, key=lambda one: one.misfit)
+    found = best if best.work is work else whole.about(best.trajectory)
+    if found is None:
         return None
     # Only the search needs earlier values, which would cost columns in each later update.
-    return changed(best.x, past=best.x.past[:, :, :0], dpast=best.x.dpast[:, :0])
+    return changed(found.x, past=found.x.past[:, :, :0], dpast=found.x.dpast[:, :0])
+
+
+def _explained(x: FilterState) -> bool:
+    """True if the innovations of a filter are no larger than their noise makes usual."""
+    count, squares = x.innovations.sums[0, 0], x.innovations.sums[0, 2]
+    return bool(squares <= count + 3.0 * math.sqrt(2.0 * count))
 
 
 def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
@@ -253,7 +266,7 @@ class _Samples:
                 misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
-        return _Pass(np.array(followed), smoothed, x, misfit)
+        return _Pass(np.array(followed), smoothed, x, misfit, self.work)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x

@@ -18,7 +18,7 @@ from livepde.laws.assimilation import (
     assimilate,
 )
 from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter, MeanFilter
+from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards
@@ -237,7 +237,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             ),
         )
         if self.shadows is not None:
-            followed = ShadowSet.of(filter_, MeanFilter.of(filter_), self.shadows)
+            parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
+            followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
         options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
         # A replay iterates the same linearisation: both would do the same work twice.

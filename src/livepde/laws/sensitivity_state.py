@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
+from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.guards import Guards
@@ -280,7 +281,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         if work.jumps is not None:
             found = replace(found, jump=np.zeros(members))
         if shadows is not None:
-            found = found.updated(shadows.diagnostics(now))
+            found = found.updated(shadows.diagnostics(now, robust_factors(reduction, now)[1]))
         estimate = q + da @ reduction.Phi.T
         if reduction.bounded(estimate) is not estimate:
             held = reduction.held(estimate)

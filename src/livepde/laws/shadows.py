@@ -1,4 +1,4 @@
-"""The discretisation error of a filter: its shifts by time step, mesh and input interpolation.
+"""Discretisation error followed beside a filter: the shifts by time step, mesh and input lines.
 
 The filter and one without discretisation error would take the same samples with the same gain. The
 error of the former, e of the state and s of the unknowns, follows
@@ -6,16 +6,18 @@ error of the former, e of the state and s of the unknowns, follows
     predict   [e; s]+ = T [e; s] + d,      T the linearised step, d the error that this step adds
     update    [e; s] <- [e; s] - K H [e; s]
 
-with the filter's own T, H and gain K, for unknowns that stay and for unknowns that move. Each
-shadow estimates its d: that of the step by Richardson's extrapolation from two halved steps, that
-of the input lines from the curvature of the readings. The mesh has a trajectory of its own on the
-halved mesh, with the unknowns of the filter: the difference of the two trajectories is no d, but
-enters the predicted readings.
+with the filter's own T, H and gain K, for unknowns that stay and for unknowns that move. T acts
+where the filter steps: [e; s] are tangents of the step. Each source of error, a shadow, estimates
+its d: that of the step by Richardson's extrapolation from two halved steps, that of the input lines
+from the curvature of the readings. The mesh has a trajectory of its own on the halved mesh, with
+the unknowns of the filter: the difference of the two trajectories is no d, but enters the predicted
+readings.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
@@ -24,15 +26,24 @@ import numpy as np
 
 from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
-from livepde.laws.covariance import robust_factors
-from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
+from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import TINY, KeptFactors, Moments, Span
+from livepde.linalg import Array, BlockFactor, IntArray, Mask
+from livepde.stepping import (
+    TINY,
+    Advance,
+    KeptFactors,
+    MemberStage,
+    Moments,
+    Span,
+    StageOfMembers,
+    advance,
+)
 from livepde.verdict import Shifts
 
 __all__ = ["KINDS", "ShadowSet", "Shadows"]
@@ -40,7 +51,9 @@ __all__ = ["KINDS", "ShadowSet", "Shadows"]
 FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
 CALM = 4  # steps after a jump that are all shadowed
 JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped
-USUAL = 16.0  # steps over which that is averaged
+USUAL = 16  # steps over which that is averaged
+# Weight of a step in that average, by the number of steps so far; later ones have the last one.
+WEIGHTS = 1.0 / np.array([1, 1, 1, *range(3, USUAL + 1)])
 ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
@@ -91,49 +104,99 @@ class Shadows:
             raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
 
 
-class Steps(NamedTuple):
-    """The steps of some members that a shadow stands for.
+class Block(NamedTuple):
+    """Steps of some members whose error a shadow estimates: all since the previous estimate.
 
     Attributes
     ----------
     x, end
         The filter before and after the last of them.
-    span, block
-        The last of them, and all steps since the previous shadow.
+    step, span
+        The last step, and all steps as one.
     waited, next
-        Number of steps since the previous shadow, and from now to the next one, (members,).
+        Number of steps in it, and from now to the next estimate, (members,).
     jumps
         Members of which the rate of the state jumped in the last step, shape (members,).
     """
 
     x: FilterState
     end: FilterState
+    step: Span
     span: Span
-    block: Span
     waited: IntArray
     next: IntArray
     jumps: Mask
 
 
 class Found(NamedTuple):
-    """Discretisation error of some steps, as found by a shadow.
+    """Discretisation error of a block of steps.
 
     Attributes
     ----------
-    error
-        Additional error of the state, shape (members, n); None for zero.
-    parts
-        Fields of `ShadowState` to exchange.
     failed
         Members whose shadow could not be stepped, shape (members,); nothing is added for them.
-    a
-        Additional error of the reduced unknowns, shape (members, k); None for zero.
+    parts
+        Fields of `ShadowState` to exchange.
+    u, a
+        Additional error of the state and of the reduced unknowns, shapes (members, n) and (members,
+        k); None for zero.
     """
 
-    error: Array | None
-    parts: dict[str, Any]
     failed: Mask
+    parts: dict[str, Any]
+    u: Array | None = None
     a: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MeanProcess:
+    """The process of a filter without covariance: members with the unknowns of the filter.
+
+    Attributes
+    ----------
+    control, stage
+        Step control, and implicit stage of all members.
+    reduction
+        The reduced coordinates of the unknowns.
+    moves
+        True if an unknown moves.
+    """
+
+    control: Advance
+    stage: MemberStage
+    reduction: Reduction
+    moves: bool
+
+    def propagate(
+        self, x: FilterState, u: Array, kept: KeptFactors, span: Span
+    ) -> tuple[Array, KeptFactors, Mask]:
+        """Return states after a span, warm-start data of the last stage, and which members failed.
+
+        Parameters
+        ----------
+        x, u
+            The filter at the start, and the states that are propagated in the place of its own.
+        kept
+            Warm-start data of the previous stage.
+        """
+        members, no = len(u), np.zeros(len(u), dtype=bool)
+        tangents = self.reduction.directions(x.q, np.zeros((members, 0, x.C.shape[2])))
+        factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
+        now = kept
+
+        def stage(columns: Array, t: float, h: float) -> Array:
+            nonlocal now
+            q, same = x.q, factors
+            if self.moves:
+                q, same = self.reduction.predict(q, t - span.start), {}
+            work = StageOfMembers(x.member, q, tangents, h, span.at(t), now, no, same)
+            y, now = self.stage.advance(columns, work)
+            return y
+
+        columns, _, failure = advance(self.control, stage, u[None], span.start, span.t1)
+        if failure is not None:
+            return u, kept, ~no
+        return columns[0], now, ~np.isfinite(columns[0]).all(axis=1)
 
 
 class Shadow(ABC):
@@ -154,18 +217,18 @@ class Shadow(ABC):
         """
 
     @abstractmethod
-    def found(self, s: ShadowState, steps: Steps) -> Found:
-        """Return the discretisation error of some steps."""
+    def error(self, s: ShadowState, block: Block) -> Found:
+        """Return the discretisation error of a block of steps."""
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
-        """Return the state after one more interval was read, before any shadow is taken."""
-        return s
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
+        """Return fields of the state after one more interval was read, before any estimate."""
+        return {}
 
-    def seen(self, s: ShadowState) -> Array | None:
-        """Return the error in the readings beside that of `ShadowState.u`; None if zero."""
+    def in_readings(self, s: ShadowState) -> Array | None:
+        """Return the error of the readings beside that due to `ShadowState.u`; None if zero."""
         return None
 
-    def beside(self, s: ShadowState) -> Array | None:
+    def in_state(self, s: ShadowState) -> Array | None:
         """Return the error of the state beside that in `ShadowState.u`, shape (members, n)."""
         return None
 
@@ -174,47 +237,47 @@ class Shadow(ABC):
 class StepShadow(Shadow):
     """The error of the time step: one step less two halved ones, from the same state.
 
-    One step stands for half of those since the shadow before and half of those until the next,
-    unless its error is much larger than that of the shadow before.
+    One step stands for half of those since the estimate before and half of those until the next,
+    unless its error is much larger than the one estimated before.
 
     Attributes
     ----------
     halves
-        The filter without covariance, by halved steps.
+        The process by halved steps.
     factor
         2^p/(2^p - 1) for a scheme of order p.
     """
 
-    halves: Filter
+    halves: MeanProcess
     factor: float
 
     kind = "step"
 
     @classmethod
-    def of(cls, mean: Filter) -> StepShadow:
-        """Return the shadow of a filter without covariance."""
-        control = mean.problem.control
-        finer = replace(mean.problem, control=replace(control, parts=2 * control.parts))
+    def of(cls, process: MeanProcess) -> StepShadow:
+        """Return the shadow of a process."""
+        control = replace(process.control, parts=2 * process.control.parts)
         # Richardson: e(h) = c h^p, so that e(h) - e(h/2) = (1 - 2^-p) e(h).
         ratio = 2.0**control.scheme.order
         # Halved steps have matrices of their own: in a common cache both would factorise anew.
-        return cls(replace(mean, problem=finer, stage=mean.stage.twin()), ratio / (ratio - 1.0))
+        halves = replace(process, control=control, stage=process.stage.twin())
+        return cls(halves, ratio / (ratio - 1.0))
 
     def begun(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         return changed(s, halves=self.halves.stage.kept(1))
 
-    def found(self, s: ShadowState, steps: Steps) -> Found:
-        u, kept, failed = _followed(self.halves, steps.x, steps.x.u, s.halves, steps.span)
-        error = self.factor * (steps.end.u - u)
-        size = np.linalg.norm(error, axis=1)
+    def error(self, s: ShadowState, block: Block) -> Found:
+        u, kept, failed = self.halves.propagate(block.x, block.x.u, s.halves, block.step)
+        error = self.factor * (block.end.u - u)
+        size = np.sqrt((error * error).sum(axis=1))
         # An error much larger than the one before is that of this step alone.
         alike = np.where(size <= ALIKE * s.size, 1.0, s.size / np.maximum(size, TINY))
-        weight = 1.0 + (0.5 * (steps.waited + steps.next) - 1.0) * alike
+        weight = 1.0 + (0.5 * (block.waited + block.next) - 1.0) * alike
         # The error of a step with a jump is exceptional and no measure for the next ones.
-        parts = {"halves": kept, "size": np.where(steps.jumps | failed, s.size, size)}
-        return Found(weight[:, None] * error, parts, failed)
+        parts = {"halves": kept, "size": np.where(block.jumps | failed, s.size, size)}
+        return Found(failed, parts, u=weight[:, None] * error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,38 +289,41 @@ class InputShadow(Shadow):
 
     Attributes
     ----------
-    mean
-        The filter without covariance.
+    process
+        The process itself.
+    channels
+        Number of channels.
     """
 
-    mean: Filter
+    process: MeanProcess
+    channels: int
 
     kind = "input"
 
     def begun(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        nothing = np.zeros((1, len(self.mean.problem.channels)))
+        nothing = np.zeros((1, self.channels))
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return the error of inputs by straight lines, and by values held in a gap."""
-        length, slope = span.t1 - span.t0, span.inputs1 - span.inputs0
+        length, change = span.t1 - span.t0, span.inputs1 - span.inputs0
         if len(length) < len(s):  # the members of a bank have their samples in common
             length = np.repeat(length, len(s))
-        if len(slope) < len(s):
-            slope = np.repeat(slope, len(s), axis=0)
+        if len(change) < len(s):
+            change = np.repeat(change, len(s), axis=0)
         h = length[:, None]
         if span.gaps is not None:
-            return self._read_gaps(s, h, slope, span.gaps)
-        slope = slope / h
+            return self._read_gaps(s, h, change, span.gaps)
+        slope = change / h
         # The second derivative is 2 (slope - s.slope)/(h + s.length), and the line lies above the
         # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
-        return changed(s, slope=slope, length=length, bend=bend, missed=s.missed + bend)
+        return {"slope": slope, "length": length, "bend": bend, "missed": s.missed + bend}
 
     @staticmethod
-    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> ShadowState:
+    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> dict[str, Any]:
         """Return the same where channels are held.
 
         In a gap a channel is expected to go on as before; once it has a value again the line across
@@ -274,25 +340,25 @@ class InputShadow(Shadow):
         some: Mask = np.asarray((gaps > 0.0).any(axis=(1, 2)))
         bend = np.where(some[:, None], 0.0, bend)
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
-        return changed(s, slope=slope, length=length, bend=bend, missed=missed)
+        return {"slope": slope, "length": length, "bend": bend, "missed": missed}
 
-    def found(self, s: ShadowState, steps: Steps) -> Found:
-        ahead = (0.5 * (steps.next - 1))[:, None] * s.bend  # of half of the steps until the next
+    def error(self, s: ShadowState, block: Block) -> Found:
+        ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
         # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
         # this off again when they have been read.
         missed = s.missed + ahead
         missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
         left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
-            return Found(None, left, np.zeros(len(missed), dtype=bool))
+            return Found(np.zeros(len(missed), dtype=bool), left)
         # Only their sum counts, wherever in the block the inputs were missed.
-        span = steps.span
+        span = block.step
         # The response is linear in the input for small errors: one interval takes the sum of all.
         off = missed / (span.t1 - span.t0)[:, None]
         first, last = span.inputs0 + off, span.inputs1 + off
         moved = replace(span, inputs0=first, inputs1=last, interval=None)
-        u, _, failed = _followed(self.mean, steps.x, steps.x.u, steps.x.kept, moved)
-        return Found(u - steps.end.u, left, failed)
+        u, _, failed = self.process.propagate(block.x, block.x.u, block.x.kept, moved)
+        return Found(failed, left, u=u - block.end.u)
 
 
 class HeldInputShadow(InputShadow):
@@ -307,11 +373,10 @@ class HeldInputShadow(InputShadow):
     def begun(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        channels = len(self.mean.problem.channels)
         s = super().begun(s, x, moment, given)
-        return changed(s, held=np.full((1, 4, channels), np.nan))
+        return changed(s, held=np.full((1, 4, self.channels), np.nan))
 
-    def read(self, s: ShadowState, span: Span) -> ShadowState:
+    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return the difference of held inputs to straight lines."""
         # Sums of squares of successive changes, and of differences of them: the ratio tells smooth
         # inputs from set points.
@@ -324,7 +389,7 @@ class HeldInputShadow(InputShadow):
         missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
         values = np.broadcast_to(span.inputs1, change.shape)
         held = np.stack([values, change, changes, differences], axis=1)
-        return changed(s, held=held, bend=missed, missed=s.missed + missed)
+        return {"held": held, "bend": missed, "missed": s.missed + missed}
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,27 +403,23 @@ class MeshShadow(Shadow):
 
     Attributes
     ----------
-    mean
-        The filter without covariance.
-    fine
-        The same on the halved mesh.
+    coarse, fine
+        The process on the mesh, and on the halved mesh.
     mesh
         The halved mesh.
     """
 
-    mean: Filter
-    fine: Filter
+    coarse: MeanProcess
+    fine: MeanProcess
     mesh: HalvedMesh
 
     kind = "mesh"
 
     @classmethod
-    def of(cls, mean: Filter) -> MeshShadow:
-        """Return the shadow of a filter without covariance; raises `LivepdeError`."""
-        mesh = HalvedMesh.of(mean.problem)
-        finer = replace(mean.problem, model=mesh.model)
-        fine = replace(mean, problem=finer, stage=mesh.stage)
-        return cls(replace(mean, stage=mean.stage.twin()), fine, mesh)
+    def of(cls, process: MeanProcess, problem: Problem) -> MeshShadow:
+        """Return the shadow of a process; raises `LivepdeError`."""
+        mesh, coarse = HalvedMesh.of(problem), replace(process, stage=process.stage.twin())
+        return cls(coarse, replace(process, stage=mesh.stage), mesh)
 
     def begun(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
@@ -368,112 +429,93 @@ class MeshShadow(Shadow):
             seen = np.zeros((1, self.mesh.observed.size))
         else:
             difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
-            seen = self.mesh.seen(x.u[0], x.q[0], difference[0], moment)[None]
-        kept = {"blocks": self.mean.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
+            seen = self.mesh.seen(x.u, x.q, difference, lambda k: moment)
+        kept = {"blocks": self.coarse.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
         gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
         return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
 
-    def found(self, s: ShadowState, steps: Steps) -> Found:
-        x, end, mesh = steps.x, steps.end, self.mesh
+    def error(self, s: ShadowState, block: Block) -> Found:
+        x, end, mesh, span = block.x, block.end, self.mesh, block.span
         coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
         # A long step for the whole block has a time error of its own, which cancels only in the
         # difference to a step of the same length on the coarse mesh.
-        if (steps.waited > 1).any():
-            coarse, blocks, failed = _followed(self.mean, x, s.u0, blocks, steps.block)
+        if (block.waited > 1).any():
+            coarse, blocks, failed = self.coarse.propagate(x, s.u0, blocks, span)
         # The fine trajectory begins at the filter's state, prolonged, and the difference so far.
         start = mesh.prolonged(s.u0) + s.fine
-        u, kept, wrong = _followed(self.fine, x, start, s.fine_stage, steps.block)
-        failed = (failed | wrong)[:, None]
-        fine = np.where(failed, s.fine, u - mesh.prolonged(coarse))
-        at = steps.block.end
-        each = enumerate(zip(end.u, end.q, fine, strict=True))
-        seen = np.array([mesh.seen(u, q, w, at.member(k)) for k, (u, q, w) in each])
-        slope = (seen - s.seen) / (steps.block.t1 - steps.block.t0)[:, None]
+        u, kept, wrong = self.fine.propagate(x, start, s.fine_stage, span)
+        failed = failed | wrong
+        fine = np.where(failed[:, None], s.fine, u - mesh.prolonged(coarse))
+        seen = mesh.seen(end.u, end.q, fine, span.end.member)
+        slope = (seen - s.seen) / (span.t1 - span.t0)[:, None]
         # `gains` weighs the gain of each sample by the time since the block began: times the slope
         # that is the effect of a difference which has grown linearly.
         a = MESH * (slope[:, None] @ s.gains)[:, 0]
         parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
-        return Found(None, parts | {"gains": np.zeros_like(s.gains)}, failed[:, 0], a)
+        return Found(failed, parts | {"gains": np.zeros_like(s.gains)}, a=a)
 
-    def seen(self, s: ShadowState) -> Array | None:
+    def in_readings(self, s: ShadowState) -> Array | None:
         return -MESH * s.seen
 
-    def beside(self, s: ShadowState) -> Array | None:
+    def in_state(self, s: ShadowState) -> Array | None:
         return -MESH * s.fine[:, self.mesh.at]
-
-
-def _followed(
-    mean: Filter, x: FilterState, u: Array, kept: KeptFactors, span: Span
-) -> tuple[Array, KeptFactors, Mask]:
-    """Return the states of members after a span, the warm-start data, and which members failed.
-
-    Parameters
-    ----------
-    mean
-        A filter without covariance.
-    x, u
-        The filter at the start, and the states that are propagated in the place of its own.
-    """
-    members, n = u.shape
-    k = x.C.shape[2]
-    bare = changed(
-        x,
-        u=u,
-        du=np.zeros_like(u),
-        da=np.zeros((members, k)),
-        U=np.zeros((members, 0, n)),
-        C=np.zeros((members, 0, k)),
-        past=x.past[:, :0],
-        kept=kept,
-        shadows=ShadowState.none(members, n, k),
-    )
-    end, _, failure = mean.carried(bare, span)
-    failed: Mask = np.asarray(~np.isfinite(end.u).all(axis=1))
-    if failure is not None:
-        failed[:] = True
-    return end.u, end.kept if failure is None else kept, failed
 
 
 @dataclass(frozen=True, eq=False)
 class ShadowSet:
-    """The shadows of a filter.
+    """The discretisation errors that are followed beside a filter.
 
     Attributes
     ----------
-    filter
-        The filter itself, without shadows.
+    problem, reduction
+        Those of the filter.
+    rows
+        Function that returns the readings of rows of state and reduced unknowns, (members, rows,
+        sensors): `MemberSensors.rows`.
     shadows
         One for each row of `ShadowState.u`.
     refused
         Why the mesh has no shadow; empty if it has one, or none was asked for.
     """
 
-    filter: Filter
+    problem: Problem
+    reduction: Reduction
+    rows: Callable[[FilterState, Array, Array, Moments], Array]
     shadows: tuple[Shadow, ...]
     refused: str = ""
 
     @classmethod
-    def of(cls, filter_: Filter, mean: Filter, options: Shadows) -> ShadowSet:
-        """Return the shadows of a filter, from the same without covariance."""
-        problem, refused = filter_.problem, ""
+    def of(
+        cls,
+        problem: Problem,
+        reduction: Reduction,
+        rows: Callable[[FilterState, Array, Array, Moments], Array],
+        stage: MemberStage,
+        options: Shadows,
+        *,
+        moves: bool,
+    ) -> ShadowSet:
+        """Return the shadows of a filter with that implicit stage; `moves`: whether unknowns do."""
+        process, refused = MeanProcess(problem.control, stage, reduction, moves), ""
         found: list[Shadow] = []
         if options.step:
-            found.append(StepShadow.of(mean))
+            found.append(StepShadow.of(process))
         if options.mesh and not (refused := refusal(problem, options.largest)):
             # An identification must not fail because its mesh error cannot be estimated: a note
             # says so.
             try:
-                found.append(MeshShadow.of(mean))
+                found.append(MeshShadow.of(process, problem))
             except LivepdeError as error:
                 refused = f"on the halved mesh: {error}"
         if options.inputs and problem.model.channels:
-            found.append((HeldInputShadow if problem.control.hold else InputShadow)(mean))
-        return cls(filter_, tuple(found), refused)
+            kind = HeldInputShadow if problem.control.hold else InputShadow
+            found.append(kind(process, len(problem.channels)))
+        return cls(problem, reduction, rows, tuple(found), refused)
 
     @cached_property
-    def counted(self) -> Mask:
-        """Which shadows tell an error, shape (shadows,)."""
-        return np.array([kind != HELD for kind in self.kinds], dtype=bool)
+    def counted(self) -> slice:
+        """Which shadows tell an error: that of held inputs, the last one, does not."""
+        return slice(0, len(self.kinds) - (HELD in self.kinds))
 
     @cached_property
     def kinds(self) -> tuple[str, ...]:
@@ -482,15 +524,10 @@ class ShadowSet:
 
     def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
         """Return the shadows of one member at the start; None stands for no moment yet."""
-        n, k = x.u.shape[1], x.C.shape[2]
-        rows = len(self.shadows)
-        nothing = np.zeros((1, len(self.filter.problem.channels)))
-        s = changed(
-            ShadowState.none(1, n, k),
-            u=np.zeros((1, rows, n)),
-            a=np.zeros((1, rows, k)),
-            inputs0=nothing,
-        )
+        n, k, rows = x.u.shape[1], x.C.shape[2], len(self.shadows)
+        u, a = np.zeros((1, rows, n)), np.zeros((1, rows, k))
+        nothing = np.zeros((1, len(self.problem.channels)))
+        s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing)
         for shadow in self.shadows:
             s = shadow.begun(s, x, moment, given)
         return s
@@ -504,63 +541,73 @@ class ShadowSet:
             Before and after the span; `end` with the errors of before, propagated.
         """
         s = end.shadows
-        fresh = s.count == s.last
-        if fresh.any():
-            s = _opened(s, fresh, x, span, "mesh" in self.kinds)
+        parts, jumps = _watched(s, x, end, span)
+        fresh = s.count == s.last  # members that begin a block
+        if np.count_nonzero(fresh):
+            rows = fresh[:, None]
+            parts["begun"] = np.where(fresh, span.t0, s.begun)
+            parts["inputs0"] = np.where(rows, span.inputs0, s.inputs0)
+            if "mesh" in self.kinds:
+                parts["u0"] = np.where(rows, x.u, s.u0)
         for shadow in self.shadows:
-            s = shadow.read(s, span)
-        s, jumps = _watched(s, x, end, span)
-        # What gaps miss counts at once: later it might cancel with that of the next one.
+            parts |= shadow.read(s, span)
+        s = changed(s, **parts)
         # After a jump of the drive the error of the step is another one at once.
         due = (s.count >= s.due) | jumps
+        # What gaps miss counts at once: later it might cancel with that of the next one.
         if span.gaps is not None:
             due = due | (span.gaps > 0.0).any(axis=(1, 2))
         # A block is one step for all members in it, which therefore have to begin together.
-        for t in np.unique(s.begun[due]) if due.any() else ():
+        for t in sorted(set(s.begun[due].tolist())) if np.count_nonzero(due) else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
-                s = self._taken(s, x, end, span, jumps)
+                s = self._with_errors(s, x, end, span, jumps)
             else:
                 some, one, after = take(s, group), take(x, group), take(end, group)
-                taken = self._taken(some, one, after, _part(span, group), jumps[group])
-                s = put(s, group, taken)
+                new = self._with_errors(some, one, after, _part(span, group), jumps[group])
+                s = put(s, group, new)
         return changed(end, shadows=s)
 
-    def _taken(
-        self, s: ShadowState, x: FilterState, end: FilterState, span: Span, jumps: Mask
+    def _with_errors(
+        self, s: ShadowState, x: FilterState, end: FilterState, step: Span, jumps: Mask
     ) -> ShadowState:
-        """Return members that began together after their shadows were taken."""
-        waited, block = s.count - s.last, span
+        """Return members whose blocks began together, with the errors of these blocks added."""
+        waited, span = s.count - s.last, step
         if (waited > 1).any():
-            block = replace(span, t0=s.begun, inputs0=s.inputs0, interval=None)
-        wait = np.where(s.count - s.jumped < CALM, 1, _wait(s.count))
-        steps, u, a = Steps(x, end, span, block, waited, wait, jumps), s.u.copy(), s.a.copy()
+            span = replace(step, t0=s.begun, inputs0=s.inputs0, interval=None)
+        wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
+        wait = np.where(s.count - s.jumped < CALM, 1, wait)
+        block = Block(x, end, step, span, waited, wait, jumps)
+        u, a, failed = s.u.copy(), s.a.copy(), s.failed
+        parts: dict[str, Any] = {}
         for row, shadow in enumerate(self.shadows):
-            found = shadow.found(s, steps)
-            if found.error is not None:
-                u[:, row] += np.where(found.failed[:, None], 0.0, found.error)
+            found = shadow.error(s, block)
+            if found.u is not None:
+                u[:, row] += np.where(found.failed[:, None], 0.0, found.u)
             if found.a is not None:
                 # A shift of the unknowns moves the state with it, by their covariance.
                 good = np.isfinite(found.a).all(axis=1) & np.isfinite(end.C).all(axis=(1, 2))
                 for k in np.flatnonzero(good & ~found.failed).tolist():
                     a[k, row] += found.a[k]
                     u[k, row] += along(end, k, found.a[k])
-            s = changed(s, **found.parts, failed=s.failed + found.failed)
-        begun = np.full(len(s), span.t1)
-        return changed(s, u=u, a=a, begun=begun, last=s.count, due=s.count + wait)
+            parts |= found.parts
+            failed = failed + found.failed
+        begun = np.full(len(s), step.t1)
+        parts |= {"begun": begun, "last": s.count, "due": s.count + wait, "failed": failed}
+        return changed(s, u=u, a=a, **parts)
 
     def seen(self, x: FilterState, at: Moments) -> Array:
         """Return by how much predictions are off, (members, shadows, sensors)."""
         s = x.shadows
-        seen = self.filter.sensors.rows(x, s.u, s.a, at)
+        seen = self.rows(x, s.u, s.a, at)
         for row, shadow in enumerate(self.shadows):
-            more = shadow.seen(s)
+            more = shadow.in_readings(s)
             if more is not None:
                 seen[:, row] += more
         return seen
 
     def updated(
-        self, x: FilterState, new: FilterState, made: Update, weights: Array, seen: Array, t: float
+        self, x: FilterState, new: FilterState, left: Array, weights: Array, off: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
 
@@ -568,34 +615,46 @@ class ShadowSet:
         ----------
         x, new
             The filter before and after it.
+        left
+            `Update.left`.
         weights
             One over the noise of each value that was used, zero for others, (members, sensors).
-        seen, t
-            By how much predictions were off, as `seen` says, and the time.
+        off, t
+            By how much predictions of such values were off, as `seen` says, zero for others; and
+            the time.
         """
-        s, left, weights = x.shadows, made.left.transpose(0, 2, 1), weights[:, None]
-        if s.gains.size:
-            s = _recalled(s, x, new, weights.transpose(0, 2, 1) * left, t)
-        # Predictions of values that were not used may be NaN, which a weight of zero does not undo.
-        half = (np.where(weights > 0.0, seen, 0.0) * weights) @ left
-        return changed(s, u=s.u - half @ new.U, a=s.a - half @ new.C)
+        s = x.shadows
+        # K^T = `gain` [U C], with the rows of the new square root.
+        gain = weights[:, :, None] * left.swapaxes(1, 2)  # (members, sensors, r)
+        half = off @ gain
+        parts = {"u": s.u - half @ new.U, "a": s.a - half @ new.C}
+        since = t - s.begun
+        if s.gains.size and np.count_nonzero(since):
+            # A sample multiplies the effect of earlier ones by I - K H, for which the share of the
+            # variance that it leaves stands: the full product would need a matrix for each sensor.
+            share = np.einsum("brk,brk->bk", new.C, new.C)
+            share /= np.maximum(np.einsum("brk,brk->bk", x.C, x.C), TINY)
+            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ new.C)
+        return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
         """Return the shifts of state and reduced unknowns, (members, rows, n or k)."""
         s, u = x.shadows, x.shadows.u.copy()
         for row, shadow in enumerate(self.shadows):
-            more = shadow.beside(s)
+            more = shadow.in_state(s)
             if more is not None and u.size:  # of a state that is asked for
                 u[:, row] += more
         return u, s.a
 
-    def diagnostics(self, x: FilterState) -> Diagnostics[Array]:
+    def diagnostics(self, x: FilterState, C: Array) -> Diagnostics[Array]:
         """Return the shifts of the unknowns, numbers of shape (members,).
 
-        Standard deviations are as reported without the shifts.
+        Parameters
+        ----------
+        C
+            Square root of their covariance without the shifts, (members, r, k).
         """
-        reduction, latent = self.filter.reduction, self.filter.problem.model.latent
-        C = robust_factors(self.filter, x)[1]
+        reduction, latent = self.reduction, self.problem.model.latent
         found = []
         for k, a in enumerate(x.shadows.a):
             q = reduction.bounded(x.q[k] + reduction.Phi @ x.da[k])
@@ -625,63 +684,28 @@ class ShadowSet:
         shift lies outside the range of the linear filter.
         """
         u, a = (rows[:, self.counted].sum(axis=1, keepdims=True) for rows in self.shifts(x))
-        size = np.linalg.norm(self.filter.reduction.in_prior_units(a, x.age), axis=2)
-        good = np.isfinite(size) & np.isfinite(u).all(axis=2)
-        factor = np.where(good, 1.0 / np.maximum(size, 1.0), 0.0)[:, :, None]
-        return np.where(good[..., None], u, 0.0) * factor, np.where(
-            good[..., None], a, 0.0
-        ) * factor
-
-
-def _recalled(
-    s: ShadowState, x: FilterState, new: FilterState, gain: Array, t: float
-) -> ShadowState:
-    """Return members with the gain of one more sample, which reduces the effect of earlier gains.
-
-    Parameters
-    ----------
-    gain
-        Of the rows of the new square root, shape (members, sensors, r).
-    """
-    since = (t - s.begun)[:, None, None]
-    if not since.any():
-        return s
-    # A sample multiplies the effect of earlier ones by I - K H, for which the share of the variance
-    # that it leaves stands: the full product would need a matrix for each sensor.
-    before, after = ((C * C).sum(axis=1, keepdims=True) for C in (x.C, new.C))
-    left = np.divide(after, before, out=np.zeros_like(after), where=before > 0.0)
-    return changed(s, gains=left * s.gains + since * (gain @ new.C))
+        size = np.linalg.norm(self.reduction.in_prior_units(a, x.age), axis=2)
+        good = (np.isfinite(size) & np.isfinite(u).all(axis=2))[..., None]
+        factor = np.where(good, 1.0 / np.maximum(size, 1.0)[..., None], 0.0)
+        return np.where(good, u, 0.0) * factor, np.where(good, a, 0.0) * factor
 
 
 def _watched(
     s: ShadowState, x: FilterState, end: FilterState, span: Span
-) -> tuple[ShadowState, Mask]:
-    """Return members after one more step, and those of which the rate of the state jumped in it."""
+) -> tuple[dict[str, Any], Mask]:
+    """Return fields after one more step, and members whose rate of the state jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
-    differs, most = np.sqrt((more * more).sum(axis=1)), JUMP * s.usual
-    count, settled = s.count + 1, s.count > CALM
-    jumps = settled & (differs > most)
+    count, differs = s.count + 1, np.sqrt(np.einsum("mn,mn->m", more, more))
+    most = np.where(count > CALM + 1, JUMP * s.usual, np.inf)  # in the first steps none is known
+    jumps = differs > most
     # A jump does not count as usual.
-    told = np.minimum(differs, most)
-    if not settled.all():  # before the second step nothing is known
-        told = np.where(settled, told, differs)
-    weight = 1.0 / np.minimum(count, USUAL)
-    usual = s.usual + (told - s.usual) * np.where(count > 2, weight, 1.0)
-    jumped = np.where(jumps, count, s.jumped)
-    return changed(s, rate=rate, usual=usual, count=count, jumped=jumped), jumps
-
-
-def _wait(count: IntArray) -> IntArray:
-    """Return the number of steps from a shadow after `count` steps to the next one, (members,)."""
-    return np.where(count < FIRST, 1, LATER[count // 8 % len(LATER)])
-
-
-def _opened(s: ShadowState, fresh: Mask, x: FilterState, span: Span, mesh: bool) -> ShadowState:
-    """Return members of which some begin a block of steps with a span."""
-    rows = fresh[:, None]
-    begun, u0 = np.where(fresh, span.t0, s.begun), np.where(rows, x.u, s.u0) if mesh else s.u0
-    return changed(s, begun=begun, u0=u0, inputs0=np.where(rows, span.inputs0, s.inputs0))
+    weight = WEIGHTS[np.minimum(count, USUAL)]
+    usual = s.usual + (np.minimum(differs, most) - s.usual) * weight
+    parts: dict[str, Any] = {"rate": rate, "usual": usual, "count": count}
+    if np.count_nonzero(jumps):
+        parts["jumped"] = np.where(jumps, count, s.jumped)
+    return parts, jumps
 
 
 def _part(span: Span, group: IntArray) -> Span:

@@ -70,7 +70,7 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
 
     def found() -> Verdict:
         one = take(x, member)
-        w, settled = judge.settled(one.ledger, one.causes)
+        w, settled = judge.summed_up(one.ledger, one.causes)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             at = _position(filter_, replace(one, causes=w, ledger=settled))
             return assess(judge.dictionary, at)

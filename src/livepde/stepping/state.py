@@ -280,7 +280,8 @@ class ForwardStage:
         The factor is that on the free coefficients, the matrix has all columns.
         """
         if self.keeps:
-            return self.factor(q, h, moment), self._system(q, h, moment).matrix
+            rows = self._system(q, h, moment).matrix  # first: the factor is made of its data
+            return self.factor(q, h, moment), rows
         data = self._data(u, self.model.latent.value(q), h, moment)
         return self._factorise(data), self._rows[0].matrix(data)
 

@@ -15,7 +15,7 @@ from livepde.verdict.findings import (
     flat,
 )
 from livepde.verdict.inputs import InputLedger
-from livepde.verdict.judge import Judge, Seen
+from livepde.verdict.judge import Judge, ScoredSample
 from livepde.verdict.ledger import WINDOWS, Ledger
 from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
 from livepde.verdict.withheld import WithheldLedger
@@ -35,7 +35,7 @@ __all__ = [
     "Ledger",
     "Position",
     "ScoreDirection",
-    "Seen",
+    "ScoredSample",
     "Severity",
     "Shifts",
     "Verdict",

@@ -129,6 +129,13 @@ class Dictionary:
         self.jumps = [place for _, place in jumps]
         self._add("jump", [ScoreDirection("jump", label, JUMP) for label, _ in jumps])
         self._add("process", [ScoreDirection(term.kind, term.subject) for term in terms])
+        # Offsets and drifts, in units of the noise, are the same at each sample.
+        self._constant = np.zeros((observed.size, len(self)))
+        for kind, size in (("offset", OFFSET), ("drift", OFFSET / DRIFT)):
+            if kind in self.parts:  # many sensors leave out kinds
+                self._constant[:, self.parts[kind]] = size * np.eye(observed.size)
+        changing = [self._places(kind) for kind in self.kinds if kind not in ("offset", "drift")]
+        self._changing: IntArray = np.concatenate([*changing, np.zeros(0, dtype=np.int64)])
 
     def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
         """Append the directions of single sensors, as many kinds as there is room for."""
@@ -161,50 +168,41 @@ class Dictionary:
         self.directions += directions
         self.parts[part] = slice(start, len(self.directions))
 
+    def _places(self, part: str) -> IntArray:
+        return np.arange(len(self))[self.parts[part]]
+
     def __len__(self) -> int:
         return len(self.directions)
 
-    def moved(self, u: Array) -> Array:
-        """Return how readings change with shifts of their sensors, (members, axes * sensors)."""
-        if self.shifts is None:
-            return np.zeros((len(u), 0))
-        return self.shifts.of_readings(u)
-
-    def signals(
-        self, noise: Array, h: Array, first: Array, last: Array, share: Array, moved: Array
+    def effects(
+        self, noise: Array, change: Array, late: Array, moved: Array, answers: Array
     ) -> Array:
-        """Return the change of a reading along each direction, (samples, directions of sensors).
+        """Return the change of readings along each direction, in units of their noise.
 
-        In units of the noise. That of a drift is its slope.
+        Shape (members, samples, sensors, directions). That of a drift is its slope.
 
         Parameters
         ----------
         noise
-            Shape (samples, sensors).
-        h, first, last
-            Predictions now, at the start and of the sample before, (samples, sensors).
-        share
-            Usual interval between samples over this one, (samples,).
+            Shape (members, samples, sensors).
+        change, late
+            Predictions less the first ones, and predictions a sample earlier less those of now,
+            (members, samples, sensors).
         moved
-            Shape (samples, axes * sensors).
+            Changes by shifts of the sensors, (members, samples, axes * sensors).
+        answers
+            Readings due to missing terms, (members, samples, terms, sensors).
         """
-        samples, sensors = h.shape
-        parts: dict[str, Any] = {}
-        for kind in self.kinds:
-            if kind == "offset":
-                parts[kind] = np.full((samples, sensors), OFFSET)
-            elif kind == "drift":
-                parts[kind] = np.full((samples, sensors), OFFSET / DRIFT)
-            elif kind == "gain":
-                parts[kind] = GAIN * (h - first) / noise
-            elif kind == "lag":
-                rate = (last - h) * share[:, None]
-                parts[kind] = LAG * np.where(np.isfinite(rate), rate, 0.0) / noise
-            else:
-                parts[kind] = moved / np.tile(noise, moved.shape[1] // sensors)
-        if not parts:
-            return np.zeros((samples, 0))
-        return np.concatenate([parts[kind] for kind in self.kinds], axis=1)
+        found = np.empty((*noise.shape, len(self)))
+        found[...] = self._constant
+        each = {"lag": LAG * late, "position": moved, "gain": GAIN * change}
+        if self._changing.size:
+            own = self.own[self._changing]  # each changes the readings of one sensor
+            parts = [each[kind] for kind in self.kinds if kind in each]
+            signals = np.concatenate(parts, axis=2) / noise[:, :, own]
+            found[:, :, own, self._changing] = signals
+        found[..., self.parts["process"]] = answers.swapaxes(-1, -2) / noise[..., None]
+        return found
 
 
 def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:

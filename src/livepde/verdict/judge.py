@@ -1,4 +1,4 @@
-"""Scores of a sample for the ledger, and sensitivities to the causes of misfit.
+"""Running scores of a filter: the data of its verdict, and the shifts by causes of misfit.
 
 Let delta be the difference of the truth and the estimate of [u; a] due to a cause of amplitude one,
 and f the direct effect of that cause on the readings. A Kalman filter without a model of the cause
@@ -13,8 +13,9 @@ of the noise, an update is
 
     w <- W^T (w - Y f),    since  [U C] <- W^T [U C]  and  K = [U C]^T W W^T Y N^-1.
 
-Several samples are summed together. `FilterState.causes` holds M, by which updates and predictions
-have moved rows since the last sample; each sample that waits keeps its M and Y. Then
+A sample only writes one row of numbers; a batch of rows is summed at once. `FilterState.causes`
+holds M, by which updates and predictions have moved the rows of [U C] since the last sample, so
+that the batch has
 
     w_k = M_k (w_(k-1) - Y_(k-1) f_(k-1)),    g_k = f_k + Y_k^T w_k.
 
@@ -25,8 +26,8 @@ estimate of the unknowns for each unit of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,24 +35,24 @@ from livepde.linalg import Array, Mask
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary
 from livepde.verdict.evidence import causes_of, quiet
-from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, summed
+from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
 from livepde.verdict.missing_terms import Now, stride
 
-__all__ = ["Judge", "Seen"]
+__all__ = ["Judge", "ScoredSample"]
 
-MOST_MEMBERS = 16  # of a bank that are judged; a fleet of more is not
+MOST_MEMBERS = 16  # of a bank in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
+class ScoredSample(NamedTuple):
     """Prior of a filter at a sample, with the sample; in units of the noise.
 
     Attributes
     ----------
-    C, causes
-        Square root of the covariance of the unknowns, (members, r, k), and M, (members, r, rank).
+    C, M
+        Square root of the covariance of the unknowns, (members, r, k), and the product of the
+        matrices that have moved its rows since the last sample, (members, r, rank).
     a, q
         Functions that return the estimated reduced and latent unknowns: not every judge asks.
     u
@@ -66,7 +67,7 @@ class Seen:
     """
 
     C: Array
-    causes: Array
+    M: Array
     a: Callable[[], Array]
     q: Callable[[], Array]
     u: Array
@@ -80,7 +81,7 @@ class Seen:
 
 
 class Judge:
-    """Keeps the ledger of a filter.
+    """Configuration of a ledger: it adds samples to it, and sums them.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ class Judge:
         self.terms = len(dictionary.process.terms) if dictionary.process else 0
         self._drift = dictionary.parts.get("drift", slice(0, 0))
         self._jump, self._process = dictionary.parts["jump"], dictionary.parts["process"]
-        # Sizes of the parts of a row that waits, in their order.
+        # Numbers of a sample, in the order in which `add` writes them.
         sizes = {
             "t": 1,
             "used": sensors,
@@ -122,13 +123,11 @@ class Judge:
             "C": unknowns**2 if self.recorded else 0,
         }
         ends = np.cumsum(list(sizes.values())).tolist()
-        self._at = {
-            name: slice(end - size, end)
-            for (name, size), end in zip(sizes.items(), ends, strict=True)
-        }
+        each = zip(sizes.items(), ends, strict=True)
+        self._at = {name: slice(end - size, end) for (name, size), end in each}
         self.numbers = int(ends[-1])
         self.batch = batch_of(self.numbers)
-        self._fresh = np.eye(rank)
+        self._eye = np.eye(rank)[None]
 
     def widened(self, more: int) -> Judge:
         """Return the judge of a filter whose square root has more rows."""
@@ -142,153 +141,129 @@ class Judge:
         counts = len(self.dictionary), followed, self.terms, n, self.windows, self.rank
         return Ledger.start(self.sensors, *counts, self.batch, self.numbers)
 
-    def heard(self, ledger: Ledger, seen: Seen) -> tuple[Array, Ledger]:
-        """Return M of a sample, the identity before its update, and the ledger."""
-        M, full = seen.causes, ledger.waiting == self.batch
+    def answered(self, members: int) -> bool:
+        """Return whether missing terms are looked for: each costs a solve for each member."""
+        return self.terms > 0 and members <= MOST_MEMBERS
+
+    def add(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
+        """Return M of the next sample before its update, the identity, and the ledger."""
+        M = sample.M
         members, r, _ = M.shape
         # A batch is summed when the next sample comes, so that whoever reads the verdict in between
-        # sums a copy and changes nothing.
-        if full.any() or not ledger.seen.all():
-            M, ledger = self._begun(ledger, seen, full)
-        each: dict[str, Array | Mask] = {
-            "used": seen.used,
-            "d": seen.d,
-            "noise": seen.noise,
-            "z": seen.z,
-            "predicted": seen.predicted,
-            "Y": seen.Y,
-            "M": M,
-        }
-        parts: dict[str, Any] = {}
+        # sums a copy and changes nothing. None waits before the first sample, too.
+        if np.count_nonzero(ledger.waiting % self.batch) < members:
+            M, ledger = self._batch_begun(ledger, sample)
+        reached = ledger.reached[:, 1] >= sample.at.t
+        if self.answered(members) and np.count_nonzero(reached) < members:
+            ledger = self._answered(ledger, sample)
+        # In the order of `_at`; the rows that a square root lacks are zeros.
+        row = [
+            np.full((members, 1), sample.at.t),
+            sample.used,
+            sample.d,
+            _of_each(sample.noise, members),
+            _of_each(sample.z, members),
+            sample.predicted,
+            *_filled(sample.Y, self._at["Y"]),
+            *_filled(M, self._at["M"]),
+        ]
         if self.dictionary.shifts is not None:
-            each["moved"] = self.dictionary.moved(seen.u)
-        # The answers of the process cost a solve for each term and member.
-        if self.terms and members <= MOST_MEMBERS:
-            parts = self._answered(ledger, seen)
-            each["answers"] = _between(parts, seen.at.t)
-        if self.recorded and seen.C.shape[1] == self.unknowns:
-            each |= {"a": seen.a(), "C": seen.C}
-        row = np.zeros((members, self.numbers))
-        row[:, 0] = seen.at.t
-        for name, part in each.items():  # those of rows that a square root lacks stay zero
-            flat = part.reshape(len(part), -1)
-            begin = self._at[name].start
-            row[:, begin : begin + flat.shape[1]] = flat
+            row.append(self.dictionary.shifts.of_readings(sample.u))
+        if self.terms:  # interpolated later on, many at once
+            row.append(np.full((members, self.terms * self.sensors), np.nan))
+        if self.recorded:
+            if sample.C.shape[1] == self.unknowns:
+                row += [sample.a(), sample.C.reshape(members, -1)]
+            else:
+                row.append(np.zeros((members, self.unknowns * (1 + self.unknowns))))
         rows = ledger.rows.copy()
-        rows[np.arange(members), ledger.waiting] = row
-        more = {"seen": ledger.seen + 1, "waiting": ledger.waiting + 1, "rows": rows}
+        rows[np.arange(members), ledger.waiting] = np.concatenate(row, axis=1)
         # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
         # [U C].
-        fresh = np.broadcast_to(self._fresh[:r], (members, r, self.rank))
-        return fresh, _changed(ledger, more | parts)
+        one = self._eye[:, :r]
+        after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
+        return one if members == 1 else np.repeat(one, members, axis=0), after
 
     @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
-    def settled(self, ledger: Ledger, causes: Array) -> tuple[Array, Ledger]:
+    def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
         Parameters
         ----------
-        causes
-            M now, (members, r, rank).
+        M
+            As it is now, (members, r, rank).
 
         Returns
         -------
         w
             Shape (members, r, windows times directions).
         """
-        members, sensors = len(ledger.seen), self.sensors
-        at, due = self._at, ledger.due
-        there = np.arange(self.batch) < ledger.waiting[:, None]  # (members, batch)
+        members, at, due = len(ledger.seen), self._at, ledger.due
         # Only as many rows as some member has waiting are summed.
-        ledger = self._timed(ledger, there)
         batch = max(int(ledger.waiting.max(initial=0)), 1)
-        rows, some = ledger.rows[:, :batch], there[:, :batch, None]
-        used = rows[:, :, at["used"]] * some
-        Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, sensors)
-        own, answers = self._effects(ledger, rows, used, due)
-        # T = (1 + Y^T Y)^(-1/2) whitens the innovations of a sample: r = T d, g <- T g.
-        Yt, (X, scale) = Y.swapaxes(-1, -2), _whitening(Y)
-        before, w = self._followed(ledger, self._through(own, answers, Yt))
-        # With T = 1 + X scale X^T all of g T is f and a product of few columns.
-        scaled = (self._through(own, answers, X) + (X.swapaxes(-1, -2) @ Yt) @ before) * scale
-        g = np.concatenate([Yt, X], axis=-1) @ np.concatenate([before, scaled], axis=-2)
-        g = g.reshape(members, batch, sensors, self.windows, -1)
-        owner = self.dictionary.own
-        g[:, :, owner, :, np.arange(len(owner))] += own.transpose(3, 0, 1, 2)
-        g[..., self._process] += answers.swapaxes(-1, -2)[:, :, :, None]
-        d = rows[:, :, at["d"]]
-        r = d + (X @ (scale * (X.swapaxes(-1, -2) @ d[..., None])))[..., 0]
+        rows, there = ledger.rows[:, :batch], np.arange(batch) < ledger.waiting[:, None]
+        ledger = self._timed(ledger, rows, there)
+        used = rows[:, :, at["used"]] * there[:, :, None]
+        Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, self.sensors)
+        f, growth = self._effects(ledger, rows, used, due)
+        before, w = self._followed(ledger, rows, there, _in_windows(Y @ f, growth))
+        # Innovations and g, not yet whitened, in one array: (members, batch, sensors, 1 + columns).
+        d = rows[:, :, at["d"], None]
+        found = np.concatenate([d, _in_windows(f, growth) + Y.swapaxes(-1, -2) @ before], axis=-1)
+        # T = (1 + Y^T Y)^(-1/2) = 1 + X scale X^T whitens the innovations of a sample.
+        X, scale = _whitening(Y)
+        found += X @ (scale * (X.swapaxes(-1, -2) @ found))
         # A single wild value must be no evidence for a cause (Huber's loss).
-        r = ledger.clipped(r) * some
-        if not some.all():
-            g *= some[..., None, None]
+        found[..., 0] = ledger.clipped(found[..., 0])
+        if not there.all():
+            found *= there[:, :, None, None]
         # Sums over the samples that waited, in the windows that go on or begin with them.
-        names = ("sums", "noise", "before", "present")
-        parts: dict[str, Any] = dict(zip(names, summed(ledger, due, r, g, used), strict=True))
+        parts: dict[str, Any] = summed(ledger, due, found, used)
         # The record is of raw residuals about the prior mean, d + Y^T a: its scores do not depend
         # on the estimate of the moment, so that blocks of different times may be added.
         if self.recorded:
-            Y, told = self._record(rows, Y[:, :, : self.unknowns])
-            Y, told = Y * used[:, :, None], told * used
-            new = blocked(ledger, ledger.seen - ledger.waiting, Y, told)
-            parts |= dict(zip(("score", "information", "length"), new, strict=True))
-        waited = ledger.waiting[:, None]
-        parts |= self._stuck(ledger, there)
-        parts["sound"] = _sounded(ledger, due)
-        shown = np.isfinite(rows[:, :, at["z"]]) & some
+            parts |= blocked(ledger, *self._record(rows, Y[:, :, : self.unknowns], used))
+        z, last = rows[:, :, at["z"]], rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
+        some = ledger.waiting[:, None] > 0
+        shown = np.isfinite(z) & there[:, :, None]
         refused = shown & ~(used > 0.0)
-        parts["shown"] = ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1)
-        last = rows[np.arange(members), np.maximum(ledger.waiting - 1, 0)]
-        parts |= {
+        times = np.concatenate([last[:, at["t"]], ledger.times[:, 1:]], axis=1)
+        parts |= self._stuck(ledger, np.where(shown, z, np.nan)) | {
+            "sound": _sounded(ledger, due),
+            "shown": ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1),
             "waiting": np.zeros_like(ledger.waiting),
-            "age": np.where(due, 0, ledger.age) + waited,
+            "age": np.where(due, 0, ledger.age) + ledger.waiting[:, None],
             "epoch": ledger.epoch + (due & (ledger.age > 0)),
-            "last": np.where(waited > 0, last[:, at["predicted"]], ledger.last),
-            "times": np.where(waited > 0, _replaced(ledger.times, last[:, at["t"]]), ledger.times),
+            "last": np.where(some, last[:, at["predicted"]], ledger.last),
+            "times": np.where(some, times, ledger.times),
         }
-        return causes @ w, replace(ledger, **parts)
+        return M @ w, changed(ledger, **parts)
 
-    def _through(self, own: Array, answers: Array, X: Array) -> Array:
-        """Return X^T f of the effects of all directions, (members, batch, k, columns).
-
-        Parameters
-        ----------
-        own, answers
-            As `_effects` returns them.
-        X
-            Shape (members, batch, sensors, k).
-        """
-        members, batch, _, k = X.shape
-        found = np.zeros((members, batch, k, self.windows, len(self.dictionary)))
-        Xt, owner = X.swapaxes(-1, -2), self.dictionary.own
-        found[..., : len(owner)] = Xt[:, :, :, None, owner] * own[:, :, None]
-        found[..., self._process] = (Xt @ answers.swapaxes(-1, -2))[:, :, :, None]
-        return found.reshape(members, batch, k, -1)
-
-    def _followed(self, ledger: Ledger, effect: Array) -> tuple[Array, Array]:
+    def _followed(
+        self, ledger: Ledger, rows: Array, there: Mask, effect: Array
+    ) -> tuple[Array, Array]:
         """Return w before the update of each sample that waits, and w - Y f of the last one.
 
         Shapes (members, batch, rank, columns) and (members, rank, columns). Where none is there w
         stays.
         """
-        members, batch, rank, _ = effect.shape
-        M = ledger.rows[:, :batch, self._at["M"]].reshape(members, batch, rank, rank)
-        before, w = np.zeros_like(effect), ledger.w
-        for k in range(batch):
-            before[:, k] = M[:, k] @ w
-            w = np.where((ledger.waiting > k)[:, None, None], before[:, k] - effect[:, k], w)
+        M = rows[:, :, self._at["M"]].reshape(*rows.shape[:2], self.rank, self.rank)
+        before, w, whole = np.empty_like(effect), ledger.w, bool(there.all())
+        for k in range(effect.shape[1]):
+            np.matmul(M[:, k], w, out=before[:, k])
+            after = before[:, k] - effect[:, k]
+            w = after if whole else np.where(there[:, k, None, None], after, w)
         return before, w
 
-    def _record(self, rows: Array, Y: Array) -> tuple[Array, Array]:
+    def _record(self, rows: Array, Y: Array, used: Array) -> tuple[Array, Array]:
         """Return sensitivities to the unknowns, and residuals at the prior mean, of the record.
 
-        Shapes (members, batch, k, sensors) and (members, batch, sensors).
+        Shapes (members, batch, k, sensors) and (members, batch, sensors); zero where no value is.
         """
-        members, batch, _ = rows.shape
-        k, at = self.unknowns, self._at
-        Y = _sensitivity(rows[:, :, at["C"]].reshape(members, batch, k, k), Y)
+        at, k = self._at, self.unknowns
+        Y = _sensitivity(rows[:, :, at["C"]].reshape(*rows.shape[:2], k, k), Y)
         told: Array = rows[:, :, at["d"]] + (rows[:, :, None, at["a"]] @ Y)[:, :, 0]
-        return Y, told
+        return Y * used[:, :, None], told * used
 
     @staticmethod
     def _unit(ledger: Ledger, k: int, t: float) -> float:
@@ -297,23 +272,28 @@ class Judge:
         since = t - float(ledger.rows[k, 0, 0])
         return known if np.isfinite(known) else since if since > 0.0 else 1.0
 
-    def _timed(self, ledger: Ledger, there: Mask) -> Ledger:
-        """Return the ledger with the usual interval, and the first predictions."""
-        times = np.concatenate([ledger.times[:, :1], ledger.rows[:, :, 0]], axis=1)
+    def _timed(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
+        """Return the ledger with the usual interval, the first one, and the first predictions."""
+        if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
+            return ledger
+        times = np.concatenate([ledger.times[:, :1], rows[:, :, 0]], axis=1)
         steps = np.where(there, np.diff(times, axis=1), np.nan)
-        unit = ledger.times[:, 1]
-        for step in steps.T:
-            unit = np.where(np.isfinite(unit), unit, step)
-        predicted = ledger.rows[:, 0, self._at["predicted"]]
+        steps = np.concatenate([ledger.times[:, 1:], steps], axis=1)
+        known = np.isfinite(steps).argmax(axis=1)[:, None]
+        unit = np.take_along_axis(steps, known, axis=1)
+        predicted = rows[:, 0, self._at["predicted"]]
         first = np.where(np.isfinite(ledger.first), ledger.first, predicted)
-        times = np.stack([ledger.times[:, 0], unit], axis=1)
-        return replace(ledger, times=times, first=first)
+        return changed(ledger, times=np.concatenate([times[:, :1], unit], axis=1), first=first)
 
-    def _stuck(self, ledger: Ledger, there: Mask) -> dict[str, Any]:
+    @staticmethod
+    def _stuck(ledger: Ledger, z: Array) -> dict[str, Any]:
         """Return how often in a row sensors have shown the same value, and that value."""
-        values = np.where(there[:, :, None], ledger.rows[:, :, self._at["z"]], np.nan)
-        z = np.concatenate([ledger.value[:, None], values], axis=1)
-        order, seen = np.arange(self.batch + 1)[:, None], np.isfinite(z)
+        before = np.concatenate([ledger.value[:, None], z[:, :-1]], axis=1)
+        # Most often all are shown, and none is that before.
+        if np.isfinite(z).all() and not (np.abs(z - before) <= SAME * np.abs(z)).any():
+            return {"stuck": np.zeros_like(ledger.stuck), "value": z[:, -1]}
+        z = np.concatenate([ledger.value[:, None], z], axis=1)
+        order, seen = np.arange(z.shape[1])[:, None], np.isfinite(z)
         latest = np.maximum.accumulate(np.where(seen, order, 0), axis=1)
         value = np.take_along_axis(z, latest, axis=1)  # the last one that was shown
         same = np.abs(z[:, 1:] - value[:, :-1]) <= SAME * np.abs(z[:, 1:])
@@ -322,23 +302,24 @@ class Judge:
         stuck = np.where(changes > 0, 0, ledger.stuck) + since
         return {"stuck": stuck, "value": value[:, -1]}
 
-    def _begun(self, ledger: Ledger, seen: Seen, full: Mask) -> tuple[Array, Ledger]:
+    def _batch_begun(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
         """Return M and the ledger of members whose batch is full, or the first one."""
-        begins = full | (ledger.seen == 0)
-        members, r, _ = seen.causes.shape
+        full = ledger.waiting == self.batch
+        begins = full | (ledger.waiting == 0)
+        members, r, _ = sample.M.shape
         w = np.zeros((members, r, ledger.w.shape[2]))
         if full.any():
-            found, settled = self.settled(ledger, seen.causes)
+            found, settled = self.summed_up(ledger, sample.M)
             w[full] = found[full]
             ledger = settled if full.all() else _where(full, settled, ledger)
-        w = self._opened(ledger, seen, ledger.due & begins[:, None], w)
+        w = self._window_begun(ledger, sample, ledger.due & begins[:, None], w)
         kept = np.zeros_like(ledger.w)
         kept[:, :r] = w[:, : self.rank]
         chosen = begins[:, None, None]
-        M = np.where(chosen, self._fresh[:r], seen.causes)
-        return M, replace(ledger, w=np.where(chosen, kept, ledger.w))
+        M = np.where(chosen, self._eye[:, :r], sample.M)
+        return M, changed(ledger, w=np.where(chosen, kept, ledger.w))
 
-    def _opened(self, ledger: Ledger, seen: Seen, due: Mask, w: Array) -> Array:
+    def _window_begun(self, ledger: Ledger, sample: ScoredSample, due: Mask, w: Array) -> Array:
         """Return w with that of windows that begin: nothing but jumps of the unknowns."""
         count = len(self.dictionary)
         if not due.any() or not count:
@@ -350,71 +331,90 @@ class Judge:
         jumps = self.dictionary.jumps
         if jumps and ledger.seen.any():
             # ... but a jump of an unknown is a shift C^T w = e of the estimate from the beginning.
-            units = JUMP * np.eye(seen.C.shape[2])[:, jumps]
+            units = JUMP * np.eye(sample.C.shape[2])[:, jumps]
             for k in np.flatnonzero(due[:, 1:].any(axis=1)).tolist():
-                moved = np.linalg.lstsq(seen.C[k].T, units, rcond=None)[0]
+                moved = np.linalg.lstsq(sample.C[k].T, units, rcond=None)[0]
                 for window in (1 + np.flatnonzero(due[k, 1:])).tolist():
                     w[k, :, window, self._jump] = moved
         return w.reshape(members, r, -1)
 
     def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
-        """Return f of the samples that wait: of directions of sensors, and of terms of the process.
+        """Return f of the samples that wait, (members, batch, sensors, directions).
 
-        Shapes (members, batch, windows, directions of sensors) and (members, batch, terms,
-        sensors).
+        And by what it is larger in each window, (members, batch, windows, directions): a drift
+        begins with its window and grows by one unit with each sample.
         """
-        at = self._at
-        members, batch, _ = rows.shape
+        at, (members, batch, _) = self._at, rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
         before = np.concatenate([ledger.times[:, :1], t[:, :-1]], axis=1)
         # A sensor that is late by a sample shows the prediction of the sample before it.
         last = np.concatenate([ledger.last[:, None], h[:, :-1]], axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            share = ledger.times[:, 1:] / (t - before)
-        first = np.broadcast_to(ledger.first[:, None], h.shape)
-        noise = rows[:, :, at["noise"]]
-        noise = np.where(noise > 0.0, noise, 1.0)  # rows that are not filled yet
-        noise, h, first, last, moved = (
-            part.reshape(members * batch, -1)
-            for part in (noise, h, first, last, rows[:, :, at["moved"]])
-        )
-        f = self.dictionary.signals(noise, h, first, last, share.ravel(), moved)
-        f = f.reshape(members, batch, -1) * used[:, :, self.dictionary.own]
-        own = np.repeat(np.where(np.isfinite(f), f, 0.0)[:, :, None], self.windows, axis=2)
-        if self._drift.stop > self._drift.start:
-            # A drift begins with its window and grows by one unit with each sample.
-            age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
-            own[..., self._drift] *= age[..., None]
-        answers = rows[:, :, at["answers"]].reshape(members, batch, self.terms, self.sensors)
-        answers = answers * (used / noise.reshape(members, batch, -1))[:, :, None]
-        return own, np.where(np.isfinite(answers), answers, 0.0)
+        late = (last - h) * (ledger.times[:, 1:] / (t - before))[:, :, None]
+        moved, change = rows[:, :, at["moved"]], h - ledger.first[:, None]
+        answers = self._answers(ledger)[:, :batch]
+        answers = answers.reshape(members, batch, self.terms, self.sensors)
+        f = self.dictionary.effects(rows[:, :, at["noise"]], change, late, moved, answers)
+        f *= used[..., None]
+        f[~np.isfinite(f)] = 0.0  # the sample before is not known, or a row is not filled
+        growth = np.ones((members, batch, self.windows, len(self.dictionary)))
+        age = np.where(due, 0, ledger.age)[:, None] + np.arange(batch)[:, None]
+        growth[..., self._drift] = age[..., None]
+        return f, growth
 
-    def _answered(self, ledger: Ledger, seen: Seen) -> dict[str, Any]:
-        """Return responses of the process that reach this sample at least."""
-        process, t = self.dictionary.process, seen.at.t
-        # One step of the process answers for several samples, which interpolate between its ends.
-        behind = ~(ledger.reached[:, 1] >= t)
-        if process is None or not behind.any():
-            return {"readings": ledger.readings, "reached": ledger.reached}
+    def _answers(self, ledger: Ledger) -> Array:
+        """Return readings due to missing terms at samples that wait, (members, batch, numbers)."""
+        known = ledger.rows[:, :, self._at["answers"]]
+        since = (ledger.rows[:, :, 0] - ledger.reached[:, :1])[:, :, None]
+        low, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
+        return np.where(np.isnan(known), low + since * slope, known)
+
+    def _answered(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
+        """Return the ledger with responses of the process that reach a sample at least.
+
+        One step of the process answers for several samples, which interpolate between its ends.
+        """
+        process, t = self.dictionary.process, sample.at.t
+        if process is None:
+            return ledger
+        rows = ledger.rows.copy()
+        rows[:, :, self._at["answers"]] = self._answers(ledger)
         p, readings = ledger.process.copy(), ledger.readings.copy()
-        reached, q = ledger.reached.copy(), seen.q()
-        for k in np.flatnonzero(behind).tolist():
+        reached, q = ledger.reached.copy(), sample.q()
+        for k in np.flatnonzero(~(reached[:, 1] >= t)).tolist():
             # Without a better guess, what the sensors showed first is where nothing is lost.
-            rest = float(np.nanmean(ledger.first[k])) if np.isfinite(ledger.first[k]).any() else 0.0
-            now = Now(seen.u[k], q[k], seen.at.member(k), self._unit(ledger, k, t), rest)
+            first = ledger.first[k, np.isfinite(ledger.first[k])]
+            rest = float(first.sum()) / max(len(first), 1)
+            unit = self._unit(ledger, k, t)
+            now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
             if not np.isfinite(reached[k, 1]):
                 p[k] = process.begun()
-                readings[k] = process.shown(p[k], now)
+                readings[k] = process.shown(p[k], now), np.zeros_like(readings[k, 1])
                 reached[k] = t
                 continue
-            begin, steps = float(reached[k, 1]), stride(int(ledger.seen[k]))
-            unit = self._unit(ledger, k, t)
-            h = max(steps * unit, t - begin)
+            begin = float(reached[k, 1])
+            h = max(stride(int(ledger.seen[k])) * unit, t - begin)
             p[k] = process.advance(p[k], now, h)
-            readings[k, 0] = readings[k, 1]
-            readings[k, 1] = process.shown(p[k], now)
+            low = readings[k, 0] + (begin - reached[k, 0]) * readings[k, 1]
+            readings[k] = low, (process.shown(p[k], now) - low) / h
             reached[k] = begin, begin + h
-        return {"process": p, "readings": readings, "reached": reached}
+        return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
+
+
+def _of_each(part: Array, members: int) -> Array:
+    """Return an array of each member, (members, ...), of one that may be common to all of them."""
+    return part if len(part) == members else np.repeat(part, members, axis=0)
+
+
+def _filled(part: Array, at: slice) -> list[Array]:
+    """Return an array as a row of each member, and the zeros that it lacks to fill its place."""
+    row = part.reshape(len(part), -1)
+    lacking = at.stop - at.start - row.shape[1]
+    return [row, np.zeros((len(row), lacking))] if lacking else [row]
+
+
+def _in_windows(effect: Array, growth: Array) -> Array:
+    """Return effects of each direction in each window, (..., k, windows * directions)."""
+    return (effect[..., None, :] * growth[:, :, None]).reshape(*effect.shape[:3], -1)
 
 
 def _sounded(ledger: Ledger, due: Mask) -> Mask:
@@ -428,15 +428,6 @@ def _sounded(ledger: Ledger, due: Mask) -> Mask:
     return sound
 
 
-def _between(parts: dict[str, Any], t: float) -> Array:
-    """Return the answers of the process at a time, (members, terms, sensors)."""
-    found = []
-    for (begin, end), (low, high) in zip(parts["reached"].tolist(), parts["readings"], strict=True):
-        along = (t - begin) / (end - begin) if end > begin else 0.0
-        found.append(low + min(max(along, 0.0), 1.0) * (high - low))
-    return np.stack(found) if len(found) > 1 else found[0][None]
-
-
 def _whitening(Y: Array) -> tuple[Array, Array]:
     """Return X and scale with (1 + Y^T Y)^(-1/2) = 1 + X scale X^T, for Y (..., rank, sensors).
 
@@ -444,7 +435,8 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
     sensors, k) and (..., k, 1).
     """
     rank, sensors = Y.shape[-2:]
-    Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
+    if not np.isfinite(Y).all():
+        Y = np.where(np.isfinite(Y).all(axis=(-2, -1), keepdims=True), Y, 0.0)
     small = rank < sensors
     Yt = Y.swapaxes(-1, -2)
     values, axes = np.linalg.eigh(Y @ Yt if small else Yt @ Y)
@@ -455,19 +447,6 @@ def _whitening(Y: Array) -> tuple[Array, Array]:
         scale /= np.where(values > 0.0, values, 1.0)
         axes = Yt @ axes
     return axes, scale[..., None]
-
-
-def _replaced(times: Array, last: Array) -> Array:
-    """Return the time of the last sample and the usual interval."""
-    return np.concatenate([last, times[:, 1:]], axis=1)
-
-
-def _changed(ledger: Ledger, parts: dict[str, Any]) -> Ledger:
-    """Return a ledger with some fields exchanged: `replace` in a tenth of its time."""
-    new: Ledger = object.__new__(Ledger)
-    new.__dict__.update(ledger.__dict__)
-    new.__dict__.update(parts)
-    return new
 
 
 def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
@@ -482,7 +461,9 @@ def _where(chosen: Mask, one: Ledger, other: Ledger) -> Ledger:
 
 def _sensitivity(C: Array, Y: Array) -> Array:
     """Return how readings change with the unknowns, (..., k, sensors); zero where not known."""
-    known = np.isfinite(C).all(axis=(-2, -1)) & (np.abs(np.linalg.det(C)) > 0.0)
-    one = np.eye(C.shape[-1])
-    safe = np.where(known[..., None, None], C, one)
+    determinant = np.linalg.det(C)
+    known = np.isfinite(determinant) & (determinant != 0.0)
+    if known.all():
+        return np.asarray(np.linalg.solve(C, Y))
+    safe = np.where(known[..., None, None], C, np.eye(C.shape[-1]))
     return np.asarray(np.where(known[..., None, None], np.linalg.solve(safe, Y), 0.0))

@@ -7,9 +7,9 @@ response is needed to a tenth of its size, to tell causes apart, and so costs a 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -29,8 +29,7 @@ MOST_STRIDE = 16  # samples of one step
 MOST_ENDS = 4  # boundaries of the mesh that are looked at
 
 
-@dataclass(frozen=True)
-class Now:
+class Now(NamedTuple):
     """Where a response stands: state, latent parameter, inputs, usual interval and rest state.
 
     Attributes
@@ -51,9 +50,8 @@ class Now:
 Load: TypeAlias = Callable[[Now], Array]
 
 
-@dataclass(frozen=True)
-class Term:
-    """A term that a model may lack or have wrong.
+class Term(NamedTuple):
+    """A term that a model may lack or have wrong, with an amplitude of one.
 
     Attributes
     ----------
@@ -61,10 +59,14 @@ class Term:
         "boundary", "source", "loss", "flux", "channel" (its gain), or "initial" state.
     subject
         Boundary or channel; empty for the whole domain.
+    load, lift
+        Function that returns its load, and boundary values of its response, (n,); None for zero.
     """
 
     kind: str
     subject: str = ""
+    load: Load | None = None
+    lift: Array | None = None
 
 
 class Process:
@@ -81,16 +83,13 @@ class Process:
         self.observed = observed
         self.level = DEVIATIONS * level
         self.stage = ForwardStage(model)
-        self._loads: list[Load] = []
-        self._lifts: list[Array] = []
         self.terms: list[Term] = []
-        if self.refused(model):
-            return
-        self._whole = model.mass @ model.state_space.interpolate(1.0)
-        self._boundary_values()
-        self._domain()
-        self._ends()
-        self._channels()
+        if not self.refused(model):
+            parts = self._boundary_values(), self._domain(), self._fluxes()
+            self.terms += [term for part in parts for term in part]
+            self.terms += self._gains()
+        zero = np.zeros(model.X.dim)
+        self._lifts = np.array([zero if term.lift is None else term.lift for term in self.terms])
 
     @staticmethod
     def refused(model: Model) -> str:
@@ -100,14 +99,13 @@ class Process:
         block = next(iter(model.state_space.fields.values()))
         return "the state is a vector" if block.vector else ""
 
-    def _add(self, term: Term, load: Load, lift: Array) -> None:
-        self.terms.append(term)
-        self._loads.append(load)
-        self._lifts.append(lift)
+    @cached_property
+    def _whole(self) -> Array:
+        """Load of a source of one in the whole domain."""
+        return np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
 
-    def _boundary_values(self) -> None:
-        model, n = self.model, self.model.X.dim
-        zero, none = np.zeros(n), _nothing
+    def _boundary_values(self) -> Iterator[Term]:
+        model, zero = self.model, np.zeros(self.model.X.dim)
         # Boundary values are affine in the inputs: the difference of two states is the lift of a
         # channel.
         known = dict.fromkeys(model.channels, 0.0)
@@ -120,28 +118,23 @@ class Process:
             lift = model.impose(zero, Moment(0.0, moved)) - at_rest
             if lift.any():
                 rest &= lift == 0.0
-                self._add(Term("boundary", name), none, self.level * lift)
+                yield Term("boundary", name, lift=self.level * lift)
         if rest.any():
-            self._add(Term("boundary", "the fixed boundary"), none, self.level * rest)
+            yield Term("boundary", "the fixed boundary", lift=self.level * rest)
 
-    def _domain(self) -> None:
-        nothing = np.zeros(self.model.X.dim)
+    def _domain(self) -> Iterator[Term]:
         mass = self.model.mass
-
-        def source(now: Now) -> Array:
-            found: Array = self.level / (REACH * now.unit) * self._whole
-            return found
 
         def loss(now: Now) -> Array:
             found: Array = -LOSS / (REACH * now.unit) * (mass @ (now.u - now.rest))
             return found
 
-        self._add(Term("source"), source, nothing)
-        self._add(Term("loss"), loss, nothing)
-        self._add(Term("initial"), _nothing, nothing)
+        yield Term("source", load=_constant(self._whole, self.level))
+        yield Term("loss", load=loss)
+        yield Term("initial")
 
-    def _ends(self) -> None:
-        """Add a flux through each boundary where the model states no value."""
+    def _fluxes(self) -> Iterator[Term]:
+        """Iterate over a flux through each boundary where the model states no value."""
         model = self.model
         names = [str(name) for name in (model.mesh.boundaries or {})]
         ones = model.state_space.interpolate(1.0)
@@ -153,36 +146,32 @@ class Process:
                 continue
             # As much as the source of amplitude one brings into the whole domain.
             shape = load * (self._whole.sum() / load.sum())
-            self._add(Term("flux", name), _flux(shape, self.level), np.zeros(model.X.dim))
+            yield Term("flux", name, load=_constant(shape, self.level))
 
-    def _channels(self) -> None:
-        """Add a gain of each channel that drives the model other than as a boundary value."""
-        model, zero = self.model, np.zeros(self.model.X.dim)
+    def _gains(self) -> list[Term]:
+        """Return a gain of each channel that drives the model other than as a boundary value."""
         taken = {term.subject for term in self.terms}
-        for name in model.channels:
-            if name in taken:
-                continue
-            self._add(Term("channel", name), _gain(model, name), zero)
+        others = [name for name in self.model.channels if name not in taken]
+        return [Term("channel", name, load=_gain(self.model, name)) for name in others]
 
     def begun(self) -> Array:
         """Return the responses at the start, (terms, n): that to another initial state."""
-        p = np.zeros((len(self.terms), self.model.X.dim))
-        for k, (term, lift) in enumerate(zip(self.terms, self._lifts, strict=True)):
-            p[k] = lift
-            if term.kind == "initial":
-                p[k] = self.level * self.model.X.free
+        p: Array = self._lifts.copy()
+        p[[term.kind == "initial" for term in self.terms]] = self.level * self.model.X.free
         return p
 
     def advance(self, p: Array, now: Now, h: float) -> Array:
         """Return the responses a time h later, shape (terms, n)."""
-        loads = np.array([load(now) for load in self._loads])
-        lifts = np.array(self._lifts)
         # M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
         factor, rows = self.stage.linearised(now.u, now.q, h, now.moment)
-        known = (self.model.mass @ p.T).T / h + loads - (rows @ lifts.T).T
+        known = (self.model.mass @ p.T).T / h - (rows @ self._lifts.T).T
+        for k, term in enumerate(self.terms):
+            if term.load is not None:
+                known[k] += term.load(now)
         free = self.model.X.free
         solved: Array = factor.solve((known * free).T).T
-        return solved * free + lifts
+        found: Array = solved * free + self._lifts
+        return found
 
     def shown(self, p: Array, now: Now) -> Array:
         """Return the readings of the responses, shape (terms, sensors)."""
@@ -191,11 +180,8 @@ class Process:
         return np.asarray((H @ p.T).T)
 
 
-def _nothing(now: Now) -> Array:
-    return np.zeros(len(now.u))
-
-
-def _flux(shape: Array, level: float) -> Load:
+def _constant(shape: Array, level: float) -> Load:
+    """Return a load that is constant but for the usual interval between samples."""
     return lambda now: level / (REACH * now.unit) * shape
 
 
