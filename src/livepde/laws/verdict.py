@@ -105,8 +105,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     for label, place in reduction.stay:
         names[place] = label
     return Position(
-        ledger=x.ledger,
-        member=0,
+        ledger=x.ledger.of_member(0),
         moved=found,
         distance=_distance(reduction, x, a),
         sensors=problem.observed.names,

@@ -424,7 +424,8 @@ def _sounded(ledger: Ledger, due: Mask) -> Mask:
         return ledger.sound
     sound = ledger.sound.copy()
     for k in np.flatnonzero(ends).tolist():
-        sound[k] = quiet(ledger, k, causes_of(ledger, k).log_e)
+        one = ledger.of_member(k)
+        sound[k] = quiet(one, causes_of(one).log_e)
     return sound
 
 
