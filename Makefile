@@ -36,12 +36,12 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-fast test-system test-long test-all coverage mpi lowest versions package check format docs bench lock clean
+.PHONY: help demo test test-fast test-system test-long test-all coverage mpi lowest versions package check format docs bench experiment lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
 	@echo
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
 	@$(BIN)/livepde demo
@@ -55,7 +55,7 @@ test-fast: $(READY)  ## Run those that take a fraction of a second each
 test-system: $(READY)  ## Run those with programs of their own, brokers, browsers and pages
 	@$(BIN)/$(PYTEST) $(SYSTEM)
 
-test-long: $(READY)  ## Run those that take several seconds each
+test-long: $(READY)  ## Run those that take longer, which CI runs, too
 	@$(BIN)/$(PYTEST) $(LONG)
 
 test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too
@@ -106,9 +106,13 @@ docs: $(READY)  ## Build the documentation into site/
 	@$(BIN)/python docs/links.py
 	@echo "Built: site/index.html"
 
-NAME = step
+bench: NAME = step
 bench: $(READY)  ## Run a benchmark, as NAME="step --size 31"; without NAME what one step costs
 	@$(BIN)/python -m benchmarks $(NAME)
+
+experiment: NAME = --help
+experiment: $(READY)  ## Run a study, as NAME="degenerate --quick"; without NAME list them
+	@$(BIN)/python -m experiments $(NAME)
 
 lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
 	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
@@ -118,7 +122,7 @@ lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest ver
 clean:  ## Remove caches and build products (not .venv)
 	@rm -rf build dist site htmlcov .coverage .coverage.* .hypothesis
 	@rm -rf .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
-	@find src tests benchmarks -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+	@find src tests benchmarks experiments -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 # The stamp is younger than both files as long as the environment holds what they ask for.
 $(READY): pyproject.toml constraints.txt

@@ -206,7 +206,7 @@ def jobs_of(path: Path, pictures: Path | None = None, variants: bool = True) -> 
     jobs = [Job(path, figure=figure)]
     if not variants:
         return jobs
-    for variant in load(path, allow_code=True).variants:
+    for variant in load(path, allow_code=True).spec.variants:
         changed = dict(variant.set)
         for key, value in variant.reference.items():
             changed[f'reference."{key}"'] = value
@@ -228,7 +228,7 @@ def run_job(job: Job) -> Run:
         from livepde import plots
 
         plots.overview(data, title=case.title).savefig(job.figure, dpi=120)
-    variants = {variant.name: variant.expect for variant in case.variants}
+    variants = {variant.name: variant.expect for variant in case.spec.variants}
     space = case.model.parameter_space
     return Run(
         title=case.title,
@@ -296,7 +296,7 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
     """Return the run, the forward run, and the ratio of their times."""
     frozen = _Frozen()
     runs = [prepared.identifier, prepared.identifier_with(frozen)]
-    every = prepared.case.fields_every
+    every = prepared.case.spec.output.fields_every
     results = [
         Result(one.model, one.observed, one.withheld, every, layout=prepared.layout) for one in runs
     ]

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange import export_fmu
 from livepde.exchange.unit_process import UnitProcess, of_case
@@ -113,7 +113,7 @@ def compare_fmu(
     """
     if case.live:
         raise ConfigurationError(
-            f"{case.frame.path}: the unit is compared on the data of the case, and its source goes "
+            f"{case.path}: the unit is compared on the data of the case, and its source goes "
             "on: set another data.file."
         )
     prepared = case.prepare()

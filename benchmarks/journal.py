@@ -101,5 +101,7 @@ def _run(case: Path) -> tuple[Stopwatch, Stopwatch, int, int]:
             written.watch(kept, *WRITES)
             stepped.watch(identifier, "step")
             feed = SampleFeed(prepared.stream, identifier.observed.names)
-            Live(identifier, feed, kept, fields_every=loaded.fields_every, strict=True).run()
+            Live(
+                identifier, feed, kept, fields_every=loaded.spec.output.fields_every, strict=True
+            ).run()
         return written, stepped, stepped.calls, file.stat().st_size

@@ -188,7 +188,7 @@ def _run(loaded: Case, folder: Path, number: int) -> float:
             prepared.identifier,
             prepared.stream,
             progress=True,
-            fields_every=loaded.fields_every,
+            fields_every=loaded.spec.output.fields_every,
             journal=journal,
         )
         return (process_time() - begun) / len(driven.result)

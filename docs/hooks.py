@@ -2,6 +2,7 @@
 
 <!-- command line -->             the help of all commands
 <!-- benchmarks -->               the help of all benchmarks
+<!-- experiments -->              the help of all studies
 <!-- keys of a case -->           tables of all keys of a case file
 <!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
 """
@@ -55,6 +56,11 @@ def benchmarks() -> str:
     return command_line("benchmarks.__main__", "python -m benchmarks")
 
 
+def experiments() -> str:
+    """Return the help of all studies."""
+    return command_line("experiments.__main__", "python -m experiments")
+
+
 def members(room: str) -> str:
     """Return a directive for mkdocstrings that shows what only this room exports."""
     names = [name for name in import_module(room).__all__ if name not in livepde.__all__]
@@ -75,7 +81,9 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
     kind = model["properties"].get("kind", {}).get("const")
     if kind:
         title += f", `kind = {json.dumps(kind)}`"
-    yield f"## {title}\n\n{model['description']}\n\n| key | value | default |\n|---|---|---|"
+    about, meanings = _documented(model["description"])
+    columns = ["key", "value", "default", *(["meaning"] if meanings else [])]
+    yield f"## {title}\n\n{about}\n\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
     needed = model.get("required", ())
     inner: list[tuple[str, str]] = []
     for key, value in model["properties"].items():
@@ -85,11 +93,23 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
             "" if default in ("null", "[]", '""') or "default" not in value else f"`{default}`"
         )
         words = f"a table: name = {BOUND}" if key == "expect" else _alternatives(value)
-        yield f"| `{key}` | {words} | {'required' if key in needed else default} |"
+        cells = [f"`{key}`", words, "required" if key in needed else default]
+        yield f"| {' | '.join([*cells, *([meanings[key]] if meanings else [])])} |"
         inner += _tables(name, value)
     yield ""
     for where, found in inner:
         yield from _section(where, models[found], models)
+
+
+def _documented(text: str) -> tuple[str, dict[str, str]]:
+    """Return the summary of a docstring, and parameter -> its meaning.
+
+    Options of a law are documented where they are declared, and only there.
+    """
+    summary = text.partition("\n\n")[0].replace("\n", " ")
+    listed = re.search(r"^Parameters\n-+\n(.*?)(?:\n\n|\Z)", text, flags=re.DOTALL | re.MULTILINE)
+    items = re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed[1] if listed else "", flags=re.MULTILINE)
+    return summary, {name: " ".join(meaning.split()) for name, meaning in items}
 
 
 def _alternatives(value: Schema) -> str:
@@ -151,5 +171,6 @@ SIMPLE = {
 WRITERS = {
     "<!-- command line -->": command_line,
     "<!-- benchmarks -->": benchmarks,
+    "<!-- experiments -->": experiments,
     "<!-- keys of a case -->": keys_of_a_case,
 }

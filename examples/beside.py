@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from livepde.cases import Wiring, load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.result import Estimate
 from livepde.runs import Sink
 from livepde.streams import Rows

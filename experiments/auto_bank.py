@@ -6,7 +6,7 @@ times it, or none. The viscosity that wanders is not said to: its evolution is t
 model. Of the constant unknowns the fit of all data with hindsight is printed as well. Medians over
 seeds; the share of 95 % intervals that hold the truth; processor time over that of the plain law.
 
-    python experiments/auto_bank.py [--quick] [problem ...]
+    python -m experiments.auto_bank [--quick] [problem ...]
 
 --quick: one seed, 1 and 10 % noise, the right noise level and three drifts in the grid.
 """
@@ -16,12 +16,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from time import process_time
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # the benchmarks are not installed
 
 import livepde as lp
 from benchmarks.accuracy import run_law
@@ -55,7 +52,7 @@ def data_of(problem: Problem, level: float, seed: int) -> Data:
     return replace(data, process=replace(data.process, model=model))
 
 
-def try_out(data: Data, law: lp.laws.Law, noise: float | None = 1.0) -> Tried:
+def try_out(data: Data, law: lp.laws.AnyLaw, noise: float | None = 1.0) -> Tried:
     """Run a law that is told a multiple of the noise level, or nothing."""
     told = None if noise is None else (noise * data.noise).tolist()
     start = process_time()

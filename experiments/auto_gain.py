@@ -7,9 +7,9 @@ grid, with Tikhonov in the V~ norm by the discrepancy principle with the exact l
 relative L2 errors of q after the last sample, t = 60; q = 0 has 1. The prior deviation of `seed` is
 0.01, that of `seed-excited` 1.
 
-    python experiments/auto_gain.py
+    python -m experiments.auto_gain
 
-takes the seeds 100 to 109 and about a quarter of an hour; `python experiments/auto_gain.py seed 100
+takes the seeds 100 to 109 and about a quarter of an hour; `python -m experiments.auto_gain seed 100
 101` runs one example with these seeds.
 """
 
@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 
+from experiments.seed_excited_noise import WhiteNoise
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.observation import Discrepancy, Full, Subdomain, Tikhonov
-from livepde.reproduce import noisy, seed, seed_excited
+from livepde.reproduce import seed, seed_excited
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
@@ -73,7 +74,7 @@ def compare(name: str, level: float, number: int) -> tuple[float, float]:
         u_true=module.u_true,
         times=module.TIMES,
     )
-    samples = list(noisy.WhiteNoise(twin, level, number) if level else twin)
+    samples = list(WhiteNoise(twin, level, number) if level else twin)
     sensors = smoothed(observation, level) if level else observation
 
     def u0(x: Any) -> Any:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -29,11 +29,13 @@ class Forward:
     def __init__(self, name: str, settings: Mapping[str, Any]) -> None:
         self.case = case = load(CASES / f"{name}.toml", allow_code=True, settings=settings)
         self.prepared, self.model = case.prepare(), case.model
-        samples = list(self.prepared.stream)
+        readings: list[tuple[float, dict[str, Any]]] = [
+            (sample.t, dict(cast("Mapping[str, Any]", sample.z))) for sample in self.prepared.stream
+        ]
         spaces = self.model.state_space, self.model.X, self.model.parameter_space
         self.observed = case.observation.bind(*spaces)
-        self.z = np.array([[s.z[name] for name in self.observed.names] for s in samples])
-        self.inputs = {s.t: dict(s.z) for s in samples}
+        self.z = np.array([[z[name] for name in self.observed.names] for _, z in readings])
+        self.inputs = dict(readings)
 
     def __call__(self, numbers: Mapping[str, Any], u0: Any = None) -> np.ndarray:
         """Return predictions, shape (times, sensors)."""
@@ -55,7 +57,7 @@ def fit(
         return misses[np.isfinite(misses)]
 
     scale = np.abs(start)
-    found = least_squares(finite, start, bounds=(low, high), x_scale=scale, diff_step=1e-5)
+    found = least_squares(finite, start, bounds=(low, high), x_scale=scale, diff_step=[1e-5])
     return found.x, float(np.sqrt(np.mean(found.fun**2)))
 
 

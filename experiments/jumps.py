@@ -1,6 +1,6 @@
 """What a law has to forget to follow a jump: a diffusivity that rises by a fifth at t = 20.
 
-python experiments/jumps.py
+python -m experiments.jumps
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.stepping import ForwardStage
@@ -25,8 +24,8 @@ POINTS = [0.25, 0.5, 0.75]
 
 def rod(a: lp.fem.Unknown) -> lp.Model:
     """Return a rod whose left end swings."""
-    ends = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
-    state = lp.Field(MESH, ElementLineP1(), dirichlet=ends)
+    ends: dict[str, Any] = {"left": lambda x, t: np.sin(3 * t) + 0.0 * x[0], "right": 0.0}
+    state = lp.Field(MESH, lp.fem.linear(MESH), dirichlet=ends)
     return lp.Model(state, {"a": a}, A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)))
 
 

@@ -107,7 +107,8 @@ def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Foun
     )
     spaces = Spaces(model, twin.observed)
     c = constants(spaces, twin.q, twin.states[::10], gain=gain)
-    nothing = Errors(0.0, 0.0, *([Norms()] * 4), Pu=0.0, rate=0.0, theta=0.0)
+    zero = Norms()
+    nothing = Errors(0.0, 0.0, r=zero, p=zero, d=zero, r_alpha=zero, Pu=0.0, rate=0.0, theta=0.0)
     rules: dict[str, tuple[lp.laws.Damping, bool]] = {
         "c1 alone (ResidualDamping)": (lp.laws.ResidualDamping(1.0), False),
         "ExactBound, ||p|| <= 0.01": (ExactBound(c, 0.01, 1.0, FLOOR), False),

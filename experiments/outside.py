@@ -10,7 +10,7 @@ mean width of the intervals as a share of the prior's. The rows named "informed"
 number of directions, but those of which all data tell most instead of the leading modes of the
 prior: they are taken from the posterior of a run with all modes, with hindsight.
 
-    python experiments/outside.py 20
+    python -m experiments.outside 20
 
 runs seeds 0 to 19.
 """
@@ -163,9 +163,9 @@ def informed(belief: Belief, model: Model, count: int) -> Array:
 
 def run(data: Data, law: AnyLaw, noisy: bool = True) -> Identifier:
     """Return the identifier after all samples."""
-    smoothing = {"reconstruction": Tikhonov("V", Discrepancy(1.0))}
-    options = smoothing if noisy and isinstance(law, GradientLaw) else {}
-    seen = Subdomain(omega, noise=data.noise, **options)
+    seen = Subdomain(omega, noise=data.noise)
+    if noisy and isinstance(law, GradientLaw):
+        seen = replace(seen, reconstruction=Tikhonov("V", Discrepancy(1.0)))
     identifier = Identifier(data.model, seen, law, u0=0.0, scheme=Alexander2())
     for t, z in zip(TIMES, data.z if noisy else data.exact, strict=True):
         identifier.step(float(t), z)

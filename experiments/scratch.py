@@ -11,7 +11,8 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from batch import Forward, fit
+
+from experiments.batch import Forward, fit
 
 
 def main() -> None:
@@ -32,7 +33,10 @@ def main() -> None:
         def free(p: Any, z: Any = z) -> Any:
             return z - known(p, lambda x: np.interp(x[0], places, p[2:]))
 
-        fits = {"as measured": fit(lambda p, z=z: (z - known(p))[1:], guess)}
+        def plain(p: Any, z: Any = z) -> Any:
+            return (z - known(p))[1:]
+
+        fits = {"as measured": fit(plain, guess)}
         if equation == "fisher_kpp":
             fits["weighted"] = fit(weighted, guess)
             fits["fitted, too"] = fit(free, [*guess, *np.maximum(z[0], 1.0)])

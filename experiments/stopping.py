@@ -18,6 +18,7 @@ from livepde.reproduce import seed_excited as excited
 from livepde.streams import RelativeNoise, Twin
 
 SEEDS = range(5)
+GAIN = 1000.0
 WITHIN = 2.0
 
 
@@ -70,7 +71,7 @@ def twin(setting: Setting, seed: int, samples: int) -> Twin:
 def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float, float]:
     """Return (T*, its surrogate) of one seed; infinity if not reached."""
     data = twin(setting, seed, samples or setting.samples)
-    law = lp.GradientLaw(gain=1000.0, damping=lp.laws.ResidualDamping(setting.c1))
+    law = lp.GradientLaw(gain=GAIN, damping=lp.laws.ResidualDamping(setting.c1))
     identifier = lp.Identifier(data.model, data.observation, law, q0=0.0, u0=0.0)
     noise = RelativeNoise(setting.level)
     online = OnlineTracker(identifier, 0.1, noise=lambda z: noise.std(z, data.weights))
@@ -79,7 +80,7 @@ def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float,
         estimate = identifier.step(sample.t, sample.z)
         online.add(estimate, sample)
         truth.add(estimate, sample.z)
-    c = constants(online.spaces, data.q, data.states[::20], gain=law.gain)
+    c = constants(online.spaces, data.q, data.states[::20], gain=GAIN)
     return stopping_time(truth.errors, c), online.stopping(c).T
 
 

@@ -48,6 +48,13 @@ def server(tmp_path):
 
 
 @pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Work in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def logs():
     """Leave logging as it was."""
     root = logging.getLogger()

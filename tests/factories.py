@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from skfem import (
 )
 
 import livepde as lp
+from livepde.cases.new_case import write_template
 from livepde.stepping import ForwardStage, advance
 
 
@@ -168,6 +170,11 @@ def advanced(
     return u
 
 
+def filter_alone(**options: Any) -> lp.SensitivityLaw:
+    """Return a sensitivity law without its iterated start, shadows and verdict, for speed."""
+    return lp.SensitivityLaw(**{"start_window": 0, "shadows": None, "verdict": False, **options})
+
+
 def observe(model: lp.Model, observation: lp.observation.Observation) -> Any:
     return observation.bind(model.state_space, model.X, model.parameter_space)
 
@@ -194,6 +201,16 @@ def readings(
         u = advanced(forward, u, lambda t: np.array([q(t)]), t0, t1, scheme)
         found.append((t1, observed.G @ u + noise * rng.standard_normal(observed.size)))
     return found
+
+
+def short_rod(folder: Path, samples: int = 61, replay: bool = False) -> Path:
+    """Write the case of `livepde init` with its first samples, and without the replays."""
+    case, data = write_template(folder)
+    rows = data.read_text().splitlines()[: samples + 1]
+    data.write_text("\n".join(rows) + "\n")
+    if not replay:
+        case.write_text(case.read_text().replace("replay = true", "replay = false"))
+    return case
 
 
 # A rod in a case file, ready for its [channels].

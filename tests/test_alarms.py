@@ -17,13 +17,13 @@ import livepde as lp
 from benchmarks import alarms
 from benchmarks.__main__ import app as benchmarks
 from livepde import cases, runs
-from livepde.cases.template import NOISE, TRUE_ALPHA, write_template
+from livepde.cases.new_case import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
 from livepde.diagnostics import identifiability
 from livepde.models import heat
 from livepde.runs import doubts, measures, tables
 
-JUMP, CHANGE, END = 4000.0, 1.3, 7200.0
+JUMP, CHANGE, END = 2400.0, 1.3, 4400.0
 
 
 def ends(t: float) -> dict[str, float]:
@@ -32,7 +32,7 @@ def ends(t: float) -> dict[str, float]:
 
 @cache
 def rows(change: float) -> str:
-    """Return the data of the template's rod, whose diffusivity changes after 4000 s."""
+    """Return the data of the template's rod, whose diffusivity changes after 2400 s."""
     values = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
     model = heat(lp.interval(0.0, 0.4, 40), lp.Normal(TRUE_ALPHA), values)
     points = lp.Points({"T_10": 0.1, "T_20": 0.2, "T_30": 0.3})

@@ -12,7 +12,7 @@ from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.cases import load
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.laws import MemberReports
 from livepde.laws.guess import GUESSED, PATIENCE, first_guess
 
@@ -78,13 +78,13 @@ def moving() -> list[tuple[float, Any]]:
 
 @cache
 def still() -> list[tuple[float, Any]]:
-    return samples(stays, 400)
+    return samples(stays, 250)
 
 
 @cache
-def bank_moving(noise: float | None = NOISE) -> list[lp.Estimate]:
+def bank_moving(noise: float | None = NOISE, count: int = 400) -> list[lp.Estimate]:
     """Return the estimates of the bank for the unknown that moves."""
-    return run(build(noise=noise), moving())
+    return run(build(noise=noise), moving()[:count])
 
 
 @cache
@@ -199,11 +199,11 @@ def test_guesses_of_the_noise():
 )
 def test_units_scale_out(unit: dict[str, float], noise: float | None):
     u, x, t = (unit.get(name, 1.0) for name in "uxt")
-    stream = moving()[:150]
+    stream = moving()[:60]
     points = [x * at for at in POINTS]
     scaled = build(None, rod(**unit), noise and u * noise, points=points)
     other = run(scaled, [(t * time, u * z) for time, z in stream])
-    for mine, theirs in zip(bank_moving(noise)[:150], other, strict=True):
+    for mine, theirs in zip(bank_moving(noise, 60), other, strict=True):
         for k in range(2):
             ours, its = mine.parameters["a"][k], theirs.parameters["a"][k] * t / x**2
             assert its == pytest.approx(ours, rel=1e-6)
@@ -242,23 +242,23 @@ def test_the_mesh_hardly_matters():
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_it_keeps_the_contract_of_a_law(noise: float | None):
     lp.diagnostics.check_law(
-        lp.AutoLaw(), lambda law: build(law, noise=noise), still()[:30]
+        lp.AutoLaw(), lambda law: build(law, noise=noise), still()[:15]
     ).raise_if_failed()
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("noise", [NOISE, None])
 def test_a_resumed_run_gives_the_same_numbers(noise: float | None, tmp_path: Any):
-    """Saved before, at and after a replay, as often as the run goes on from there."""
-    stops, first = (5, 45, 100, 120), build(noise=noise)
+    """Saved before, at and after a replay, and when members may sleep."""
+    stops, first = (5, 45, 70), build(noise=noise)
     for begin, stop in pairwise((0, *stops)):
         run(first, still()[begin:stop])
         first.save(tmp_path / f"{stop}.bin")
-    expected = run(build(noise=noise), still()[:140])[-1]
+    expected = run(build(noise=noise), still()[:90])[-1]
     for stop in stops:
         second = build(noise=noise)
         second.load(tmp_path / f"{stop}.bin")
-        found = run(second, still()[stop:140])[-1]
+        found = run(second, still()[stop:90])[-1]
         np.testing.assert_array_equal(found.q, expected.q)
         np.testing.assert_array_equal(found.u, expected.u)
         assert found.belief.q_factor is not None
@@ -311,7 +311,7 @@ def test_a_step_that_fails_for_all_changes_nothing(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.long
 def test_an_unknown_with_an_evolution_of_its_own_keeps_it():
-    found = run(build(model=rod(evolution=lp.RandomWalk(0.05))), moving())
+    found = run(build(model=rod(evolution=lp.RandomWalk(0.05))), moving()[:200])
     assert found[0].diagnostics.awake == 2
     assert missed(found, wandering) < 0.02
 
@@ -337,7 +337,7 @@ def test_a_window_that_is_full_begins_anew():
 
 @pytest.mark.long
 def test_the_first_interval_may_be_of_any_length():
-    late, nothing = moving()[100:250], np.full(len(POINTS), np.nan)
+    late, nothing = moving()[100:180], np.full(len(POINTS), np.nan)
     (value, std), *others = (
         run(build(dt_max=0.05), [*early, *late])[-1].parameters["a"]
         for early in ([(t, nothing) for t, _ in moving()[:100]], [], [(1e-6, nothing)])

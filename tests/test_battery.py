@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
@@ -132,7 +133,7 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         seed=2,
         scheme=lp.SensitivityLaw.scheme,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=16))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=16), shadows=None)
     identifier = lp.Identifier(model, sensor, law, u0=START)
     for sample in twin:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
@@ -155,7 +156,7 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
         inputs=("I",),
         noise=noise,
     )
-    observed = voltage.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, voltage)
     identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, hold=True)
     rng = np.random.default_rng(0)
     c = model.initial(START)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from benchmarks import cases as bench
 from benchmarks.__main__ import app
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 
 pytestmark = pytest.mark.study
 

@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +170,9 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_soak_in_small(monkeypatch):
+    law = partial(lp.SensitivityLaw, start_window=4)  # an iterated start takes most of the time
+    law.scheme = lp.SensitivityLaw.scheme
+    monkeypatch.setattr(soak, "SensitivityLaw", law)
     monkeypatch.setattr(soak, "WARM", 200)
     monkeypatch.setattr(soak, "BLOCK", 100)
     outcome = soak.soak(700)

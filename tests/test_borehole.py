@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import exp1
@@ -139,7 +140,7 @@ def test_a_twin_finds_conductivity_and_resistance():
         seed=3,
         **steps,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=16))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=16), shadows=None)
     identifier = lp.Identifier(process, sensor, law, u0=10.0, **steps)
     for sample in twin:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
@@ -196,9 +197,7 @@ def fluid(process: lp.Model, times: Any) -> float:
     heated = lambda t: {"Q": POWER}  # noqa: E731
     start = process.initial_parameter(TRUTH)
     *_, (_, u) = simulate(process, start, 10.0, times, Advance(Alexander2()), heated)
-    sensor = lp.Averages({"T": "left"}).bind(
-        process.state_space, process.X, process.parameter_space
-    )
+    sensor = observe(process, lp.Averages({"T": "left"}))
     moment = lp.fem.Moment(float(times[-1]), heated(0.0))
     return float(sensor.predict(u, process.latent.value(start), moment)[0])
 
@@ -309,12 +308,10 @@ T_fluid = { role = "sensor", column = "T", unit = "degC", over = "left", noise =
 @pytest.mark.parametrize("finite", [True, False])
 def test_a_short_borehole_from_a_case(tmp_path: Path, finite: bool) -> None:
     """Its ends cool it: a case of radius and height finds k, one of the radius alone does not."""
-    times = np.concatenate([[0.0], np.geomspace(300.0, 150 * HOUR, 60)])
+    times = np.concatenate([[0.0], np.geomspace(300.0, 150 * HOUR, 40)])
     process, advance = plane(cells=60), Advance(Alexander2())
     start = process.initial_parameter(TRUTH)
-    sensor = lp.Averages({"T": "left"}).bind(
-        process.state_space, process.X, process.parameter_space
-    )
+    sensor = observe(process, lp.Averages({"T": "left"}))
     heated, q = lp.fem.Moment(0.0, {"Q": POWER}), process.latent.value(start)
     states = simulate(process, start, 10.0, times, advance, lambda t: {"Q": POWER})
     noise = np.random.default_rng(3).normal(0.0, 0.01, len(times))

@@ -16,12 +16,12 @@ from pathlib import Path
 import pytest
 import xarray as xr
 from commands import bad, bench, call, estimates, shell, until
+from factories import short_rod
 from patience import PATIENCE
 from typer.testing import CliRunner
 
 import livepde
 from livepde import cli, runs
-from livepde.cases.template import write_template
 from livepde.runs import Check, Outcome, Table
 
 COMMANDS = (
@@ -41,17 +41,9 @@ COMMANDS = (
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Work in an empty folder."""
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
 def rod(here):
-    """The case of `livepde init` without its replays, which take most of the time."""
-    path, _ = write_template(here / "rod")
-    path.write_text(path.read_text().replace("replay = true", "replay = false"))
+    """The case of `livepde init`, short."""
+    short_rod(here / "rod")
     return "rod/case.toml"
 
 
@@ -117,16 +109,16 @@ def test_equations(here):
 
 @pytest.mark.long
 def test_values_set_from_outside(rod, here, monkeypatch):
-    setting = ("--set", "data.every=9", "--set", "title=Thin")
+    setting = ("--set", "data.every=3", "--set", "title=Thin")
     assert call("check", rod, *setting)[1].startswith("Thin")
     monkeypatch.setattr(sys, "argv", ["livepde", "run", rod, *setting])
     code, output = call("run", rod, *setting)
     assert code == 0
     assert "21 samples" in output
     folder = here / "runs" / "rod"
-    assert "every = 9" in (folder / "case.toml").read_text()
+    assert "every = 3" in (folder / "case.toml").read_text()
     assert json.loads((folder / "run.json").read_text())["settings"] == [
-        "data.every=9",
+        "data.every=3",
         "title=Thin",
     ]
     code, output = call("report", "runs/rod", "--theory", "--json")
@@ -227,7 +219,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
     text = text.replace(
         "# by layer:", 'regions = { near = [0, "39 cm"], far = ["39 cm", "40 cm"] }\n#'
     )
-    text = text.replace('"0.05 K"', '"5 K"')
+    text = text.replace('"0.05 K"', '"1 K"')
     path.write_text(text)
     code, output = call("check", rod)
     assert code == 0
@@ -246,7 +238,7 @@ def test_check_shows_notes_and_failures(rod, monkeypatch):
     from livepde import diagnostics
 
     report = diagnostics.CheckReport(
-        "model", (diagnostics.CheckLine.at_most("transpose", 1.0, 1e-12, "mend it"),)
+        "model", (diagnostics.Check.at_most("transpose", 1.0, 1e-12, "mend it"),)
     )
     monkeypatch.setattr(diagnostics, "check_model", lambda *_, **__: report)
     code, output = call("check", rod)
@@ -318,9 +310,9 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     shutil.copytree("whole", "cut")
     with closing(sqlite3.connect("cut/journal.sqlite")) as journal, journal:
         journal.execute("DELETE FROM checkpoints")
-        journal.execute("DELETE FROM samples WHERE id > 60")
-        journal.execute("DELETE FROM estimates WHERE id > 59")
-        journal.execute("DELETE FROM fields WHERE id > 59")
+        journal.execute("DELETE FROM samples WHERE id > 20")
+        journal.execute("DELETE FROM estimates WHERE id > 19")
+        journal.execute("DELETE FROM fields WHERE id > 19")
     journal.close()
     assert call("run", rod, "--out", "cut", "--resume")[0] == 0
     xr.testing.assert_identical(runs.open("cut").dataset, whole)

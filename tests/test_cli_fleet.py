@@ -20,7 +20,7 @@ from patience import PATIENCE
 
 from livepde import Fleet, cases, runs
 from livepde.cases import members_together
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
 from livepde.runs import JOURNAL, Journal
@@ -278,10 +278,12 @@ def workers(parent: int) -> list[int]:
 
 @pytest.fixture
 def longer(alike):
-    """Data that take a while: of twenty times as many samples."""
+    """Data that take a while: of eight times as many samples."""
+    case = Path("rod/case.toml")
+    case.write_text(case.read_text().replace("replay = false", "replay = false\nshadows = false"))
     for path in (Path("rod/rod.csv"), Path("rod/other.csv"), Path("rod/third.csv")):
         table = pd.read_csv(path)
-        table = pd.concat([table] * 20, ignore_index=True)
+        table = pd.concat([table] * 8, ignore_index=True)
         table[table.columns[0]] = 20.0 * np.arange(len(table))
         table.to_csv(path, index=False)
     Path("rods.csv").write_text(ALIKE + "d,rod/third.csv,\n")

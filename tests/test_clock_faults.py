@@ -63,11 +63,12 @@ def test_a_row_days_ahead_of_fast_ones_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("wrong", [1, 2, AGREE])
-@pytest.mark.parametrize("step", [0.1, 1000.0])
+@pytest.mark.parametrize(
+    ("wrong", "step"), [(1, 0.1), (2, 0.1), (2, 1000.0), (AGREE, 0.1), (AGREE, 1000.0)]
+)
 def test_rows_far_ahead_that_agree_are_taken_back(tmp_path, wrong, step):
     """As if they had never come: the estimates are those of the right rows, bit by bit."""
-    given = right(80)
+    given = right(50)
     ahead = moved(given[30 : 30 + wrong], 3650 * DAY)
     ahead = [{**row, "t": row["t"] + step * k} for k, row in enumerate(ahead)]
     run = run_of(tmp_path, [*given[:30], *ahead, *given[30:]])
@@ -186,11 +187,11 @@ def test_the_hour_that_clocks_show_twice(tmp_path):
 
 @pytest.mark.slow
 def test_the_hour_twice_without_a_zone_is_a_clock_set_back(tmp_path):
-    given = right(400)
-    given[200:] = moved(given[200:], -10.0)
+    given = right(200)
+    given[100:] = moved(given[100:], -10.0)
     run = run_of(tmp_path, given)
     run.run()
-    assert len(run.journal) == 400
+    assert len(run.journal) == 200
     assert told(run) == ["clock"]
 
 

@@ -174,8 +174,8 @@ def test_conditions_of_a_case_are_numbers_and_channels_too(tmp_path: Path) -> No
     case = load(file)
     assert tuple(case.model.parameter_space.labels) == ("k", "h")
     assert set(case.model.inputs) == {"P", "T_air"}
-    assert case.frame.unit("T_air") == "degC"
-    assert case.frame.unit("P") == "W/m^3"
+    assert case.unit("T_air") == "degC"
+    assert case.unit("P") == "W/m^3"
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_sensors_from_a_table_of_positions(tmp_path: Path) -> None:
     sensor = CASE[CASE.index("T1 =") : CASE.index("T_cold")]
     table = 'T = { role = "sensor", positions = "places.csv", noise = "0.1 K" }\n'
     (tmp_path / "places.csv").write_text("name,x\nT1,0.005\nT2,50 mm\n")
-    places = load(changed(tmp_path, (sensor, table))).frame.spec.channels
+    places = load(changed(tmp_path, (sensor, table))).spec.channels
     assert {name: item.at for name, item in places.items() if item.role == "sensor"} == {
         "T1": 0.005,
         "T2": 0.05,
@@ -266,7 +266,7 @@ def test_a_source_with_a_constant_input_is_assembled_once() -> None:
         field,
         {"a": lp.Normal()},
         A=lambda q, u, v, x: q.a * u * v,
-        f=lp.On("left", lambda x, t: x.inputs["Q"]),
+        f=lp.On("left", lambda x, _: x.inputs["Q"]),
         inputs=["Q"],
     )
     assert source.with_constant_inputs({"Q": 2.0}).form_F.constant

@@ -28,8 +28,8 @@ def rod(cells: int = 20, **options: Any) -> lp.Model:
         "A": lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         "B": lambda u, v, x: 2000.0 * u * v,
         "f": [
-            lambda x, t: 2000.0 * x.inputs["room"],
-            lp.On("left", lambda x, t: 60e3 * x.inputs["heater"]),
+            lambda x, _: 2000.0 * x.inputs["room"],
+            lp.On("left", lambda x, _: 60e3 * x.inputs["heater"]),
         ],
         **options,
     }
@@ -49,7 +49,12 @@ GOAL = ct.Goal(track={"tip": 1.0}, move={"heater": 500.0}, inputs={"heater": (0.
 
 
 def identifier(**options: Any) -> lp.Identifier:
-    given = {"law": lp.SensitivityLaw(), "hold": True, "scheme": lp.Alexander2(), **options}
+    given = {
+        "law": lp.SensitivityLaw(start_window=4, shadows=None),
+        "hold": True,
+        "scheme": lp.Alexander2(),
+        **options,
+    }
     return lp.Identifier(rod(), SENSORS, u0=ROOM, **given)
 
 
@@ -144,7 +149,7 @@ def test_a_boundary_value_may_be_a_control_that_jumps():
     [
         ({"f": lambda x, t: 1.0 + np.sin(t)}, "reads the time"),
         ({"B": lambda u, v, x: x.inputs["heater"] * u * v}, "multiplies the state"),
-        ({"f": lambda x, t: x.inputs["heater"] ** 2}, "not linear in its input channels"),
+        ({"f": lambda x, _: x.inputs["heater"] ** 2}, "not linear in its input channels"),
         (
             {"A": lambda q, u, v, x: (q.k + q.k**2) * lp.dot(lp.grad(u), lp.grad(v))},
             "not linear in its unknown numbers",
@@ -170,8 +175,8 @@ def test_a_nonlinear_model_is_linearised_where_it_is_said():
 def test_the_error_is_relative_to_the_largest_response_to_any_control():
     """In five seconds a weak heater does not reach the tip; the room does."""
     sources = [
-        lambda x, t: 2000.0 * x.inputs["room"],
-        lp.On("left", lambda x, t: 0.06 * x.inputs["heater"]),
+        lambda x, _: 2000.0 * x.inputs["room"],
+        lp.On("left", lambda x, _: 0.06 * x.inputs["heater"]),
     ]
     missed = [
         ct.reduce(rod(f=sources), OUTPUTS, controls, modes=1).error(h=1.0, samples=5)["tip"]
@@ -415,9 +420,9 @@ def test_the_target_meets_the_reference_or_stays_within_the_range():
 def test_a_control_does_the_work_of_another_that_is_at_its_end():
     """The best steady state within the ranges, found by trying all of them."""
     sources = [
-        lambda x, t: 2000.0 * x.inputs["room"],
-        lp.On("left", lambda x, t: 60e3 * x.inputs["heater"]),
-        lp.On("right", lambda x, t: 60e3 * x.inputs["second"]),
+        lambda x, _: 2000.0 * x.inputs["room"],
+        lp.On("left", lambda x, _: 60e3 * x.inputs["heater"]),
+        lp.On("right", lambda x, _: 60e3 * x.inputs["second"]),
     ]
     model = rod(f=sources, inputs=["heater", "second", "room"])
     small = ct.reduce(model, OUTPUTS, ["heater", "second"], sensors=SENSORS, u=ROOM)

@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import cards, cuts, field_views, figures, panels, serve, times
+from livepde.dashboard import canvas, cards, cuts, field_views, panels, serve
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
 from livepde.models import heat
@@ -148,7 +148,7 @@ def test_looking_back_shows_the_fields_of_then():
 @pytest.mark.slow
 def test_unknowns_are_drawn_with_their_intervals():
     data = dataset(count=9)
-    figure = figures.unknowns(data, ["loss"])
+    figure = panels.unknowns(data, ["loss"])
     (line,) = (trace for trace in figure.data if trace.name == "loss")
     band = [trace.y for trace in figure.data if trace.legendgroup == "loss" and trace is not line]
     assert np.array_equal(line.y, data["loss"])
@@ -159,11 +159,11 @@ def test_unknowns_are_drawn_with_their_intervals():
 @pytest.mark.slow
 def test_dates_where_the_run_has_an_origin():
     data = dataset()
-    assert times.when_axis(data).text(0.6) == "0.6 s"
+    assert canvas.when_axis(data).text(0.6) == "0.6 s"
     data.attrs["origin"] = "2025-04-01 00:00:00"
-    assert times.when_axis(data).text(3600.0) == "2025-04-01 01:00:00"
+    assert canvas.when_axis(data).text(3600.0) == "2025-04-01 01:00:00"
     data["time"] = data["time"] * 1e300
-    assert not times.when_axis(data).dates
+    assert not canvas.when_axis(data).dates
 
 
 @pytest.mark.slow
@@ -171,9 +171,9 @@ def test_long_series_are_thinned_but_failures_stay():
     data = dataset(count=4)
     long = data.isel(time=np.zeros(20_000, dtype=int), snapshot=[0])
     long["status"].values[777] = 1
-    (line,) = (t for t in figures.unknowns(long, ["loss"]).data if t.name == "loss")
-    assert len(line.y) <= figures.MOST_POINTS + 1
-    assert "failed step" in {trace.name for trace in figures.unknowns(long, ["loss"]).data}
+    (line,) = (t for t in panels.unknowns(long, ["loss"]).data if t.name == "loss")
+    assert len(line.y) <= panels.MOST_POINTS + 1
+    assert "failed step" in {trace.name for trace in panels.unknowns(long, ["loss"]).data}
 
 
 @pytest.mark.slow
@@ -181,8 +181,8 @@ def test_names_from_files_are_text_in_figures():
     data = dataset().rename({"loss": HOSTILE, "loss_std": f"{HOSTILE}_std"})
     data["sensor"] = [HOSTILE]
     drawn = [
-        figures.residuals(data, "innovation", "sensor"),
-        figures.unknowns(data, [HOSTILE, HOSTILE]),
+        panels.residuals(data, "innovation", "sensor"),
+        panels.unknowns(data, [HOSTILE, HOSTILE]),
     ]
     for figure in drawn:
         names = [trace.name for trace in figure.data if "document" in (trace.name or "")]

@@ -12,7 +12,7 @@ from skfem import ElementLineHermite, ElementLineP1
 
 import livepde as lp
 from livepde.diagnostics import (
-    CheckLine,
+    Check,
     CheckReport,
     check_law,
     check_model,
@@ -215,12 +215,12 @@ def test_a_law_needs_some_samples():
 
 
 def test_reports_are_read_by_people():
-    bad = CheckLine.at_most("P P = P", 0.5, 1e-12, "make it a projection.")
+    bad = Check.at_most("P P = P", 0.5, 1e-12, "make it a projection.")
     report = CheckReport("observation", (bad,))
     assert "FAIL" in str(report)
     assert "make it a projection." in str(report)
-    assert not CheckLine.at_most("x", np.nan, 1.0, "").ok
-    assert not CheckLine.at_least("x", np.nan, 1.0, "").ok
+    assert not Check.at_most("x", np.nan, 1.0, "").ok
+    assert not Check.at_least("x", np.nan, 1.0, "").ok
 
 
 def test_hermite_models_at_the_users_scale():

@@ -9,14 +9,14 @@ import pytest
 from skfem import ElementHex1, ElementLineHermite, ElementQuadBFS, ElementTriP2, MeshHex, MeshTri
 
 import livepde as lp
+from experiments import dimensions
 from livepde.fem import Moment, box, quadratic, smooth
-from livepde.reproduce import EXPERIMENTS, dimensions
 from livepde.runs.outcome import Outcome
 
 
 @pytest.fixture(scope="module", params=["discrete", "analytic"])
 def outcome(request) -> Outcome:
-    return EXPERIMENTS["dimensions"].run(request.param)
+    return dimensions.dimensions(request.param)
 
 
 @pytest.mark.study

@@ -1,4 +1,4 @@
-"""The law beside the independent implementation of the paper's method: `reproduce exact`.
+"""The law beside the independent implementation of the paper's method: the study `exact`.
 
 A part of the settings, meshes and rules of the experiment, with the bounds of all of it.
 """
@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from factories import observe
 
+from experiments import exact, reference
+from experiments.reference_settings import SETTINGS
 from livepde import paper
-from livepde.reproduce import EXPERIMENTS, exact, reference
-from livepde.reproduce.reference_settings import SETTINGS
 
 pytestmark = pytest.mark.study
 
@@ -41,7 +42,7 @@ def test_law_and_reference_have_the_same_data():
         np.testing.assert_array_equal(samples.z, run.Z[:, columns])
         np.testing.assert_array_equal(samples.loads, run.F)
         model, observation = samples.build()
-        observed = observation.bind(model.state_space, model.X, model.parameter_space)
+        observed = observe(model, observation)
         np.testing.assert_array_equal(observed.G @ run.Z[2], samples.z[2])
         mass = model.mass.toarray()[np.ix_(samples.at.X.free, samples.at.X.free)]
         np.testing.assert_allclose(mass, samples.at.M, atol=1e-15)
@@ -87,10 +88,9 @@ def test_nu_and_norms_do_not_depend_on_the_mesh(mesh):
     assert all(check.ok for check in checks), [check for check in checks if not check.ok]
 
 
-def test_energy_never_grows(monkeypatch):
+def test_energy_never_grows():
     short = {name: replace(setting, steps=60) for name, setting in exact.ENERGIES.items()}
-    monkeypatch.setattr(exact, "ENERGIES", short)
-    rows = exact.energies()
+    rows = exact.energies(short)
     assert len(rows) == 12
     checks = exact.energy_checks(rows)
     assert all(check.ok for check in checks), [check for check in checks if not check.ok]
@@ -111,5 +111,4 @@ def test_tables_have_a_row_for_each(found):
     assert [row[0] for row in table.rows] == list(CHOSEN)
     assert all(row[-1] == 0 for row in table.rows)
     assert len(SETTINGS) >= 16
-    assert EXPERIMENTS["exact"] is exact.EXACT
     exact._figure(dict.fromkeys(exact.DRAWN, found["partial"])).canvas.draw()

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from factories import short_rod
 from skfem import ElementLineP1, MeshTri
 from typer.testing import CliRunner
 
@@ -24,7 +25,6 @@ from benchmarks import fmu
 from benchmarks.__main__ import app as benchmarks
 from benchmarks.fmu import compare_fmu, running
 from livepde.cases import load
-from livepde.cases.template import write_template
 from livepde.cases.units import in_si
 from livepde.cli import app
 from livepde.exchange import (
@@ -65,9 +65,8 @@ def other():
 
 @pytest.fixture(scope="module")
 def rod(tmp_path_factory):
-    """The case of `livepde init`: a rod with two sensors, 181 samples."""
-    case, _ = write_template(tmp_path_factory.mktemp("rod"))
-    return case
+    """The case of `livepde init`: a rod with two sensors, 61 samples."""
+    return short_rod(tmp_path_factory.mktemp("rod"), replay=True)
 
 
 @pytest.fixture(scope="module", params=[2, 3])
@@ -105,13 +104,13 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
             model = [z["T_20"] - estimate.withheld_error[0], 0.0]
             assert found[:2] == pytest.approx([alpha, std], rel=1e-10)
             assert found[3:] == pytest.approx(model, rel=1e-10)
-    assert k == 180
+    assert k == 60
 
 
 @pytest.mark.long
 def test_the_unit_compares_with_its_case(rod, unit):
     found = compare_fmu(unit, load(rod))
-    assert found.samples == 181
+    assert found.samples == 61
     assert set(found.differences) == {*OUTPUTS, "T_30_model", "estimate_time"}
     assert found.largest <= 1e-10
 
@@ -122,12 +121,12 @@ def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
 
     def watched(rows, total, what):
         for bars[what], row in enumerate(rows, start=1):
-            assert total == 181
+            assert total == 61
             yield row
 
     monkeypatch.setattr(fmu, "watched", watched)
-    assert compare_fmu(unit, load(rod), progress=True).samples == 181
-    assert bars == {"in Python": 181, "in the unit": 181}
+    assert compare_fmu(unit, load(rod), progress=True).samples == 61
+    assert bars == {"in Python": 61, "in the unit": 61}
 
 
 @pytest.mark.long
@@ -152,7 +151,7 @@ def test_the_description_says_names_units_and_times(unit):
     assert (units["degC"].K, units["degC"].offset) == (1, 273.15)
     assert (units["m^2/s"].m, units["m^2/s"].s) == (2, -1)
     times = description.defaultExperiment
-    assert [float(t) for t in (times.startTime, times.stopTime, times.stepSize)] == [0, 3600, 20]
+    assert [float(t) for t in (times.startTime, times.stopTime, times.stepSize)] == [0, 1200, 20]
     able = description.coSimulation
     assert able.canHandleVariableCommunicationStepSize
     assert (getattr(able, "canGetAndSetFMUstate", 0) or able.canGetAndSetFMUState) is True
@@ -171,7 +170,7 @@ def test_a_simulation_runs_the_unit_as_users_do(rod, unit):
     found = fmpy.simulate_fmu(
         str(unit),
         start_time=0.0,
-        stop_time=3600.0,
+        stop_time=1200.0,
         output_interval=20.0,
         input=np.array(rows, dtype=kinds),
         output=["alpha", "status"],
@@ -510,7 +509,7 @@ def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
     header, *rows = rod.with_name("rod.csv").read_text().splitlines()
     begin = datetime(2025, 4, 1)
     dated = [header]
-    for row in rows[:80]:
+    for row in rows[:50]:
         seconds, _, rest = row.partition(",")
         dated.append(f"{begin + timedelta(seconds=float(seconds))},{rest}")
     (tmp_path / "rod.csv").write_text("\n".join(dated))
@@ -519,7 +518,7 @@ def test_dates_of_the_case_hold_in_the_unit(rod, tmp_path):
     case.write_text(text)
     unit = export_fmu(case, tmp_path / "rod.fmu")
     found = compare_fmu(unit, load(case))
-    assert found.samples == 80
+    assert found.samples == 50
     assert found.largest <= 1e-10
     component = Component(recipe_of(load(case)).process)
     for t, z in history(32):

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import bad, call
-
-from livepde.cases.template import write_template
+from factories import short_rod
 
 OFFSET = 0.5  # K
 
@@ -18,8 +17,7 @@ OFFSET = 0.5  # K
 def biased(tmp_path, monkeypatch):
     """Return a run of the case of `livepde init` whose sensor reads too much."""
     monkeypatch.chdir(tmp_path)
-    path, _ = write_template(tmp_path / "rod")
-    path.write_text(path.read_text().replace("replay = true", "replay = false"))
+    path = short_rod(tmp_path / "rod", 121)
     table = pd.read_csv(path.parent / "rod.csv")
     table["T_10"] += OFFSET
     table.to_csv(path.parent / "rod.csv", index=False)
@@ -54,7 +52,7 @@ def test_a_cause_that_is_none_is_refused(biased):
 @pytest.mark.long
 def test_without_a_suspect_there_is_nothing_to_test(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    write_template(tmp_path / "rod")
+    short_rod(tmp_path / "rod")
     call("run", "rod/case.toml", "--out", "run")
     code, output = call("explain", "run")
     assert code == 0
@@ -64,7 +62,7 @@ def test_without_a_suspect_there_is_nothing_to_test(tmp_path, monkeypatch):
 @pytest.mark.long
 def test_what_a_cause_frees_is_a_setting_of_a_case(biased):
     from livepde import cases, runs
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
 
     findings = runs.verdict(runs.open(biased).dataset).findings
     settings = {cause.setting for item in findings for cause in item.causes if cause.setting}

@@ -40,7 +40,7 @@ def sources():
     return lp.Model(
         lp.Field(line(12), ElementLineP2(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=2.0), "b": lp.Normal(-1.0, std=0.5)},
-        A=lambda q, u, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
+        A=lambda q, _, v, x: -q.a * v - q.b * x[0] * np.sin(x.t) * v,
         B=laplace,
     )
 
@@ -74,7 +74,7 @@ def walks():
         unknowns,
         A=[
             lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.b * u * v,
-            lambda q, u, v, x: -q.c * x[0] * v - q.d * np.sin(x.t) * v,
+            lambda q, _, v, x: -q.c * x[0] * v - q.d * np.sin(x.t) * v,
         ],
     )
 
@@ -89,11 +89,15 @@ MODELS = {
 
 
 def law(**options) -> lp.SensitivityLaw:
-    """Return a law whose runs are not judged: those of a fleet are not."""
-    return lp.SensitivityLaw(verdict=False, **options)
+    """Return a law whose runs are not judged: those of a fleet are not.
+
+    Its start is short and without shadows: "usual" is the law that has both as they are by default.
+    """
+    return lp.SensitivityLaw(**{"start_window": 4, "shadows": None, "verdict": False, **options})
 
 
 LAWS = {
+    "usual": lp.SensitivityLaw(verdict=False),
     "drift": law(drift=0.1),
     "rank": law(rank=8),
     "plain": law(),
@@ -190,10 +194,14 @@ def test_equals_separate_identifiers(model, law):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("build", MODELS.values(), ids=MODELS.keys())
-def test_equals_separate_identifiers_with_another_scheme_and_substeps(build):
+@pytest.mark.parametrize("model", ["rod", "sources", "layers"])
+def test_equals_separate_identifiers_with_another_scheme_and_substeps(model):
     fleet, estimate = compare(
-        build(), LAWS["plain"], partial(samples, steps=9), scheme=lp.ImplicitEuler(), dt_max=0.04
+        MODELS[model](),
+        LAWS["plain"],
+        partial(samples, steps=9),
+        scheme=lp.ImplicitEuler(),
+        dt_max=0.04,
     )
     assert fleet.together
     assert estimate.steps.tolist() == [3, 3, 3, 3]
@@ -228,7 +236,7 @@ def test_an_unknown_initial_state_learns_from_a_first_sample():
 @pytest.mark.long
 def test_a_bound_is_kept_and_left_again():
     model = rod(BOUNDED)
-    fleet, estimate = compare(model, law(start_window=4), members=6)
+    fleet, estimate = compare(model, law(), members=6)
     assert fleet.together
     alpha, _ = estimate.parameters["alpha"]
     assert np.isin(alpha, (0.45, 0.55)).any()
@@ -251,7 +259,7 @@ def test_a_member_that_fails_does_not_disturb_the_others():
         (rod(), lp.laws.Guards()),
         (rod(BOUNDED), None),
     ):
-        fleet, estimate = compare(model, law(guards=guards, start_window=4), stream)
+        fleet, estimate = compare(model, law(guards=guards), stream)
         assert fleet.together
         assert estimate.ok.all()
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["a", "b", "c", "d"])
@@ -288,7 +296,7 @@ def curved_in_inputs():
         lp.Field(line(16), ElementLineP1(), dirichlet={"boundary": 0.0}),
         {"a": lp.Normal(0.5, std=0.2)},
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
-        f=lambda x, t: x.inputs["T_0"] ** 2,
+        f=lambda x, _: x.inputs["T_0"] ** 2,
         inputs=["T_0"],
     )
 
@@ -490,7 +498,8 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
 def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
     model = MODELS[name]()
-    fleet = lp.Fleet(model, SENSORS, LAWS["gate, noise"], 3, withheld=lp.Points({"hidden": 0.4}))
+    law = lp.SensitivityLaw(gate=3.0, noise="auto", start_window=4, verdict=False)
+    fleet = lp.Fleet(model, SENSORS, law, 3, withheld=lp.Points({"hidden": 0.4}))
     kept = FleetRecords(model, 4)
     results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]
     for t, z, inputs in samples(fleet, 9):

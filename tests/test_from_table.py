@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.data_sources import source_of
+from livepde.cases.data import source_of
 from livepde.cases.measured import measured
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.cli import app
 from livepde.models import EQUATIONS
 
@@ -25,12 +25,6 @@ Zeit;Tiefe 5 cm [°C];Fühler (0,2 m);Bemerkung
 01.04.2025 12:10;21,5;19,1;Regen
 01.04.2025 12:30;;19,2;
 """
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 def begun(text: str, encoding: str = "utf-8", equation: str = "heat") -> dict:
@@ -680,7 +674,7 @@ def test_several_tables_are_not_followed(here):
         cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
     case = cases.load("mine/case.toml", settings=FILES)
     with pytest.raises(lp.errors.CaseError, match="a process is followed in one: name it"):
-        source_of(case.frame, None, "")
+        source_of(case, None, "")
 
 
 @pytest.mark.parametrize(

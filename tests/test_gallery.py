@@ -7,13 +7,19 @@ import re
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+from experiments.__main__ import app as studies
 from livepde.reproduce import EXPERIMENTS
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "gallery"
 CASES = sorted(path.stem for path in (ROOT / "cases").glob("*.toml"))
-SCRIPTS = sorted(path.stem for path in (ROOT / "experiments").glob("*.py"))
+SCRIPTS = sorted(
+    path.stem
+    for path in (ROOT / "experiments").glob("[!_]*.py")
+    if '__name__ == "__main__"' in path.read_text()
+)
 PROGRAMS = sorted(path.stem for path in (ROOT / "examples").glob("*.py"))
 LARGEST = 150_000  # bytes of a picture
 
@@ -23,7 +29,7 @@ def maker():
     """The program that makes the page of experiments."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "docs"))
-        return importlib.import_module("experiments")
+        return importlib.import_module("experiments_page")
 
 
 def part(page, heading):
@@ -50,11 +56,12 @@ def test_every_case_has_a_figure_a_table_and_its_command(name):
     assert f"\n| {name} | " in mine[0]
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_published_experiment_has_figures_a_table_and_its_command(name):
+@pytest.mark.parametrize("name", [*EXPERIMENTS, *get_command(studies).commands])
+def test_every_published_experiment_and_study_has_figures_a_table_and_its_command(name):
     text = part("experiments.md", f"### {name}")
     assert pictures(text)
-    assert f"`livepde reproduce {name}`" in text
+    program = "livepde reproduce" if name in EXPERIMENTS else "python -m experiments"
+    assert f"`{program} {name}`" in text
     assert "| number | value |" in text
     assert "FAILED" not in text
 
@@ -63,7 +70,7 @@ def test_every_published_experiment_has_figures_a_table_and_its_command(name):
 def test_every_script_has_a_figure_what_it_prints_and_its_command(name, maker):
     text = part("experiments.md", f"### {name}")
     assert pictures(text)
-    assert f"`python experiments/{name}.py" in text
+    assert f"`python -m experiments.{name}" in text
     kept = (FOLDER / "experiments" / f"{name}.txt").read_text(encoding="utf-8")
     assert maker.drawn(name, kept) is not None
     assert f"    {maker.shown(name, kept).splitlines()[0]}" in text

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 from commands import bench
+from factories import observe
 
 import livepde as lp
 from benchmarks.honest import KINDS, PROBLEMS, honest
@@ -74,7 +75,7 @@ def simulated(problem, theta, refine, substeps):
     """Return what the sensors show in livepde, with second order and inputs at each substep."""
     model = problem.model(refine)
     sensors = lp.Points(dict(problem.points), direct=dict(problem.direct))
-    observed = sensors.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, sensors)
     space = model.parameter_space
     q = np.zeros(space.dim)
     for label, latent in problem.latents.items():

@@ -11,8 +11,8 @@ from patience import PATIENCE
 import livepde as lp
 from benchmarks.faults.hostile import HOSTILE, hostile_case
 from livepde import cases
-from livepde.cases.limits import CELLS, check_unit
-from livepde.cases.units import conversion, in_si
+from livepde.cases.geometry import CELLS
+from livepde.cases.units import check_unit, conversion, in_si
 from livepde.streams.clock import Clock, number_of
 from livepde.streams.csvfile import read_csv
 from livepde.streams.table import Column

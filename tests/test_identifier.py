@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import xarray as xr
-from factories import excited, excited_u, laplace, line, truth
+from factories import excited, excited_u, laplace, line, observe, truth
 from skfem import ElementLineP1, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -21,7 +21,7 @@ def rod(**options):
         ),
         {"k": lp.Scalar(lp.Normal(1.0, std=0.5, bounds=(0.1, 5.0)), unit="m^2/s")},
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["heat"] * v * 0,
-        f=lambda x, t: x.inputs["heat"],
+        f=lambda x, _: x.inputs["heat"],
         inputs=("heat",),
         time_unit="s",
         **options,
@@ -34,7 +34,7 @@ HIDDEN = lp.Points({"c": 0.8}, unit="degC")
 
 def identifier(**options):
     options = {"withheld": HIDDEN, **options}
-    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(), **options)
+    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(start_window=4), **options)
 
 
 def sample(t=0.1, **changes):
@@ -358,7 +358,7 @@ def test_progress_is_silent_where_nobody_watches(capsys):
 
 def test_substeps_are_those_made_by_hand():
     model = excited(8)
-    z = np.zeros(lp.Full().bind(model.state_space, model.X, model.parameter_space).size)
+    z = np.zeros(observe(model, lp.Full()).size)
     law = lp.GradientLaw(newton=lp.stepping.Newton(tolerance=1e-12, share=0.0))
     divided = lp.Identifier(model, lp.Full(), law, q0=1.0, dt_max=0.1)
     estimate = divided.step(0.4, z)

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from factories import observe
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
@@ -450,7 +451,7 @@ def test_normal_equations_are_those_of_dense_matrices(sees: str) -> None:
     model, _ = rod(cells=12)
     cells = {"a": lambda x: x[0] < 0.3, "b": lambda x: (x[0] > 0.3) & (x[0] < 0.8)}
     part = lp.Subdomain(lambda x: x[0] > 0.4) if sees == "part" else lp.Averages(cells)
-    split = part.bind(model.state_space, model.X, model.parameter_space).split()
+    split = observe(model, part).split()
     metric = InformationMetric(model, selects=sees == "part")
     forms = StageForms(model, split, None, None, 0.0)
     rng = np.random.default_rng(0)
@@ -514,8 +515,8 @@ def test_what_the_data_taught_does_not_depend_on_how_well_a_stage_is_solved() ->
 def test_noise_is_detected(noise: float) -> None:
     model, twin = rod(cells=40)
     detector = NoiseDetector(
-        twin.observation.bind(model.state_space, model.X, model.parameter_space),
-        twin.observation.bind(model.state_space, model.X, model.parameter_space).split(),
+        observe(model, twin.observation),
+        observe(model, twin.observation).split(),
     )
     balance = Balance.none(39, model.X.dim)
     rng, told = np.random.default_rng(0), []

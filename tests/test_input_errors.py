@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from livepde import cli
-from livepde.cases.template import write_template
+from livepde.cases.new_case import write_template
 from livepde.runs import RunWriter
 
 PAGE = Path(__file__).parents[1] / "docs" / "mistakes.md"

@@ -12,7 +12,9 @@ import subprocess
 import sys
 import threading
 from contextlib import closing, suppress
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -53,11 +55,21 @@ def started(folder: Path, count: int, **options) -> Live:
     return Live(identifier(), samples(count, kept.last), kept, fields_every=10, **options)
 
 
+@cache
+def journal_bytes(count: int) -> bytes:
+    """Return the file that a run of so many samples leaves."""
+    with TemporaryDirectory() as folder:
+        run = started(Path(folder), count)
+        run.run()
+        run.journal.close()
+        return (Path(folder) / NAME).read_bytes()
+
+
 def finished(folder: Path, count: int = 30) -> Path:
-    run = started(folder, count)
-    run.run()
-    run.journal.close()
-    return folder / NAME
+    """Return the journal of a finished run."""
+    path = folder / NAME
+    path.write_bytes(journal_bytes(count))
+    return path
 
 
 def content(path: Path) -> dict[str, dict[int, tuple]]:
@@ -186,8 +198,8 @@ def limit_pages(kept: Journal, more: int) -> None:
 def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
     whole, full = tmp_path / "whole", tmp_path / "full"
     whole.mkdir(), full.mkdir()
-    finished(whole, 300)
-    run = started(full, 300)
+    finished(whole, 150)
+    run = started(full, 150)
     limit_pages(run.journal, 20)
     with pytest.raises(
         lp.errors.RunError, match=r"full.*What was written before is safe; make room"
@@ -197,16 +209,16 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
         run.journal.commit()
     kept = len(run.journal)
     run.journal.close()
-    assert 0 < kept < 300
+    assert 0 < kept < 150
     with closing(sqlite3.connect(full / NAME)) as raw:
         assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    again = started(full, 300)
+    again = started(full, 150)
     again.resume()
     again.run()
     again.journal.close()
     with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
         same(other, one)
-        assert other.accepted == 300
+        assert other.accepted == 150
 
 
 @pytest.mark.long
@@ -250,7 +262,7 @@ class Failing:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [2, 40, 43, 60, 73, 100])
+@pytest.mark.parametrize("first", [2, 40, 43, 73])
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first):
     whole, failing = tmp_path / "whole", tmp_path / "failing"
     whole.mkdir(), failing.mkdir()
@@ -385,11 +397,12 @@ with Journal.create(None, (), livepde.records.Layout("", "", {}, {}, [], None, {
     pass
 if os.getuid() == 0:
     os.setuid(65534)
-try:
-    with Journal.open(Path(sys.argv[1]), write=len(sys.argv) > 2) as kept:
-        print(len(kept), len(kept.dataset().time))
-except livepde.errors.RunError as error:
-    print(error)
+for write in (False, True):
+    try:
+        with Journal.open(Path(sys.argv[1]), write=write) as kept:
+            print(len(kept), len(kept.dataset().time))
+    except livepde.errors.RunError as error:
+        print(error)
 """
 
 
@@ -423,8 +436,9 @@ def test_a_folder_that_may_only_be_read(shared, killed):
     for path in shared.glob("*"):
         path.chmod(0o644 if path.is_file() else 0o755)
     shared.chmod(0o555)
-    assert as_nobody(READ, shared / NAME) == "30 30\n"
-    assert "cannot be written" in as_nobody(READ, shared / NAME, "write")
+    read, write = as_nobody(READ, shared / NAME).splitlines()
+    assert read == "30 30"
+    assert "cannot be written" in write
     shared.chmod(0o755)
 
 
@@ -528,12 +542,6 @@ def test_a_file_that_was_cut_off(tmp_path, keep):
     refused(path)
 
 
-@pytest.fixture(scope="module")
-def twelve(tmp_path_factory) -> bytes:
-    """The journal of twelve samples."""
-    return finished(tmp_path_factory.mktemp("twelve"), 12).read_bytes()
-
-
 @pytest.mark.long
 @settings(
     max_examples=60,
@@ -542,11 +550,11 @@ def twelve(tmp_path_factory) -> bytes:
     derandomize=True,
 )
 @given(seed=st.integers(0, 2**32), share=st.sampled_from([1e-5, 1e-4, 1e-3, 1e-2, 0.3]))
-def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, twelve, seed, share):
+def test_a_file_with_wrong_bytes_is_read_or_one_sentence(tmp_path_factory, seed, share):
     folder = tmp_path_factory.mktemp("bytes")
     path = folder / NAME
     rng = np.random.default_rng(seed)
-    data = np.frombuffer(twelve, dtype=np.uint8).copy()
+    data = np.frombuffer(journal_bytes(12), dtype=np.uint8).copy()
     where = rng.integers(0, len(data), max(int(share * len(data)), 1))
     data[where] = rng.integers(0, 256, len(where))
     path.write_bytes(data.tobytes())
@@ -686,7 +694,7 @@ run.run()
 @pytest.mark.process
 def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(tmp_path):
     path, seen = tmp_path / NAME, 0
-    for _ in range(3):
+    for _ in range(2):
         child = subprocess.Popen([sys.executable, "-c", WRITER, tmp_path, Path(__file__).parent])
         goal = seen + 50
         while child.poll() is None and seen < goal:
@@ -700,7 +708,7 @@ def test_readers_see_whole_estimates_while_another_process_writes_and_is_killed(
         child.wait()
         with Journal.open(path) as kept:
             assert len(list(kept)) >= seen
-    assert seen >= 150
+    assert seen >= 100
 
 
 @pytest.mark.long
@@ -1041,10 +1049,10 @@ def test_what_is_whole_is_salvaged(tmp_path):
 
 @pytest.mark.long
 def test_a_journal_that_was_cut_off_is_salvaged(tmp_path):
-    path = finished(tmp_path, 600)
+    path = finished(tmp_path, 200)
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) * 6 // 10])
     refused(path, match="damaged.*--salvage|malformed")
     with Salvage(path) as kept:
         found = sum(1 for _ in kept.after(0))
-    assert 200 < found < 600
+    assert 60 < found < 200

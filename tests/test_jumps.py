@@ -45,20 +45,18 @@ def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE, **options: An
         (0, lp.Replay(), 1.2),
         (1, None, 1.2),
         (1, lp.Replay(), 0.8),
-        (2, None, 0.8),
-        (2, lp.Replay(), 1.2),
     ],
 )
 def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, seed: int):
     def a(t: float) -> float:
-        return 0.3 if t < 15.0 else 0.3 * change
+        return 0.3 if t < 7.5 else 0.3 * change
 
     law = lp.SensitivityLaw(jumps=Jumps(), replay=replay)
-    found = run(law, samples(a, 500, seed))
+    found = run(law, samples(a, 350, seed))
     alarms = [k for k, estimate in enumerate(found) if estimate.diagnostics.jump > 0.0]
-    late = [k for k in alarms if k >= 299]
+    late = [k for k in alarms if k >= 149]
     assert late
-    assert late[0] - 299 <= 30
+    assert late[0] - 149 <= 30
     value, std = found[-1].parameters["a"]
     assert abs(value - 0.3 * change) < 5 * std < 0.02
 
@@ -132,10 +130,10 @@ def test_settings_that_cannot_be_meant_are_refused(options: Any):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("guess", [1e-3, 1e-2, 1e-1, 1.0])
+@pytest.mark.parametrize("guess", [1e-3, 1e-1, 1.0])
 def test_the_noise_is_found_from_any_first_guess(guess: float):
-    law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16))
-    found = run(law, samples(lambda t: 0.3, 400, 0), guess)
+    law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16), shadows=None)
+    found = run(law, samples(lambda t: 0.3, 250, 0), guess)
     assert found[-1].diagnostics.noise_level * guess == pytest.approx(NOISE, rel=0.2)
     value, std = found[-1].parameters["a"]
     assert abs(value - 0.3) < 4 * std < 0.01

@@ -6,7 +6,7 @@ import factories
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from factories import CASES, reaction
+from factories import CASES, observe, reaction
 from skfem import (
     ElementLineHermite,
     ElementQuad2,
@@ -312,7 +312,7 @@ def test_what_would_be_a_dense_matrix_of_a_field_is_refused(monkeypatch):
 
 def test_the_noise_of_many_sensors_is_sampled(monkeypatch):
     model = square(24)
-    observed = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, lp.Full())
     spaces = Spaces(model, observed)
     std = 0.01 * (1.0 + np.arange(observed.size) / observed.size)
     exact = stopping.noise_size(spaces, std)

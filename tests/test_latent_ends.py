@@ -11,7 +11,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.runs.judgement import doubts
+from livepde.runs.run_verdict import doubts
 
 MESH = lp.interval(0.0, 1.0, 8)
 NOISE = 0.01

@@ -14,7 +14,7 @@ from livepde.fem import Inputs, Moment
 from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.linalg import Array
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, StageOfMembers
-from livepde.stepping.driven import DrivenVector
+from livepde.stepping.banded_stage import DrivenVector
 from livepde.stepping.member_stage import SeparateStages
 
 MESH = lp.interval(0.0, 1.0, 14)
@@ -37,13 +37,13 @@ MODELS = {
     "ends in time": rod({"left": lambda x, t: np.sin(t) + 0.0 * x[0], "right": 0.0}),
     "no ends": rod({}),
     "source in time": rod({"left": 0.0}, lambda x, t: np.cos(3.0 * t) * x[0]),
-    "curved in inputs": rod({"left": 0.0}, lambda x, t: x.inputs["T_0"] ** 2, inputs=["T_0"]),
+    "curved in inputs": rod({"left": 0.0}, lambda x, _: x.inputs["T_0"] ** 2, inputs=["T_0"]),
     "unknown and input": rod(
         {"left": 0.0},
         A=[
             lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
             lambda q, u, v, x: q.s * u * v,
-            lambda q, u, v, x: -q.s * x.inputs["T_0"] * v,
+            lambda q, _, v, x: -q.s * x.inputs["T_0"] * v,
         ],
         inputs=["T_0"],
     ),

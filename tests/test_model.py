@@ -51,7 +51,7 @@ def test_channels_of_forms_and_boundaries_in_order():
         line(),
         ElementLineP1(),
         dirichlet={"left": lp.Channel("T_top")},
-        f=lp.On("right", lambda x, t: x.inputs["Q"]),
+        f=lp.On("right", lambda x, _: x.inputs["Q"]),
         inputs=("Q", "wind"),
     )
     assert model.channels == ("Q", "wind", "T_top")
@@ -154,7 +154,7 @@ def heated(source):
 def test_a_source_is_evaluated_again_only_where_it_may_have_changed():
     counts = {"evaluated": 0}
 
-    def held(x, t):
+    def held(x, _):
         counts["evaluated"] += 1
         return x.inputs["Q"] + x[0]
 

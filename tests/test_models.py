@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import observe
 
 import livepde as lp
 from livepde.models import EQUATIONS, borehole, fluid, heat, reaction_diffusion
@@ -73,7 +74,7 @@ def test_fluid_sees_the_resistance():
     mesh = lp.interval(0.05, 5.0, 20, geometric=True)
     model = borehole(mesh, lp.Normal(2.0, 1.0), lp.Normal(0.1, 0.1), H=20.0, rho_c=2e6, T0=10.0)
     points = lp.Points({"T": 0.05}, direct={"T": fluid(20.0)})
-    observed = points.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, points)
     moment = lp.fem.Moment(0.0, {"Q": 1000.0})
     u = model.initial(10.0)
     assert observed.predict(u, np.array([2.0, 0.1]), moment) == pytest.approx([10.0 + 0.1 * 50.0])

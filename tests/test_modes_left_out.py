@@ -9,7 +9,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.runs.drive import drive, journal_of
 from livepde.runs.journal import Journal
-from livepde.runs.judgement import doubts
+from livepde.runs.run_verdict import doubts
 from livepde.runs.summary import tables
 
 MESH = lp.interval(0.0, 1.0, 40)

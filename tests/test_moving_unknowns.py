@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import advanced, driven_rod, line, readings
+from factories import advanced, driven_rod, line, observe, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview
-from livepde.cases.template import write_template
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import CONSTANT
 from livepde.laws import replay_slices
@@ -130,7 +130,7 @@ PAIRS = list(itertools.product(EVOLUTIONS, REPLAYS))
 def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, substeps: int):
     model = linear_model(EVOLUTIONS[name])
     # Unknowns that stay do not explain these data: a gate would refuse some of them.
-    law = lp.SensitivityLaw(modes=7, rank=30, replay=REPLAYS[replay], gate=np.inf)
+    law = lp.SensitivityLaw(modes=7, rank=30, replay=REPLAYS[replay], gate=np.inf, shadows=None)
     # Samples at equal distances: dt_max then divides each step alike.
     stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
     scheme = lp.ImplicitEuler()  # as in the dense filter
@@ -158,8 +158,8 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
 )
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
     model = linear_model(EVOLUTIONS[name])
-    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0)
-    stream = samples(10, missing=False)
+    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0, start_window=4, shadows=None)
+    stream = samples(8, missing=False)
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
 
@@ -225,7 +225,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
 
     model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
     points = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
     identifier = lp.Identifier(model, points, law)
     errors = []
     for t, z in readings(rod(lp.Normal(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
@@ -374,7 +374,9 @@ def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: 
         return placed(*arguments)
 
     monkeypatch.setattr(replay_slices, "placed", counted)
-    law = lp.SensitivityLaw(modes=7, replay=lp.Replay(first=4, iterations=50, slice=64))
+    law = lp.SensitivityLaw(
+        modes=7, replay=lp.Replay(first=4, iterations=50, slice=64), shadows=None
+    )
     identifier = lp.Identifier(linear_model(EVOLUTIONS[name]), sensors(), law)
     for t, z in samples():
         assert identifier.step(t, z).status.ok
@@ -432,7 +434,7 @@ def test_the_excitation_of_a_transformed_unknown_is_that_at_the_estimate():
         lp.LogNormal(2.0, 1.0),
         A=lambda q, u, v, x: q * u * v,
     )
-    full = lp.Full().bind(model.state_space, model.X, model.parameter_space)
+    full = observe(model, lp.Full())
     excitation = Excitation(Spaces(model, full), window=0.5)
     for q, slope in ((None, 2.0), (np.array([5.0]), 5.0)):
         state = excitation.init()
@@ -454,7 +456,7 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
     points = lp.Points({"z": 0.5}, noise=NOISE, direct={"z": lambda q, x: 20.0 * q.c})
     truth = {"a": 0.35, "c": 0.17}
     noise = AbsoluteNoise(NOISE)
-    for seed in range(5):
+    for seed in range(3):
         twin = Twin(
             model=model,
             observation=points,
@@ -465,7 +467,7 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
             seed=seed,
             scheme=lp.SensitivityLaw.scheme,
         )
-        law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+        law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
         identifier = lp.Identifier(model, points, law, u0=0.0)
         estimate = identifier.run(twin).last
         assert identifier._state.now.innovations.inflation < 1.3

@@ -52,12 +52,13 @@ def same(one: lp.Estimate, other: lp.Estimate) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
+SHORT = {"start_window": 4, "shadows": None}
 LAWS = [
     lp.SensitivityLaw(),
-    lp.SensitivityLaw(replay=lp.Replay(window=64)),
-    lp.SensitivityLaw(jumps=lp.Jumps(settle=5)),
-    lp.SensitivityLaw(noise="auto"),
-    lp.SensitivityLaw(drift=0.1),
+    lp.SensitivityLaw(replay=lp.Replay(window=64), **SHORT),
+    lp.SensitivityLaw(jumps=lp.Jumps(settle=5), **SHORT),
+    lp.SensitivityLaw(noise="auto", **SHORT),
+    lp.SensitivityLaw(drift=0.1, **SHORT),
     lp.AutoLaw(),
 ]
 

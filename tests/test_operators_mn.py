@@ -12,9 +12,9 @@ from factories import CASES, line, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
+from experiments import degenerate
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.diffusion_operators import diffusion_operator
-from livepde.reproduce import EXPERIMENTS, degenerate
 from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler
 
@@ -88,7 +88,7 @@ def test_the_law_takes_them():
 
 @pytest.fixture(scope="module")
 def outcome() -> Outcome:
-    return EXPERIMENTS["degenerate"].run()
+    return degenerate.degenerate()
 
 
 @pytest.mark.study

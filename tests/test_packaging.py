@@ -151,7 +151,7 @@ def fish(line: str) -> list[str]:
         ("livepde re", ["report", "reproduce"]),
         ("livepde equations heat", ["heat"]),
         ("livepde equations ", list(EQUATIONS)),
-        ("livepde reproduce seed-ex", ["seed-excited", "seed-excited-noise"]),
+        ("livepde reproduce se", ["seed", "seed-excited"]),
         ("livepde citation --format b", ["bibtex"]),
         ("livepde run case.toml --log ", ["text", "json"]),
     ],

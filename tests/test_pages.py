@@ -38,6 +38,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app as benchmarks
+from experiments.__main__ import app as experiments
 from livepde.cases.read import read_spec
 from livepde.cases.schema import CaseSpec
 from livepde.cli import app
@@ -93,7 +94,7 @@ ELSEWHERE = {
     ],
     "test_deploy.py::test_options_exist": ["docker build", "LIVEPDE_TOKEN=$(openssl"],
 }
-BENCHMARKS = "python -m benchmarks "
+PROGRAMS = {"python -m benchmarks ": benchmarks, "python -m experiments ": experiments}
 BEGINNINGS = [start for several in ELSEWHERE.values() for start in several]
 
 
@@ -144,8 +145,11 @@ class Session:
             if _stands_elsewhere(command):
                 continue
             program, *arguments = shlex.split(command, comments=True)
-            if command.startswith(BENCHMARKS):
-                self._invoke(benchmarks, command, arguments[2:])
+            module = next(
+                (app for words, app in PROGRAMS.items() if command.startswith(words)), None
+            )
+            if module is not None:
+                self._invoke(module, command, arguments[2:])
             elif program == "python":
                 runpy.run_path(arguments[0], run_name="__main__")
             else:
@@ -252,17 +256,20 @@ def is_a_test(name: str) -> bool:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_a_page_names_is_there(page):
     """Commands, experiments, files and tests of the project, in quotes."""
-    program, measures = get_command(app), get_command(benchmarks)
+    program = get_command(app)
+    modules = {words: get_command(module).commands for words, module in PROGRAMS.items()}
     for name in set(re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))):
         words = name.split()
         if re.fullmatch(r"test_\w+\.py(::\w+)?", name):
             assert is_a_test(name), name
         elif re.fullmatch(r"(python )?(experiments|examples|cases)/[a-z_0-9]+\.(py|toml)", name):
             assert (ROOT / words[-1]).exists(), name
+        elif name.startswith("python -m experiments."):
+            assert (ROOT / f"{words[2].replace('.', '/')}.py").exists(), name
         elif words[0] == "make" and words[1:] and words[1].islower():
             assert re.search(rf"^{words[1]}:", MAKEFILE, re.MULTILINE), name
-        elif name.startswith(BENCHMARKS) and re.fullmatch(r"[a-z]+", words[3]):
-            assert words[3] in measures.commands, name
+        elif name.startswith(tuple(PROGRAMS)) and re.fullmatch(r"[a-z-]+", words[3]):
+            assert words[3] in modules[" ".join([*words[:3], ""])], name
         elif words[0] == "livepde" and words[1:] and re.fullmatch(r"[a-z]+", words[1]):
             assert words[1] in program.commands, name
             if words[1] == "reproduce" and words[2:] and words[2].islower():

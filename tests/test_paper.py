@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import livepde as lp
-from livepde.reproduce import reference, seed
+from experiments import reference
+from livepde.reproduce import seed
 
 
 def test_the_papers_space() -> None:

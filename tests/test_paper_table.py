@@ -7,9 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
+from experiments.__main__ import app as studies
 from livepde.reproduce import EXPERIMENTS
 
+PACKAGES = ("livepde.", "experiments.")
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
 QUOTED = sorted(set(re.findall(r"`([^`]+)`", PAGE)))
@@ -31,7 +34,7 @@ th:parameter_noisesmooth PDEdiff obsdiff MN1 MN2 fig:figure1 fig:figure2
 )
 
 
-@pytest.mark.parametrize("name", [name for name in QUOTED if name.startswith("livepde.")])
+@pytest.mark.parametrize("name", [name for name in QUOTED if name.startswith(PACKAGES)])
 def test_functions_exist(name: str) -> None:
     parts = name.split(".")
     for cut in range(len(parts), 0, -1):
@@ -56,10 +59,12 @@ def test_commands_and_files_exist() -> None:
     for name in QUOTED:
         if name.startswith("livepde reproduce "):
             assert name.split()[-1] in EXPERIMENTS
+        elif name.startswith("python -m experiments "):
+            assert name.split()[-1] in get_command(studies).commands
         elif name.startswith("experiments/"):
             assert (ROOT / name).exists()
         else:
-            assert name.startswith(("livepde.", "test_")), name
+            assert name.startswith((*PACKAGES, "test_")), name
 
 
 @pytest.mark.parametrize("label", LABELS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from factories import ROD_CASE
+from factories import ROD_CASE, observe
 from skfem import ElementLineP1, ElementQuad1
 
 import livepde as lp
@@ -70,7 +70,7 @@ def test_shifts_are_found_and_what_they_cost_is_in_the_interval():
 def test_it_is_a_quadratic_in_the_shift():
     model = rod().with_unknowns(lp.Points(AT, position_std=0.02).unknowns)
     points = lp.Points(AT, position_std=0.02, noise=0.005)
-    observed = points.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, points)
     u = model.state_space.interpolate(lambda x: np.sin(3.0 * x[0]))
     q = np.array([0.1, 0.01, -0.02, 0.0])
     at = np.array(list(AT.values())) + q[1:]
@@ -86,7 +86,7 @@ def test_it_is_a_quadratic_in_the_shift():
 def test_a_sensor_may_lie_near_or_on_the_end_of_the_mesh(at, shift):
     points = lp.Points({"T": at}, position_std=0.05, noise=0.1)
     model = rod().with_unknowns(points.unknowns)
-    observed = points.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, points)
     u = model.state_space.interpolate(lambda x: 2.0 * x[0])
     q = np.array([0.1, shift])
     assert observed.predict(u, q, None) == pytest.approx([2.0 * (at + shift)])
@@ -151,7 +151,7 @@ def test_what_does_not_go_together_is_refused():
         )
     model = rod()
     with pytest.raises(lp.errors.ObservationError, match="no unknown 'position"):
-        base.bind(model.state_space, model.X, model.parameter_space)
+        observe(model, base)
 
 
 LEFT = '[boundary]\nleft = "30 degC"'

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from factories import laplace, line, reaction
+from factories import laplace, line, observe, reaction
 from skfem import (
     ElementLineHermite,
     ElementLineP1,
@@ -15,8 +15,8 @@ from skfem import (
 )
 
 import livepde as lp
+from experiments import seed_excited_noise as noisy
 from livepde.observation import Apriori, Discrepancy, Pseudoinverse, Tikhonov
-from livepde.reproduce import noisy
 
 ELEMENTS = [ElementLineHermite, ElementLineP1, ElementLineP2]
 MIDDLE = lambda x: (x[0] > 0.3) & (x[0] < 0.87)  # noqa: E731
@@ -27,7 +27,7 @@ def rod(element=ElementLineHermite, cells=20, dirichlet=None):
 
 
 def bind(model, observation):
-    return observation.bind(model.state_space, model.X, model.parameter_space)
+    return observe(model, observation)
 
 
 def kernel(cells=20, width=0.1):
@@ -349,7 +349,7 @@ def test_the_noisy_excited_twin_shows_what_smoothing_is_good_for(monkeypatch):
         return found[key]
 
     monkeypatch.setattr(noisy, "noisy_run", once)
-    outcome = noisy.SEED_EXCITED_NOISE.run()
+    outcome = noisy.seed_excited_noise()
     assert len(found) == 8
     assert outcome.ok, [check for check in outcome.checks if not check.ok]
     assert whole(0.01, 100, smoothing=True).error == outcome.tables[1].rows[0][2] <= 0.10

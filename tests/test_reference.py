@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from livepde.reproduce import reference
-from livepde.reproduce.reference import Discretisation, LineSpace, Step, fitted, run
-from livepde.reproduce.reference_settings import FULL, PAPER, SETTINGS, TWIN, VARYING, scaled
+from experiments import reference
+from experiments.reference import Discretisation, LineSpace, Step, fitted, run
+from experiments.reference_settings import FULL, PAPER, SETTINGS, TWIN, VARYING, scaled
 
 UNEVEN = np.array([0.0, 0.08, 0.2, 0.3, 0.45, 0.6, 0.7, 0.87, 0.95, 1.0])
 SHORT = replace(PAPER, steps=12)
@@ -316,7 +316,7 @@ def test_jacobian_is_the_derivative(rule, nu):
 )
 def test_energy_never_grows_with_full_data(rule, base):
     for gain in (1.0, 100.0, 1e4):
-        levels = energy(run(replace(base, gain=gain, nodes=16, steps=60, **rule)))
+        levels = energy(run(replace(base, gain=gain, nodes=16, steps=30, **rule)))
         assert (np.diff(levels) <= 1e-12 * levels[0]).all()
 
 

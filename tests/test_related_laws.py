@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import excited, excited_q, excited_u, laplace, reaction
+from factories import excited, excited_q, excited_u, laplace, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
+from experiments.relatives import EXPECTED, LAWS, law, relatives
 from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
 from livepde.laws.metrics import ConstantMetric
 from livepde.laws.related_laws import _Linear
 from livepde.model import mass_form
-from livepde.reproduce.relatives import EXPECTED, LAWS, law
 from livepde.stepping import Newton
 from livepde.streams import Twin
 
@@ -90,7 +90,7 @@ def squared(u: Any, v: Any, x: Any) -> Any:
 def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     """C is evaluated at u^; once by the products of a bilinear model, once in general."""
     model = reaction(lp.interval(0.0, 1.0, 10), ElementLineP1(), B=B)
-    observed = PART.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, PART)
     split, gain, mu, h = observed.split(), 50.0, 3.0, 0.2
     forms = StageForms(model, split, None, None, 0.0, at_estimate=True)
     stage = CoupledStage(StageTerms(forms, _Linear(mu)), Newton(tolerance=1e-12, share=0.0))
@@ -135,9 +135,7 @@ def test_no_sensor_of_the_parameter(kind: Any) -> None:
 
 @pytest.mark.study
 def test_reproduction() -> None:
-    from livepde.reproduce import EXPERIMENTS
-
-    outcome = EXPERIMENTS["relatives"].run()
+    outcome = relatives()
     assert outcome.ok, [check.name for check in outcome.checks if not check.ok]
     assert len(outcome.checks) == len(EXPECTED) + 1
     assert sum("refused" in row for row in outcome.tables[0].rows) == 2

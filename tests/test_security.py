@@ -9,6 +9,7 @@ import json
 import pickle
 import socket
 import threading
+import time
 import tomllib
 import urllib.error
 import urllib.request
@@ -26,10 +27,10 @@ import livepde as lp
 from livepde import cases, checkpoint, runs
 from livepde.atomic_write import replacing, write_bytes
 from livepde.cli.program import app
-from livepde.runs import RunWriter, pending_connections
+from livepde.runs import RunWriter, visitors
 from livepde.runs.monitor import Metrics, Monitor
-from livepde.runs.pending_connections import LONGEST_BODY
-from livepde.runs.web import THREADS, Address, Server
+from livepde.runs.visitors import IN_MEMORY, LONGEST_BODY, THREADS
+from livepde.runs.web import Address, Server
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake
 from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
@@ -405,8 +406,8 @@ def test_a_given_token_is_shown_nowhere(serving, tmp_path, monkeypatch, logs):
 @pytest.mark.slow
 def test_requests_that_are_too_long_are_refused(serving):
     server = serving()
-    assert ask(server, "/" + "x" * 20_000)[0] == 414
-    assert ask(server, Long="x" * 20_000)[0] == 413
+    assert ask(server, "/" + "x" * 20_000)[0] == 431
+    assert ask(server, Long="x" * 20_000)[0] == 431
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("POST", "/")
     connection.putheader("Content-Length", str(LONGEST_BODY + 1))
@@ -430,7 +431,7 @@ def test_no_thread_that_serves_keeps_a_program_from_its_end(serving):
 @pytest.mark.parametrize("token", ["", TOKEN])
 def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
     """Many more than there are threads, that send a little now and then: none holds one."""
-    monkeypatch.setattr(pending_connections, "DEADLINE", 2.0)
+    monkeypatch.setattr(visitors, "DEADLINE", 2)
     server = serving(token=token)
     slow = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(4 * THREADS)]
     for k, one in enumerate(slow):
@@ -453,7 +454,7 @@ def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
 
 
 @pytest.mark.slow
-def test_who_may_not_ask_is_answered_before_a_body_is_read(serving):
+def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
     server = serving(token=TOKEN)
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("POST", "/")
@@ -466,15 +467,15 @@ def test_who_may_not_ask_is_answered_before_a_body_is_read(serving):
 
 
 @pytest.mark.slow
-def test_bodies_reach_the_page(serving, monkeypatch):
-    """Those that are there at once, and one that is longer than what is waited for."""
+def test_bodies_reach_the_page():
+    """Those that are there at once, and one that is longer than what is kept in memory."""
 
     def size(environ, start):
         start("200 OK", [("Content-Type", "text/plain")])
         return [str(len(environ["wsgi.input"].read())).encode()]
 
     server = Server(size, Address())
-    for length in (0, 10, pending_connections.WHOLE + 100_000):
+    for length in (0, 10, IN_MEMORY + 100_000):
         connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
         for _ in range(2):  # the second one by the same connection
             connection.request("POST", "/", b"a" * length)
@@ -485,29 +486,55 @@ def test_bodies_reach_the_page(serving, monkeypatch):
 
 
 @pytest.mark.slow
-def test_who_holds_a_thread_for_too_long_is_sent_away(monkeypatch):
-    """One who may ask, and sends the rest of a long body a byte at a time."""
-    monkeypatch.setattr(pending_connections, "LONGEST", 0.5)
-
-    def read(environ, start):
-        got.append(len(environ["wsgi.input"].read()))
-        start("200 OK", [])
-        return [b""]
-
-    got: list[int] = []
-    server = Server(read, Address())
+def test_who_sends_a_long_body_a_byte_at_a_time_is_sent_away(serving, monkeypatch):
+    monkeypatch.setattr(visitors, "DEADLINE", 2)
+    server = serving()
     one = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE)
-    length = pending_connections.WHOLE + 1000
+    length = IN_MEMORY + 1000
     head = f"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: {length}\r\n\r\n"
-    one.sendall(head.encode() + b"a" * (pending_connections.WHOLE + 10))
-    assert b"200" not in one.recv(1000)
+    one.sendall(head.encode() + b"a" * (IN_MEMORY + 10))
+    begun = time.monotonic()
+    with pytest.raises(OSError, match=r"reset|Broken pipe"):  # noqa: PT012
+        while time.monotonic() - begun < PATIENCE:
+            one.sendall(b"a")
+            time.sleep(0.2)
+    one.close()
+
+
+@pytest.mark.slow
+def test_who_takes_a_long_answer_too_slowly_is_sent_away(monkeypatch):
+    """It holds a thread where the answer is longer than what the server buffers."""
+    monkeypatch.setattr(visitors, "LONGEST", 1)
+    ended, piece = threading.Event(), b"a" * 1_000_000
+
+    def answer(environ, start):
+        start("200 OK", [])
+        try:
+            for _ in range(40):
+                yield piece
+        finally:
+            ended.set()
+
+    server = Server(answer, Address())
+    one = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE)
+    one.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    begun = time.monotonic()
+    while not ended.is_set() and time.monotonic() - begun < PATIENCE:
+        one.recv(10_000)
+        time.sleep(0.1)
+    assert ended.is_set()
+    got = 0
+    with suppress(ConnectionResetError):
+        while content := one.recv(1_000_000):
+            got += len(content)
+    assert got < 40 * len(piece)
     one.close()
     server.close()
 
 
 @pytest.mark.slow
 def test_more_visitors_than_there_is_room_for(serving, monkeypatch):
-    monkeypatch.setattr(pending_connections, "ROOM", 5)
+    monkeypatch.setattr(visitors, "ROOM", 5)
     server = serving()
     waiting = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(20)]
     for one in waiting:

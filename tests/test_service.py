@@ -17,7 +17,7 @@ from commands import bad, call, estimates, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.data_sources import source_of
+from livepde.cases.data import source_of
 from livepde.cases.live_case import Wiring
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
@@ -77,12 +77,6 @@ def table(*chosen: dict[str, object]) -> str:
     return "".join(",".join(str(cell) for cell in one.values()) + "\n" for one in chosen)
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 def case(data='file = "rows.csv"\nfollow = true', intake="", habit="") -> str:
     Path("case.toml").write_text(CASE.format(data=data, intake=intake, habit=habit))
     return "case.toml"
@@ -131,7 +125,7 @@ def test_another_file_is_followed_as_the_one_it_stands_for(here):
 
 @pytest.mark.parametrize("name", [None, "other.csv"])
 def test_a_file_that_is_not_there_yet_is_named(here, caplog, name):
-    source_of(cases.load(case()).frame, name, "").close()
+    source_of(cases.load(case()), name, "").close()
     assert f"there is no file '{name or 'rows.csv'}' yet: waits for it" in caplog.text
 
 

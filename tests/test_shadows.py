@@ -12,7 +12,7 @@ from factories import driven_rod, readings
 
 import livepde as lp
 from livepde.models import heat
-from livepde.runs.judgement import doubts
+from livepde.runs.run_verdict import doubts
 from livepde.stepping import Alexander2, ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 

@@ -63,11 +63,20 @@ def run(one, pieces):
     )
 
 
+# Each model, and each law that keeps more than a filter, at least once; all pairs: test_fleet.py.
+PAIRS = [
+    ("walks", "plain"),
+    ("rod", "usual"),
+    ("rod", "replay"),
+    ("rod", "auto"),
+    ("layers", "gate, noise"),
+    ("logarithm", "jumps"),
+    ("sources", "no guards, memory"),
+]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("model", "rule"),
-    [*((name, "plain") for name in MODELS), *(("rod", name) for name in LAWS), ("rod", "auto")],
-)
+@pytest.mark.parametrize(("model", "rule"), PAIRS)
 def test_equals_separate_identifiers(model, rule):
     built, chosen = MODELS[model](), lp.AutoLaw() if rule == "auto" else LAWS[rule]
     items = stream(built, {"walks": 8}.get(model, 16))

@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import bad, call
-from factories import driven_rod, readings
+from factories import driven_rod, readings, short_rod
 from skfem import ElementLineP1
 
 import livepde as lp
 from benchmarks.honest import honest
 from livepde import checkpoint, runs
-from livepde.cases.template import write_template
 from livepde.runs import drive
 
 NOISE = 0.02
@@ -156,7 +155,8 @@ def swinging(q, seed=0):
 
 
 def run(law=None, evolution=None, q=lambda t: 0.12, **options):
-    identifier = lp.Identifier(conducting(evolution), SENSORS, law or lp.SensitivityLaw())
+    chosen = law or lp.SensitivityLaw(shadows=None)
+    identifier = lp.Identifier(conducting(evolution), SENSORS, chosen)
     return identifier.run(swinging(q), **options)
 
 
@@ -174,7 +174,7 @@ def test_what_is_constant_has_one_value_at_all_times():
 
 @pytest.mark.long
 def test_names_times_and_fields_are_those_of_the_run():
-    result = run(evolution=lp.RandomWalk(0.2), fields_every=50)
+    result = run(lp.SensitivityLaw(), lp.RandomWalk(0.2), fields_every=50)
     data, smoothed = result.to_xarray(), result.smoothed()
     notes = {name for name in data.data_vars if str(name).endswith("_shift")}
     assert set(data.data_vars) - set(smoothed.data_vars) - notes <= {
@@ -233,7 +233,7 @@ CHANGES = {
 @pytest.mark.parametrize("name", CHANGES)
 def test_the_bank_smooths_by_the_member_that_explains_all_samples(name):
     """With `jumps` a member leads at the end whose unknown has stayed since."""
-    result = run(lp.AutoLaw(), q=CHANGES[name])
+    result = run(lp.AutoLaw(shadows=None), q=CHANGES[name])
     data, smoothed = result.to_xarray(), result.smoothed()
     errors = [d.a.values - CHANGES[name](data.time.values) for d in (smoothed, data)]
     mine, filtered = (np.sqrt(np.mean(error**2)) for error in errors)
@@ -281,9 +281,8 @@ def test_what_cannot_be_smoothed_says_so_in_a_sentence():
 def case(tmp_path, monkeypatch):
     """The case of `livepde init` with a smoother, in an empty folder."""
     monkeypatch.chdir(tmp_path)
-    path, _ = write_template(tmp_path / "rod")
-    text = path.read_text().replace("replay = true", "replay = false")
-    path.write_text(text + "\n[output]\nsmoothed = true\n")
+    path = short_rod(tmp_path / "rod")
+    path.write_text(path.read_text() + "\n[output]\nsmoothed = true\n")
     return "rod/case.toml"
 
 
@@ -300,9 +299,9 @@ def test_a_case_writes_it_beside_the_run(case):
     shutil.copytree("whole", "cut")
     with closing(sqlite3.connect("cut/journal.sqlite")) as journal, journal:
         journal.execute("DELETE FROM checkpoints")
-        journal.execute("DELETE FROM samples WHERE id > 60")
-        journal.execute("DELETE FROM estimates WHERE id > 59")
-        journal.execute("DELETE FROM fields WHERE id > 59")
+        journal.execute("DELETE FROM samples WHERE id > 20")
+        journal.execute("DELETE FROM estimates WHERE id > 19")
+        journal.execute("DELETE FROM fields WHERE id > 19")
     assert call("run", case, "--out", "cut", "--resume")[0] == 0
     xr.testing.assert_identical(runs.open("cut").dataset, whole)
     assert call("report", "whole")[0] == 0

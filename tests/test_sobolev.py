@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.linalg as sl
-from factories import CASES, excited, excited_q, excited_u, line, product, reaction
+from factories import CASES, excited, excited_q, excited_u, filter_alone, line, product, reaction
 from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP1, MeshTri
 
 import livepde as lp
@@ -188,8 +188,15 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("law", [lp.GradientLaw(gain=1e3), lp.SensitivityLaw(noise=1e-3)])
-@pytest.mark.parametrize("inner", [lp.Sobolev(0.75, 0.2), lp.Sobolev(1.5, 0.2), lp.Sobolev(2, 0.2)])
+@pytest.mark.parametrize(
+    ("law", "inner"),
+    [
+        (lp.GradientLaw(gain=1e3), lp.Sobolev(0.75, 0.2)),
+        (lp.GradientLaw(gain=1e3), lp.Sobolev(2, 0.2)),
+        (filter_alone(noise=1e-3), lp.Sobolev(0.75, 0.2)),
+        (filter_alone(noise=1e-3), lp.Sobolev(1.5, 0.2)),
+    ],
+)
 def test_both_laws_identify(law, inner):
     model = excited(16, ElementLineP1(), inner=inner)
     times = 0.05 * np.arange(101)

@@ -513,7 +513,7 @@ def conducts(q, u, v, x):
 
 
 def test_inputs_that_do_not_touch_the_state_keep_the_factor():
-    well = lp.On("left", lambda q, u, v, x: -x.inputs["Q"] / q.S * v)
+    well = lp.On("left", lambda q, _, v, x: -x.inputs["Q"] / q.S * v)
     apart = wells([conducts, well])
     mixed = wells(
         [conducts, lp.On("left", lambda q, u, v, x: -x.inputs["Q"] / q.S * v + 0 * u * v)]

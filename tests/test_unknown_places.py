@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 NOISE = 0.01
 MESH = lp.interval(0.0, 1.0, 24)
-TIMES = 0.05 * np.arange(161)
+TIMES = 0.05 * np.arange(101)
 D = 0.2
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from factories import observe
 from skfem import ElementQuad1, ElementQuad2, ElementTriRT1, ElementVector, MeshTri
 
 import livepde as lp
@@ -95,7 +96,7 @@ def test_a_modulus_is_identified_from_a_boundary_that_moves():
     pulled = {"left": (0.0, None), "bottom": (None, 0.0), "right": (lp.Channel("pull"), None)}
     model, true = elastic(pulled), 1.6
     points = lp.Points([[0.3, 0.9], [0.7, 0.9]], noise=1e-4)
-    observed = points.bind(model.state_space, model.X, model.parameter_space)
+    observed = observe(model, points)
     forward, u, rng = ForwardStage(model), model.initial(0.0, Moment(0.0, Inputs({"pull": 0.0}))), 0
     law, scheme = lp.SensitivityLaw(), lp.ImplicitEuler()  # one stage of which makes the truth
     identifier = lp.Identifier(model, points, law, u0=0.0, scheme=scheme)

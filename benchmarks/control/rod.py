@@ -51,8 +51,8 @@ def process(cells: int) -> Model:
         A=lambda q, u, v, x: q.k * dot(grad(u), grad(v)),
         B=lambda u, v, x: LOSS * u * v,
         f=[
-            lambda x, t: LOSS * x.inputs["room"],
-            On("left", lambda x, t: POWER * x.inputs["heater"]),
+            lambda x, _: LOSS * x.inputs["room"],
+            On("left", lambda x, _: POWER * x.inputs["heater"]),
         ],
         M=lambda u, v, x: CAPACITY * u * v,
         inputs=["heater", "room"],

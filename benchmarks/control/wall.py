@@ -95,8 +95,8 @@ def process(fine: int = 1) -> Model:
             On("right", lambda u, v, x: OUTSIDE * u * v),
         ],
         f=[
-            On("room", lambda x, t: (x.inputs["heater"] + AIRING * x.inputs["outside"]) / DEEP),
-            On("right", lambda x, t: OUTSIDE * x.inputs["outside"]),
+            On("room", lambda x, _: (x.inputs["heater"] + AIRING * x.inputs["outside"]) / DEEP),
+            On("right", lambda x, _: OUTSIDE * x.inputs["outside"]),
         ],
         M=lambda u, v, x: layered(x, LAYERS, 2) * u * v,
         inputs=["heater", "outside"],

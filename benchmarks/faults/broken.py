@@ -22,8 +22,7 @@ from benchmarks.faults.plants import PATIENCE
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from benchmarks.faults.run import hearing, undisturbed
 from livepde.cases import Case, load
-from livepde.cases.data import data_file
-from livepde.cases.data_sources import policy_of, source_of
+from livepde.cases.data import data_file, policy_of, source_of
 from livepde.errors import LivepdeError
 from livepde.identifier import Sample
 from livepde.records import Record
@@ -108,7 +107,7 @@ def _soil() -> tuple[Case, list[dict[str, Any]]] | None:
     try:
         path = next(path for path in find_cases() if path.stem == "soil_uniform")
         case = load(path, settings={"intake.leap": "10 d"})
-        with data_file(case.frame).open(newline="", encoding="utf-8") as file:
+        with data_file(case).open(newline="", encoding="utf-8") as file:
             rows = [dict(row) for row in csv.DictReader(file)]
         return case, [row for row in rows if row[case.clock.name] >= str(case.clock.start)]
     except (StopIteration, LivepdeError, OSError):
@@ -195,9 +194,9 @@ def fed(case: Case, rows: Sequence[Row], path: Path, count: int, rng: np.random.
 
 def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
     """Return what a live run of a file finds, and what it said of each line."""
-    spec = case.frame.spec.data
-    intake = Intake(case.columns, case.clock, policy_of(case.frame), missing=spec.missing)
-    feed = _Audited(source_of(case.frame, str(path), ""), intake)
+    spec = case.spec.data
+    intake = Intake(case.columns, case.clock, policy_of(case), missing=spec.missing)
+    feed = _Audited(source_of(case, str(path), ""), intake)
     begun: list[Ready] = []
     while not begun:
         begun += feed.poll(0.0)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -108,7 +109,8 @@ class Channels:
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
         """Return assimilated values and their noise, withheld values, and inputs, all checked.
 
-        The noise is None if no value has one of its own, NaN where one has none.
+        The noise is None if no value has one of its own, NaN where one has none. Among the inputs
+        may be other channels.
         """
         z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
@@ -127,25 +129,19 @@ class Channels:
             raise SampleError(
                 f"unknown channel '{unknown}'; this identifier has {list(self.names)}."
             )
-        values, noise = self._valued(z)
-        measured = _row(self.observed.names, values)
-        withheld = _row(self.hidden, values) if self.hidden else NOTHING
-        named = {name: values[name] for name in self.inputs if name in values}
-        return measured, own_noise(_row(self.observed.names, noise)), withheld, named
-
-    def _valued(self, z: Mapping[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the values of all channels, and the noise of the sensors that state one."""
         values: dict[str, float] = {}
-        noise: dict[str, float] = {}
+        stds: dict[str, float] = {}  # of the sensors that state one
         for name, value in z.items():  # words for a message cost more than the usual value
             if name in self.noise:
-                noise[self.noise[name]] = check_noise(self.noise[name], value)
+                stds[self.noise[name]] = check_noise(self.noise[name], value)
                 continue
             if isinstance(value, tuple | list):
-                value, noise[name] = self._pair(name, value)
+                value, stds[name] = self._pair(name, value)
             usual = type(value) is float and math.isfinite(value)
             values[name] = value if usual else number(value, f"channel '{name}'")
-        return values, noise
+        noise = own_noise(_row(self.observed.names, stds)) if stds else None
+        withheld = _row(self.hidden, values) if self.hidden else NOTHING
+        return _row(self.observed.names, values), noise, withheld, values
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
         """Return value and noise of a reading given as a pair."""
@@ -217,4 +213,5 @@ class Channels:
 
 
 def _row(names: Sequence[str], values: Mapping[str, float]) -> Array:
-    return np.array([values.get(name, math.nan) for name in names])
+    """Return the values of some names as an array, NaN where there is none."""
+    return np.array(list(map(values.get, names, repeat(math.nan))))

@@ -267,7 +267,8 @@ class Identifier:
         """
         t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
-        self.check_weighs(noise)
+        if noise is not None:
+            self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
         if self._state is None:
             self._begun_by(values, t)
@@ -275,9 +276,9 @@ class Identifier:
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         # A first sample at the initial time has an empty interval: both ends are the sample.
         start = self._inputs if t > self._t else values
-        names, gaps = self.inputs, {}
-        missing = np.array([name in held for name in names], dtype=float)
+        names, gaps = self._channels.inputs, {}
         if names:
+            missing = np.array(list(map(held.__contains__, names)), dtype=float)
             gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
@@ -291,9 +292,10 @@ class Identifier:
 
     def _time_of_next(self, t: float) -> float:
         """Return the time of the next sample, checked; only the first may be at the start."""
-        t = number(t, "time t")
-        if math.isnan(t):
-            raise SampleError("time t is NaN; give the time of the sample.")
+        if type(t) is not float or not math.isfinite(t):
+            t = number(t, "time t")
+            if math.isnan(t):
+                raise SampleError("time t is NaN; give the time of the sample.")
         self._check_reachable(t)
         if t < self._t or (t == self._t and self._samples):
             raise TimeOrderError(
@@ -305,7 +307,7 @@ class Identifier:
     def _begun_by(self, inputs: Inputs, t: float) -> None:
         """Begin with the inputs of the first sample, unless no finite state comes of them."""
         try:
-            with _quiet():
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
                 state = self._start(inputs)
                 finite = self.law.finite(self._work, state)
         except Exception as error:
@@ -319,23 +321,23 @@ class Identifier:
             )
         self._state, self._inputs = state, inputs
 
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # seen in the result
     def _stepped(self, interval: Interval) -> tuple[Any, Report]:
         """Return state and report after a sample; the state before it after a numerical failure.
 
         A numerical failure is an operation that raises, or a belief of the law that is not finite,
         be it only the squares of its numbers.
         """
-        before, t0, t1 = self._state, interval.t0, interval.t1
+        before = self._state
         try:
-            with _quiet():
-                if t1 > t0:
-                    state, report = self.law.step(self._work, before, interval)
-                else:
-                    state = self.law.begin(self._work, before, interval)
-                    report = Report(Status(), self._expected(interval))
-                if not report.status.taken or self.law.finite(self._work, state):
-                    return state, report
-                failure = Status("not_finite", "what the law believes after it is not finite")
+            if interval.t1 > interval.t0:
+                state, report = self.law.step(self._work, before, interval)
+            else:
+                state = self.law.begin(self._work, before, interval)
+                report = Report(Status(), self._expected(interval))
+            if not report.status.taken or self.law.finite(self._work, state):
+                return state, report
+            failure = Status("not_finite", "what the law believes after it is not finite")
         except Exception as error:
             found = numerical(error)
             if found is None:
@@ -379,13 +381,6 @@ class Identifier:
         """Return the belief of the law about the physical parameter."""
         return self.problem.physical(self.latent_belief())
 
-    def _reader(self) -> Callable[[], Belief]:
-        """Return a function that gives the current belief of the law, of the physical parameter."""
-        # Estimates that are kept hold the small state of the law; mean and factors are computed
-        # when read.
-        read, problem = self.law.reader(self._work, self._state), self.problem
-        return read if self.model.latent.plain else lambda: problem.physical(read())
-
     def _estimate(
         self,
         t: float,
@@ -397,7 +392,10 @@ class Identifier:
         *,
         scored: bool = False,
     ) -> Estimate:
-        read, error = self._reader(), withheld
+        # Estimates that are kept hold the small state of the law; mean and factors are computed
+        # when read.
+        latent, problem, error = self.law.reader(self._work, self._state), self.problem, withheld
+        read = latent if self.model.latent.plain else lambda: problem.physical(latent())
         if self.withheld is not None:
             belief = read()
             read = lambda: belief  # noqa: E731
@@ -436,8 +434,8 @@ class Identifier:
         """Return a function that gives the verdict on the run so far."""
         judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
-        inputs = self.inputs
-        if not names and not gaps.counts[1:].any():
+        inputs = self._channels.inputs
+        if not names and not (inputs and gaps.counts[1:].any()):
             return judge
 
         def found() -> Verdict:
@@ -731,11 +729,6 @@ def _check_start(model: Model, t0: float, u0: Any, u0_from: Mapping[str, Any] | 
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."
         )
-
-
-def _quiet() -> np.errstate:
-    """Return a context in which NumPy does not warn: an overflow is detected in the result."""
-    return np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:

@@ -31,7 +31,7 @@ from livepde.fem import (
     compose,
     dot,
     grad,
-    reads,
+    ignores,
     with_constants,
 )
 from livepde.linalg import Array, IntArray
@@ -103,7 +103,8 @@ class Model:
         Integrand (u, v, x), linear in v.
     f
         Source density: a number or f(x, t); for several components a mapping of names to those.
-        It is evaluated once for each set of inputs if it reads no time.
+        It is evaluated once for each set of inputs if its second argument is called `_` and it
+        does not read x.t.
     M
         Integrand (u, v, x) of the mass term, symmetric positive; default u v, or the sum of these
         products over the components. A component that it leaves out is algebraic: its equation
@@ -123,6 +124,8 @@ class Model:
     -----
     `A`, `B`, `f` and `M` may each be a list of terms; `On("left", form)` restricts a term to a
     named boundary or subdomain of the mesh. In a form, `x[0]` is a coordinate, `x.t` the time.
+    Call `u` in a term that ignores it `_`, as in (q, _, v, x): then time and inputs that the term
+    reads do not change the derivative in u, and factors are kept.
 
     Raises
     ------
@@ -559,7 +562,7 @@ def _as_density(source: Source, state: FunctionSpace) -> Integrand:
 def _single_density(source: Any, block: FieldBlock) -> Integrand:
     product = _pointwise(block)
     if callable(source):
-        timed = reads(source, 1)  # what it reads of x is seen where the form is evaluated
+        timed = not ignores(source, 1)  # what it reads of x is seen where the form is evaluated
         return lambda v, x: product(source(x, x.t if timed else 0.0), v)
     level = float(source)
     return lambda v, x: level * v

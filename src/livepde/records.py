@@ -6,10 +6,12 @@ layout of plain values. So a run can be read without its model, and while it is 
 
 from __future__ import annotations
 
+import json
 import math
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from sys import getsizeof
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,6 +21,7 @@ from livepde.linalg import Array
 
 if TYPE_CHECKING:
     import xarray as xr
+    from pydantic import TypeAdapter
 
 __all__ = [
     "DATE",
@@ -78,6 +81,35 @@ class Snapshot:
     told: Mapping[str, tuple[float, int]]
     correlation: Array | None = None
     left_out: Mapping[str, float] = field(default_factory=dict)
+
+    def to_bytes(self) -> bytes:
+        """Return names and sizes in JSON, a zero byte, and the numbers."""
+        head: dict[str, Any] = {"told": self.told, "left_out": self.left_out}
+        head["profiles"] = {name: len(values) for name, values in self.profiles.items()}
+        body = [values.tobytes() for values in self.profiles.values()]
+        if self.correlation is not None:
+            head["correlation"] = len(self.correlation)
+            body.append(self.correlation.tobytes())
+        # JSON has no zero byte, so that the first one ends it.
+        return json.dumps(head).encode() + b"\0" + b"".join(body)
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Snapshot:
+        """Return the snapshot in the bytes of `to_bytes`; others raise one of many errors."""
+        text, body = content.split(b"\0", 1)
+        head = json.loads(text)
+        sizes = [*head["profiles"].values()]
+        n = head.get("correlation")
+        numbers = np.frombuffer(body)
+        if len(numbers) != sum(sizes) + (n or 0) ** 2:
+            raise ValueError("fields of another size than they say")
+        *parts, rest = np.split(numbers, np.cumsum(sizes))
+        return cls(
+            dict(zip(head["profiles"], parts, strict=True)),
+            {name: (float(told), int(count)) for name, (told, count) in head["told"].items()},
+            None if n is None else rest.reshape(n, n),
+            {str(name): float(share) for name, share in head.get("left_out", {}).items()},
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,6 +397,11 @@ class Layout:
         """Return the layout as a JSON object."""
         return asdict(self)
 
+    @classmethod
+    def from_json(cls, text: str) -> Layout:
+        """Return a layout from JSON; raises `ValueError` where a type is wrong."""
+        return _layouts().validate_json(text)
+
     def dataset(self, records: Iterable[Record], last: Snapshot | None = None) -> xr.Dataset:
         """Return records as a dataset; see `Result.to_xarray`.
 
@@ -487,6 +524,13 @@ class Layout:
             errors = np.reshape(rows.withheld_error, (len(rows), len(self.withheld)))
             data["withheld_error"] = (("time", "withheld"), errors, unit)
         return data
+
+
+@cache
+def _layouts() -> TypeAdapter[Layout]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Layout)
 
 
 def bare(name: str) -> str:

@@ -184,7 +184,7 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     """
     # Most samples are arrays as they should be: they pass without the slower checks below.
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
-    if usual and np.isfinite(z).all():
+    if usual and np.count_nonzero(np.isfinite(z)) == z.size:
         return np.array(z), None
     if _are_pairs(z, observed.size):
         values, stds = np.array(z, dtype=object).T.tolist()

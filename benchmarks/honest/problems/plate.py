@@ -86,7 +86,7 @@ class Plate(Problem):
                 + q.ky * lp.grad(u)[1] * lp.grad(v)[1]
                 + q.loss * u * v
             ),
-            f=lambda x, t: x.inputs["P"] * bump(x[0], x[1]),
+            f=lambda x, _: x.inputs["P"] * bump(x[0], x[1]),
             inputs=["P"],
         )
 
@@ -171,6 +171,6 @@ class Reaction(Problem):
             {"q": q},
             A=lambda q, u, v, x: q.q * u * v,
             B=lambda u, v, x: D * lp.dot(lp.grad(u), lp.grad(v)),
-            f=lambda x, t: x.inputs["S"] * shape(x[0], x[1]),
+            f=lambda x, _: x.inputs["S"] * shape(x[0], x[1]),
             inputs=["S"],
         )

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomlkit
 
 from livepde.cases.case_channels import (
     columns_of,
+    expanded,
     initial_of,
     initial_weights,
     input_noise_of,
@@ -22,15 +24,12 @@ from livepde.cases.case_channels import (
     sensor_notes,
 )
 from livepde.cases.case_frame import Frame
-from livepde.cases.case_model import drive_notes, mesh_of, model_of, options_of, process_notes
-from livepde.cases.conditions import conditioned
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
-from livepde.cases.instruments import expanded
+from livepde.cases.geometry import mesh_of
 from livepde.cases.laws import law_of
-from livepde.cases.read import did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import VariantSpec
-from livepde.cases.settings import apply, to_toml
+from livepde.cases.process import conditioned, drive_notes, model_of, options_of, process_notes
+from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
@@ -78,8 +77,8 @@ class Prepared:
     def identifier(self) -> Identifier:
         """The identifier, before the first sample."""
         identifier = self.identifier_with(self.case.law)
-        if self.case.smoothed and (why := identifier.unsmoothed):
-            raise self.case.frame.error("output.smoothed", f"{why}; leave it out.")
+        if self.case.spec.output.smoothed and (why := identifier.unsmoothed):
+            raise self.case.error("output.smoothed", f"{why}; leave it out.")
         return identifier
 
     def identifier_with(self, law: AnyLaw, sensors: Observation | None = None) -> Identifier:
@@ -105,17 +104,17 @@ class Prepared:
             return {}
         weights = {}
         if self.u0 is not None:
-            weights = initial_weights(case.frame, case.mesh, self.first)
-        return {"input_noise": input_noise_of(case.frame), "u0_from": weights}
+            weights = initial_weights(case, case.mesh, self.first)
+        return {"input_noise": input_noise_of(case), "u0_from": weights}
 
     @cached_property
     def u0(self) -> Any:
         """The initial state: a number, or a function of x; None if the model defines it."""
-        frame = self.case.frame
-        if self.case.model.form_initial is None:
-            return initial_of(frame, self.case.mesh, self.first)
-        if frame.spec.initial is not None:
-            raise frame.error("initial", "the equation has its own initial state; leave it out.")
+        case = self.case
+        if case.model.form_initial is None:
+            return initial_of(case, case.mesh, self.first)
+        if case.spec.initial is not None:
+            raise case.error("initial", "the equation has its own initial state; leave it out.")
         return None
 
     def typical(self, inputs: Mapping[str, float]) -> float:
@@ -142,7 +141,7 @@ class Prepared:
         return replace(
             found,
             numbers={**found.numbers, **references},
-            length_unit=self.case.frame.equation.length_unit,
+            length_unit=self.case.equation.length_unit,
             attrs=self.attributes,
         )
 
@@ -153,7 +152,7 @@ class Prepared:
     @property
     def attributes(self) -> dict[str, Any]:
         """Attributes of a dataset of this case: title, equation, start and source of references."""
-        equation = self.case.frame.equation
+        equation = self.case.equation
         found: dict[str, Any] = {"title": self.case.title, "equation": equation.formula}
         if np.isfinite(self.assimilate_from):
             found["assimilate_from"] = self.assimilate_from
@@ -192,175 +191,149 @@ def load(
     document = read_toml(text, str(file))
     if settings:
         document = apply(document, settings, str(file))
-        text = to_toml(document)
+        text = tomlkit.dumps(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.
     frame = conditioned(expanded(Frame(file, spec, resolve(*place), reader_of(*place))))
-    case = Case(frame, text, original)
+    case = Case(frame.path, frame.spec, frame.equation, frame.reader, text, original)
     case.check()
     return case
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
+class Case(Frame):
     """A case file with consistent parts; `prepare` adds the data.
 
     Attributes
     ----------
-    frame
-        File, specification and equation.
     text
         The effective case: content of the file, or of the file with settings applied.
     original
         The file's content.
     """
 
-    frame: Frame
     text: str
     original: str
 
     def check(self) -> None:
         """Build all parts that need no data; raises `CaseError`."""
         _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max, self.references, input_noise_of(self.frame)
+        _ = self.scheme, self.dt_max, self.references, input_noise_of(self)
         self._check_names()
 
     def _check_names(self) -> None:
         """Refuse names of unknowns and channels that are reserved for other numbers of a run."""
         kinds = (
             ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
-            ("channels", "channel", self.frame.roles("sensor", "withheld"), ROLES),
+            ("channels", "channel", self.roles("sensor", "withheld"), ROLES),
         )
         for key, kind, given, taken in kinds:
             for name in given:
                 if name in taken:
                     text = f"'{name}' is another number in [expect]; give the "
-                    raise self.frame.error(f"{key}.{name}", f"{text}{kind} another name.")
-
-    @property
-    def name(self) -> str:
-        """Name of the case, used for its run directories."""
-        return self.frame.name
+                    raise self.error(f"{key}.{name}", f"{text}{kind} another name.")
 
     @property
     def title(self) -> str:
         """The title, or the name of the file."""
-        return self.frame.spec.title or self.frame.path.stem
+        return self.spec.title or self.path.stem
 
     @cached_property
     def references(self) -> dict[str, float]:
         """Label of an unknown -> its reference value, in the model's unit."""
-        frame, space = self.frame, self.model.parameter_space
+        space = self.model.parameter_space
         found = {}
-        for label, value in frame.spec.reference.items():
+        for label, value in self.spec.reference.items():
             # 'source' names the publication, unless an unknown of that name exists.
             if label == "source" and label not in space.labels:
                 continue
-            if label not in space.labels:
-                text = f"there is no unknown number '{label}'; "
-                raise frame.error("reference", text + did_you_mean(label, space.labels))
+            text = f"there is no unknown number '{label}'"
+            self.require(label, space.labels, "reference", text)
             unit = space.unknown_of(label).unit
-            found[label] = frame.convert(value, unit, f"reference.{label}")
+            found[label] = self.convert(value, unit, f"reference.{label}")
         return found
 
     @property
     def source(self) -> str:
         """Source of the references: a publication, say."""
-        given = self.frame.spec.reference.get("source", "")
+        given = self.spec.reference.get("source", "")
         return given if isinstance(given, str) and "source" not in self.references else ""
-
-    @property
-    def variants(self) -> tuple[VariantSpec, ...]:
-        """The case with other values, by name."""
-        return self.frame.spec.variants
 
     @property
     def expected(self) -> dict[str, tuple[Sense, Bound]]:
         """Numbers that the case expects of its run."""
-        return dict(self.frame.spec.expect)
-
-    @property
-    def fields_every(self) -> int:
-        """Number of samples between two that keep their fields."""
-        return self.frame.spec.output.fields_every
-
-    @property
-    def smoothed(self) -> bool:
-        """Whether a finished run ends with the smoother."""
-        return self.frame.spec.output.smoothed
+        return dict(self.spec.expect)
 
     @cached_property
     def mesh(self) -> Any:
         """The mesh."""
-        return mesh_of(self.frame)
+        return mesh_of(self)
 
     @cached_property
     def options(self) -> dict[str, Any]:
         """Known numbers of the equation."""
-        return options_of(self.frame)
+        return options_of(self)
 
     @cached_property
     def model(self) -> Model:
         """The model."""
-        return model_of(self.frame, self.mesh, self.options)
+        return model_of(self, self.mesh, self.options)
 
     @cached_property
     def columns(self) -> dict[str, Column]:
         """Channel -> its column in the data."""
-        return columns_of(self.frame)
+        return columns_of(self)
 
     @cached_property
     def observation(self) -> Observation:
         """The assimilated sensors."""
-        observation = observation_of(self.frame, self.mesh, self.options, "sensor")
+        observation = observation_of(self, self.mesh, self.options, "sensor")
         if observation is None:
             text = "there is no sensor to learn from; give at least one channel role = 'sensor'."
-            raise self.frame.error("channels", text)
+            raise self.error("channels", text)
         return observation
 
     @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors that are assimilated."""
-        return tuple(self.frame.roles("sensor"))
+        return tuple(self.roles("sensor"))
 
     @cached_property
     def withheld(self) -> Observation | None:
         """The withheld sensors, which are scored only; None if there are none."""
-        return observation_of(self.frame, self.mesh, self.options, "withheld")
+        return observation_of(self, self.mesh, self.options, "withheld")
 
     @cached_property
     def law(self) -> AnyLaw:
         """The update law."""
-        return law_of(self.frame)
+        return law_of(self)
 
     @cached_property
     def scheme(self) -> Scheme:
         """The time scheme."""
         schemes = {"alexander2": Alexander2(), "implicit-euler": ImplicitEuler()}
-        name = self.frame.spec.steps.scheme
+        name = self.spec.steps.scheme
         return self.law.scheme if name is None else schemes[name]
 
     @cached_property
     def dt_max(self) -> float:
         """The longest time step."""
-        longest = self.frame.spec.steps.dt_max
-        if longest is None:
-            return float(np.inf)
-        return self.frame.positive(longest, self.frame.equation.time_unit, "steps.dt_max")
+        unit = self.equation.time_unit
+        return self.positive(self.spec.steps.dt_max, unit, "steps.dt_max", np.inf)
 
     @cached_property
     def clock(self) -> Clock:
         """The clock, which converts the column of times."""
-        return clock_of(self.frame)
+        return clock_of(self)
 
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
         found = [
-            *drive_notes(self.frame, self.model),
-            *process_notes(self.frame, self.mesh),
-            *sensor_notes(self.frame, self.mesh),
+            *drive_notes(self, self.model),
+            *process_notes(self, self.mesh),
+            *sensor_notes(self, self.mesh),
         ]
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(
@@ -372,7 +345,7 @@ class Case:
     def _expected_notes(self) -> list[str]:
         """Name expected numbers that no run of this case can have; see `runs.measures`."""
         labels = list(self.model.parameter_space.labels)
-        scored = list(self.frame.roles("sensor", "withheld"))
+        scored = list(self.roles("sensor", "withheld"))
         known = [
             *labels,
             *(f"{label}.std" for label in labels),
@@ -405,15 +378,15 @@ class Case:
 
     def read(self, source: str | Iterable[str] | None = None) -> Prepared:
         """Return the case with its data, as `prepare` does, before an identifier is built."""
-        raw = read_data(self.frame, self.columns, self.clock, source)
-        data = without_gaps(self.frame, raw) if isinstance(raw, DataTable) else raw
+        raw = read_data(self, self.columns, self.clock, source)
+        data = without_gaps(self, raw) if isinstance(raw, DataTable) else raw
         # The first sample is needed before the run. A stream can be read only once, so it is put
         # back.
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
-            raise DataError(f"{self.frame.path}: the data hold no sample between start and stop.")
-        start = assimilation_start(self.frame, self.clock, data.origin)
+            raise DataError(f"{self.path}: the data hold no sample between start and stop.")
+        start = assimilation_start(self, self.clock, data.origin)
         if isinstance(data, DataTable) and isinstance(raw, DataTable):
             return Prepared(self, first, data, start, data.origin, raw)
         return Prepared(self, first, chain([first], samples), start, data.origin)
@@ -421,13 +394,13 @@ class Case:
     @property
     def live(self) -> bool:
         """Whether the case's own source is live: a file that grows, a broker or a server."""
-        return self.frame.spec.data.live
+        return self.spec.data.live
 
     def goes_on(self, data: str | None) -> bool:
         """Return whether a source is live: the case's own, or a file instead of a followed one."""
         if data is None:
             return self.live
-        return self.frame.spec.data.follow and data != "-" and not data.endswith(".parquet")
+        return self.spec.data.follow and data != "-" and not data.endswith(".parquet")
 
     def begin(self, first: Sample, origin: datetime | None = None) -> Prepared:
         """Return the case with the first sample of a live process.
@@ -444,7 +417,7 @@ class Case:
         DataError
             The sample lacks values needed for the initial state or inputs.
         """
-        start = assimilation_start(self.frame, self.clock, origin)
+        start = assimilation_start(self, self.clock, origin)
         prepared = Prepared(self, first, (), start, origin)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared

@@ -1,27 +1,28 @@
-"""The channels of a case: columns, positions, noise, observations, initial state."""
+"""Channels of a case: columns, sensors with their unknowns, noise, initial state."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import chain
+from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+import pandas as pd
 
 from livepde.cases.case_frame import Frame
-from livepde.cases.case_model import constants_of
-from livepde.cases.instruments import calibrated, positions_of
-from livepde.cases.read import did_you_mean
-from livepde.cases.regions import sides_of
-from livepde.cases.schema import ChannelSpec, GradientSpec, TikhonovSpec
+from livepde.cases.geometry import sides_of
+from livepde.cases.read import did_you_mean, is_blank
+from livepde.cases.schema import CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
-from livepde.errors import MissingInputError
-from livepde.fem import with_constants
+from livepde.errors import CaseError, MissingInputError
+from livepde.fem import MeanReverting, Normal, Scalars, Unknown, with_constants
 from livepde.identifier import Sample
 from livepde.observation import (
     Averages,
+    Calibrated,
     Combined,
     Discrepancy,
     LineIntegrals,
@@ -32,19 +33,22 @@ from livepde.observation import (
     Reconstruction,
     Tikhonov,
 )
+from livepde.observation.placed import POSITION, shift_names
 from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
 
 __all__ = [
+    "calibrated",
     "columns_of",
+    "expanded",
     "initial_of",
     "initial_weights",
     "input_noise_of",
     "noise_of",
     "observation_of",
     "sensor_notes",
+    "unknowns_of",
 ]
-
 
 # The first sample interpolated: with the noise of its readings, or as if they had none.
 INTERPOLATED = ("interpolate", "interpolate-exact")
@@ -136,9 +140,7 @@ def _regions(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> di
     for name, item in channels.items():
         key = f"channels.{name}.over"
         if isinstance(item.over, str):
-            if item.over not in known:
-                text = f"the mesh has no part '{item.over}'; {did_you_mean(item.over, known)}"
-                raise frame.error(key, text)
+            frame.require(item.over, known, key, f"the mesh has no part '{item.over}'")
             regions[name] = item.over
         else:
             regions[name] = _inside(sides_of(frame, item.over, len(mesh.p), key))
@@ -163,9 +165,8 @@ def _followed(
     for name, item in channels.items():
         given = item.follows if isinstance(item.follows, tuple) else (str(item.follows),)
         for channel in given:
-            if channel not in known:
-                text = f"there is no channel '{channel}' of role position; "
-                raise frame.error(f"channels.{name}.follows", text + did_you_mean(channel, known))
+            text = f"there is no channel '{channel}' of role position"
+            frame.require(channel, known, f"channels.{name}.follows", text)
         if len(given) != len(mesh.p):
             text = f"got {len(given)} channels; needs one for each of {len(mesh.p)} coordinates."
             raise frame.error(f"channels.{name}.follows", text)
@@ -189,13 +190,13 @@ def _part(
     if kind == "follows":
         return Moving(_followed(frame, mesh, channels), **common)
     points = {name: _position(frame, mesh, name, item) for name, item in channels.items()}
-    constants = constants_of(frame)
+    constants = frame.constants
     direct = {  # what a quantity sees beside the state
         name: with_constants(frame.equation.quantities[item.quantity].direct(options), constants)
         for name, item in channels.items()
         if item.quantity is not None
     }
-    uncertain = positions_of(frame, channels)
+    uncertain = {name: std for name, std in _shifted(frame).items() if name in channels}
     return Points(points, direct, uncertain or None, **common)
 
 
@@ -225,9 +226,8 @@ def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
     low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
     if channel.quantity is not None:
         known, asked = frame.equation.quantities, channel.quantity
-        if asked not in known:
-            text = f"'{frame.equation.name}' has no quantity '{asked}'; "
-            raise frame.error(f"channels.{name}.quantity", text + did_you_mean(asked, known))
+        text = f"'{frame.equation.name}' has no quantity '{asked}'"
+        frame.require(asked, known, f"channels.{name}.quantity", text)
         return known[asked].at(float(low[0]), float(high[0]))
     return _inside_mesh(frame, mesh, channel.at, key)
 
@@ -268,12 +268,7 @@ def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
 
 def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
     """Return the noise of each sensor of a role; None if none is given."""
-    channels, unit = frame.roles(role), frame.equation.state.unit
-    levels = {
-        name: frame.positive(channel.noise, unit, f"channels.{name}.noise")
-        for name, channel in channels.items()
-        if channel.noise is not None
-    }
+    channels, levels = frame.roles(role), _stated(frame, "noise", role)
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."
@@ -283,11 +278,7 @@ def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
 
 def input_noise_of(frame: Frame) -> dict[str, float]:
     """Return the noise of the boundary and input channels that state one."""
-    return {
-        name: frame.positive(channel.noise, frame.unit(name), f"channels.{name}.noise")
-        for name, channel in frame.roles("boundary", "input").items()
-        if channel.noise is not None
-    }
+    return _stated(frame, "noise", "boundary", "input")
 
 
 def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
@@ -367,3 +358,173 @@ def _initial_readings(frame: Frame, mesh: Any, first: Sample) -> list[_Reading]:
             "the first sample; start later, or give a number."
         )
     return present
+
+
+MEMBERS = 10_000  # channels of one `each`
+
+
+def expanded(frame: Frame) -> Frame:
+    """Return the frame with every family of channels, `each` or `positions`, as single ones."""
+    channels: dict[str, ChannelSpec] = {}
+    for name, channel in frame.spec.channels.items():
+        if channel.each is not None:
+            key, members = f"channels.{name}.each", _evenly(frame, name, channel)
+        elif channel.positions is not None:
+            key, members = f"channels.{name}.positions", _listed(frame, name, channel)
+        else:
+            channels[name] = channel
+            continue
+        for label, (at, column) in members.items():
+            if label in frame.spec.channels or label in channels:
+                raise frame.error(key, f"there is a channel '{label}' already; rename it.")
+            member = {"each": None, "positions": None, "at": at, "column": column}
+            channels[label] = channel.model_copy(update=member)
+    spec: CaseSpec = frame.spec.model_copy(update={"channels": channels})
+    return Frame(frame.path, spec, frame.equation, frame.reader)
+
+
+def _evenly(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+    """Return place and column of each sensor of a row with even distances."""
+    start, stop, count = channel.each or (0.0, 0.0, 0)
+    unit, key = frame.equation.length_unit, f"channels.{name}.each"
+    if count > MEMBERS:
+        raise frame.error(key, f"got {count} channels; expected at most {MEMBERS}.")
+    ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
+    return {
+        f"{name}_{k}": (x, str(channel.column).replace("{}", str(k)))
+        for k, x in enumerate(np.linspace(*ends, count).tolist())
+    }
+
+
+def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+    """Return place and column of each sensor of a table of positions."""
+    key, file = f"channels.{name}.positions", frame.path.parent / str(channel.positions)
+    table = _positions_table(frame, key, file)
+    axes = [axis for axis in "xyz" if axis in table.columns]
+    found: dict[str, tuple[Any, str]] = {}
+    # Row 1 of the file is its header.
+    for row, label in enumerate(table["name"], 2):
+        if not label or label in found:
+            what = f"the name '{label}' stands there twice" if label else "the name is missing"
+            raise frame.error(key, f"{file}, row {row}: {what}.")
+        where = f"{key}: {file}, row {row}"
+        place = tuple(_coordinate(frame, table[axis][row - 2], where) for axis in axes)
+        column = str(channel.column or "{}").replace("{}", label)
+        found[label] = (place if len(place) > 1 else place[0], column)
+    return found
+
+
+def _positions_table(frame: Frame, key: str, file: Path) -> pd.DataFrame:
+    """Return a table with the columns name, x (and y, z), as text; empty where a cell is."""
+    try:
+        table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
+    except (OSError, ValueError) as error:
+        raise frame.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
+    if "name" not in table.columns or table.columns.intersection(["x", "y", "z"]).empty:
+        got = ", ".join(map(str, table.columns[:8]))
+        raise frame.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
+    if len(table) > MEMBERS:
+        raise frame.error(key, f"{file} has more than {MEMBERS} sensors.")
+    return table
+
+
+def _coordinate(frame: Frame, cell: str, where: str) -> float:
+    if is_blank(cell):
+        raise CaseError(f"{where}: still to be filled in, where it says '?'.")
+    try:
+        value: float | str = float(cell)
+    except ValueError:
+        value = cell
+    number = frame.convert(value, frame.equation.length_unit, where)
+    if not np.isfinite(number):
+        raise frame.error(where, f"got '{cell}'; expected a coordinate.")
+    return number
+
+
+def unknowns_of(frame: Frame) -> dict[str, Unknown]:
+    """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
+    state = frame.equation.state.unit
+    found: dict[str, Unknown] = {}
+    # Differences of a temperature are in K.
+    unit = "K" if state == "degC" else state
+    if offsets := _stated(frame, "offset", "sensor"):
+        prior = Normal(0.0, _common(frame, offsets, "offset"))
+        found["offset"] = Scalars(tuple(offsets), prior, unit=unit)
+    # A gain is a factor without a unit, 1 for an exact sensor.
+    if gains := _stated(frame, "gain", "sensor", unit=""):
+        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(frame, gains, "gain")))
+    if stds := _shifted(frame):
+        places = {name: frame.spec.channels[name].at for name in stds}
+        names = [
+            shift
+            for name, at in places.items()
+            for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
+        ]
+        prior = Normal(0.0, _common(frame, stds, "at_std"))
+        found[POSITION] = Scalars(names, prior, unit=frame.equation.length_unit)
+    if errors := _correlated(frame):
+        std, time = _common(frame, errors, "correlated")
+        # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
+        prior, fades = Normal(0.0, std), MeanReverting(time)
+        found["correlated"] = Scalars(tuple(errors), prior, unit=unit, evolution=fades)
+    return found
+
+
+def _shifted(frame: Frame) -> dict[str, float]:
+    """Return the standard deviation of the position of each sensor that states one."""
+    return _stated(frame, "at_std", "sensor", unit=frame.equation.length_unit)
+
+
+def _correlated(frame: Frame) -> dict[str, tuple[float, float]]:
+    """Return standard deviation and correlation time of the errors of sensors that fade."""
+    found = {}
+    for name, item in frame.roles("sensor").items():
+        if item.correlated is not None:
+            key = f"channels.{name}.correlated"
+            std = frame.positive(item.correlated.std, frame.equation.state.unit, f"{key}.std")
+            time = frame.positive(item.correlated.time, frame.equation.time_unit, f"{key}.time")
+            found[name] = (std, time)
+    return found
+
+
+def _stated(frame: Frame, key: str, *roles: str, unit: str | None = None) -> dict[str, float]:
+    """Return a number > 0 of each channel that states one, in the channel's unit or another."""
+    return {
+        name: frame.positive(
+            value, frame.unit(name) if unit is None else unit, f"channels.{name}.{key}"
+        )
+        for name, item in frame.roles(*roles).items()
+        if (value := getattr(item, key)) is not None
+    }
+
+
+def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
+    """Return the common value of all sensors: they share a prior."""
+    (first, value), *others = given.items()
+    for name, other in others:
+        if other != value:
+            text = f"differs from that of '{first}'; all sensors share one prior."
+            raise frame.error(f"channels.{name}.{key}", text)
+    return value
+
+
+def calibrated(
+    frame: Frame, base: Observation, names: Sequence[str], **options: Any
+) -> Observation:
+    """Return the readings: gain * (reading of the base) + offset + correlated."""
+    channels = frame.spec.channels
+
+    def reading(y: Any, q: Any, x: Any) -> Any:
+        shown = []
+        for value, name in zip(y, names, strict=True):
+            channel = channels[name]
+            if channel.gain is not None:
+                value = q.gain[name] * value
+            if channel.offset is not None:
+                value = value + q.offset[name]
+            if channel.correlated is not None:
+                value = value + q.correlated[name]
+            shown.append(value)
+        return np.array(shown)
+
+    return Calibrated(base, reading, **options)

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from livepde.cases.limits import LARGEST, SMALLEST
+import numpy as np
+
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
-from livepde.cases.units import convert
+from livepde.cases.units import LARGEST, SMALLEST, convert
 from livepde.errors import CaseError
 from livepde.models import Equation
 
@@ -37,13 +38,26 @@ class Frame:
     path: Path
     spec: CaseSpec
     equation: Equation
-    reader: Callable[..., Any] | None = None
+    reader: Callable[..., Any] | None
 
     @property
     def name(self) -> str:
         """Name of the case: that of its file, or of its folder if the file is 'case.toml'."""
         path = self.path.absolute()
         return path.stem if path.stem != "case" else path.parent.name or "case"
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The inputs of the equation that are constants, in its units."""
+        known, given = self.equation.inputs, self.spec.inputs
+        self.only(given, known, "inputs")
+        for name in given:
+            if name in self.spec.channels:
+                raise self.error(f"inputs.{name}", f"there is a channel '{name}', too; keep one.")
+        return {
+            name: self.convert(value, known[name].unit, f"inputs.{name}")
+            for name, value in given.items()
+        }
 
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""
@@ -69,8 +83,10 @@ class Frame:
         """Return a quantity in the model's unit."""
         return convert(value, unit, self.where(key), difference=difference)
 
-    def positive(self, value: Any, unit: str, key: str) -> float:
-        """Return a difference or duration in the model's unit, which has to be positive."""
+    def positive(self, value: Any, unit: str, key: str, default: float = np.nan) -> float:
+        """Return a difference or duration in the model's unit, > 0; a default if there is none."""
+        if value is None:
+            return default
         number = self.convert(value, unit, key, difference=True)
         if not number > 0:
             raise self.error(key, f"got {value!r}; expected more than 0.")
@@ -89,9 +105,14 @@ class Frame:
     def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
         """Raise unless every name given is known to the equation."""
         for name in given:
-            if name not in known:
-                text = f"the equation '{self.equation.name}' has no '{name}' here; "
-                raise self.error(key, text + did_you_mean(name, known))
+            self.require(
+                name, known, key, f"the equation '{self.equation.name}' has no '{name}' here"
+            )
+
+    def require(self, name: str, known: Iterable[str], key: str, text: str) -> None:
+        """Raise an error that begins with `text` unless a name is one of `known`."""
+        if name not in known:
+            raise self.error(key, f"{text}; {did_you_mean(name, known)}")
 
     def roles(self, *roles: str) -> dict[str, ChannelSpec]:
         """Return the channels of some roles."""

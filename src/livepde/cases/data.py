@@ -1,7 +1,9 @@
-"""The data of a case: which file, which times."""
+"""Data of a case: files, times, live sources, and destinations of estimates."""
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -9,16 +11,17 @@ from dataclasses import replace
 from datetime import datetime, tzinfo
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from livepde.cases.case_frame import Frame
-from livepde.cases.code import check_options, load_code
-from livepde.cases.schema import CaseSpec, DataSpec, FileSpec
+from livepde.cases.equations import check_options, load_code
+from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
 from livepde.errors import LivepdeError
+from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
     Column,
@@ -31,22 +34,34 @@ from livepde.streams import (
 from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
+from livepde.streams.intake import Habit, Policy
 from livepde.streams.join import join_tables
-from livepde.streams.names import no_file
-from livepde.streams.table import JSON_LINES
+from livepde.streams.mqtt import Broker, MqttSink, MqttSource
+from livepde.streams.sources import Follow, Lines, RowSource
+from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = [
+    "Data",
     "assimilation_start",
     "check_hours",
     "clock_of",
     "data_file",
+    "limits_of",
+    "policy_of",
+    "publishers_of",
     "read_data",
     "reader_of",
+    "source_of",
+    "source_text",
     "without_gaps",
 ]
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
+UNSET = (
+    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
+    "the measurements."
+)
 
 
 def clock_of(frame: Frame, data: DataSpec | None = None) -> Clock:
@@ -113,22 +128,19 @@ def check_hours(frame: Frame, clock: Clock, source: Any) -> None:
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
     """Return the data of a file, whose ending tells its format."""
+    rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing}
     if path.suffix in JSON_LINES:
-        return read_json_lines(path, columns, clock, every=spec.every, missing=spec.missing)
+        return read_json_lines(path, columns, clock, **rows)
     if path.suffix == ".parquet":
         from livepde.streams.parquet import read_parquet
 
-        return read_parquet(path, columns, clock, every=spec.every, missing=spec.missing)
-    return read_csv(
-        path,
-        columns,
-        clock,
-        every=spec.every,
-        missing=spec.missing,
-        separator=spec.separator,
-        encoding=spec.encoding,
-        skip=spec.skip,
-    )
+        return read_parquet(path, columns, clock, **rows)
+    written: dict[str, Any] = {
+        "separator": spec.separator,
+        "encoding": spec.encoding,
+        "skip": spec.skip,
+    }
+    return read_csv(path, columns, clock, **rows, **written)
 
 
 def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> DataTable:
@@ -206,9 +218,9 @@ def _from_reader(
     except LivepdeError:
         raise
     except FileNotFoundError as error:
-        raise frame.error(
-            "data.reader", f"there is no file '{error.filename}'.{_unset(folder)}"
-        ) from None
+        remedy = "" if folder else f" {UNSET}"
+        text = f"there is no file '{error.filename}'.{remedy}"
+        raise frame.error("data.reader", text) from None
     except Exception as error:
         text = f"{spec.reader} failed with {type(error).__name__}: {error}."
         raise frame.error("data.reader", text) from error
@@ -221,11 +233,6 @@ def _from_reader(
     return tabulated(
         times, values, columns, clock, every=spec.every, missing=spec.missing, where=where
     )
-
-
-def _unset(folder: Path | None) -> str:
-    remedy = f" {VARIABLE} is not set; set it to the folder that holds the measurements."
-    return "" if folder else remedy
 
 
 def data_file(frame: Frame) -> Path:
@@ -242,22 +249,13 @@ def data_file(frame: Frame) -> Path:
 def _found(frame: Frame, given: str) -> Path:
     """Return where a file of the case is; relative names start at the case file."""
     if VARIABLE in given:
-        given = given.replace(VARIABLE, str(_data_folder(frame)))
+        if (folder := _measurements(frame)) is None:
+            raise frame.error("data.file", UNSET)
+        given = given.replace(VARIABLE, str(folder))
     path = frame.path.parent / Path(given).expanduser()
     if not path.is_file() and not frame.spec.data.follow:
         raise frame.error("data.file", str(no_file(path)))
     return path
-
-
-def _data_folder(frame: Frame) -> Path:
-    folder = _measurements(frame)
-    if folder is None:
-        raise frame.error(
-            "data.file",
-            f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that "
-            "holds the measurements.",
-        )
-    return folder
 
 
 def _measurements(frame: Frame) -> Path | None:
@@ -287,3 +285,133 @@ def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> f
         text = f"got '{value}'; expected a date as 2025-04-01 12:00."
         raise frame.error("data.assimilate_from", text)
     return (stamp - since_1970(origin)) * clock.second
+
+
+LOG = logging.getLogger("livepde.run")
+LEAP = "30 d"  # after a longer pause a second row has to confirm the time
+
+Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
+
+
+def source_of(frame: Frame, data: Data, position: str) -> RowSource:
+    """Return the source of the rows of a case, from a position on."""
+    match data:
+        case None:
+            return _own_source(frame, position)
+        case str():
+            return _file_source(frame, Path(data), position)
+        case Iterable():
+            return Lines(data)
+    return data
+
+
+def _own_source(frame: Frame, position: str) -> RowSource:
+    """Return the source that the case names: a broker, a server or a file."""
+    spec = frame.spec.data
+    if spec.mqtt is not None:
+        topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
+        return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.times[0])
+    if spec.opcua is not None:
+        from livepde.streams.opcua import OpcuaSource
+
+        return OpcuaSource(
+            spec.opcua.url,
+            spec.opcua.columns,
+            spec.times[0],
+            interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
+            username=spec.opcua.username,
+            password=_password(frame, spec.opcua.password_env, "data.opcua"),
+        )
+    return _file_source(frame, data_file(frame), position)
+
+
+def _file_source(frame: Frame, path: Path, position: str) -> Follow:
+    spec = frame.spec.data
+    if spec.follow and not path.exists():
+        LOG.warning("there is no file '%s' yet: waits for it", path)
+    return Follow(
+        path,
+        separator=spec.separator,
+        encoding=spec.encoding,
+        follow=spec.follow,
+        position=position,
+    )
+
+
+def publishers_of(frame: Frame) -> list[Sink]:
+    """Return the sinks that a case names."""
+    spec = frame.spec.output.mqtt
+    if spec is None:
+        return []
+    return [MqttSink(_broker(frame, spec, "output.mqtt"), spec.topic)]
+
+
+def source_text(frame: Frame) -> str:
+    """Return a description of the source of the rows of a case."""
+    spec = frame.spec.data
+    if spec.mqtt is not None:
+        topics = ", ".join([*spec.mqtt.rows, *spec.mqtt.columns])
+        return f"{topics} of the broker at {spec.mqtt.host}:{spec.mqtt.port}"
+    if spec.opcua is not None:
+        return f"{len(spec.opcua.columns)} nodes of {spec.opcua.url}"
+    if isinstance(spec.file, tuple):
+        return ", ".join(file.file for file in spec.file)
+    return str(spec.file or spec.reader)
+
+
+def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
+    return Broker(
+        host=spec.host,
+        port=spec.port,
+        client_id=spec.client_id or f"livepde-{frame.name}",
+        username=spec.username,
+        password=_password(frame, spec.password_env, key),
+        tls=spec.tls,
+        ca_file=spec.ca_file,
+        session=round(frame.positive(spec.session, "s", f"{key}.session")),
+    )
+
+
+def _password(frame: Frame, variable: str | None, key: str) -> str | None:
+    if variable is None:
+        return None
+    if variable not in os.environ:
+        raise frame.error(
+            f"{key}.password_env", f"the environment variable {variable} is not set; set it."
+        )
+    return os.environ[variable]
+
+
+def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
+    """Return limits of backlog and retention, and the seconds until a source is silent."""
+    spec = frame.spec
+    # Without these keys all estimates are kept, and no source counts as silent.
+    unit, never = frame.equation.time_unit, math.inf
+    span = frame.positive(spec.output.retain, unit, "output.retain", never)
+    silence = frame.positive(spec.intake.silence, "s", "intake.silence", never)
+    backlog = Backlog(spec.intake.overflow, spec.intake.queue)
+    return backlog, Retention(span, spec.output.thin), silence
+
+
+def policy_of(frame: Frame) -> Policy:
+    """Return the policy for rows that are late, repeated or incomplete."""
+    spec, unit = frame.spec.intake, frame.equation.time_unit
+
+    def duration(value: float | str, key: str) -> float:
+        return frame.convert(value, unit, key, difference=True)
+
+    habits = {}
+    for name, channel in frame.spec.channels.items():
+        wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
+        interpolated = channel.gaps == "interpolate"
+        habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
+    # Without a unit of time 30 days cannot be converted: then any pause is accepted.
+    leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
+    leap = frame.positive(spec.leap, unit, "intake.leap", leap)
+    return Policy(
+        wait=duration(spec.wait, "intake.wait"),
+        tolerance=duration(spec.tolerance, "intake.tolerance"),
+        leap=leap,
+        repeated=spec.repeated,
+        channels=habits,
+    )

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
-import numpy as np
-
-from livepde.cases.case_channels import noise_of
+from livepde.cases.case_channels import noise_of, unknowns_of
 from livepde.cases.case_frame import Frame
-from livepde.cases.instruments import unknowns_of
-from livepde.cases.read import did_you_mean
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
 from livepde.errors import LawError
 from livepde.laws import (
@@ -27,6 +23,8 @@ from livepde.laws import (
 )
 
 __all__ = ["law_of"]
+
+Options = TypeVar("Options")
 
 
 def law_of(frame: Frame) -> AnyLaw:
@@ -52,41 +50,39 @@ def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
 
 
 def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
-    time, memory = frame.equation.time_unit, float(np.inf)
-    if spec.memory is not None:
-        memory = frame.positive(spec.memory, time, "law.memory")
+    time = frame.equation.time_unit
+    memory = frame.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
     drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
-    more: dict[str, Any] = {
-        "gate": spec.gate,
-        "jumps": _jumps(frame, spec),
-        "guards": _chosen(Guards, spec.guards),
-        "shadows": _chosen(Shadows, spec.shadows),
-        "verdict": spec.verdict,
-    }
-    replay = _chosen(Replay, spec.replay)
-    return SensitivityLaw(spec.modes, _noise(frame, spec), drift, memory, replay, **more)
+    return SensitivityLaw(
+        spec.modes,
+        _noise(frame, spec),
+        drift,
+        memory,
+        _chosen(Replay, spec.replay),
+        gate=spec.gate,
+        jumps=_jumps(frame, spec),
+        guards=_chosen(Guards, spec.guards),
+        shadows=_chosen(Shadows, spec.shadows),
+        verdict=spec.verdict,
+    )
 
 
 def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
     """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
     given = spec.jumps
-    found: Jumps | None = (
-        Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
-    )
-    names = (found.unknowns if found is not None else None) or ()
+    found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
     known = [*frame.spec.unknowns, *unknowns_of(frame)]
-    for name in names:
-        if name not in known:
-            key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
-            raise frame.error(key, f"there is no unknown '{name}'; {did_you_mean(name, known)}")
+    key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
+    for name in (found.unknowns if found is not None else None) or ():
+        frame.require(name, known, key, f"there is no unknown '{name}'")
     return found
 
 
-def _chosen(kind: Any, given: Any) -> Any:
-    """Return an option of a law that a case has as true, false or a table."""
+def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
+    """Return options of a law that a case has as true (the defaults), false or a table."""
     if isinstance(given, bool):
         return kind() if given else None
-    return kind(**given.model_dump())
+    return given
 
 
 def _noise(frame: Frame, spec: SensitivitySpec) -> float | str | None:

@@ -13,8 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from livepde.cases.case import Case, Prepared
-from livepde.cases.data import check_hours, read_data
-from livepde.cases.data_sources import Data, limits_of, policy_of, publishers_of, source_of
+from livepde.cases.data import (
+    Data,
+    check_hours,
+    limits_of,
+    policy_of,
+    publishers_of,
+    read_data,
+    source_of,
+)
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted
@@ -81,7 +88,7 @@ class Wiring:
         self.silent = False
         self.why = ""
         # An invalid case is refused here, before anything is connected.
-        self._policy, self._limits = policy_of(case.frame), limits_of(case.frame)
+        self._policy, self._limits = policy_of(case), limits_of(case)
         self._path = path
         self._journal: Journal | None = None
         self._intake: Intake | None = None
@@ -129,7 +136,7 @@ class Wiring:
             The source ended before the first sample.
         """
         stopping = stopping or threading.Event()
-        sinks = [*sinks, *publishers_of(self.case.frame)]
+        sinks = [*sinks, *publishers_of(self.case)]
         for sink in sinks:
             self._stack.callback(sink.close)
         waiting: Sequence[Ready] = ()
@@ -152,7 +159,7 @@ class Wiring:
             self._feed,
             self._journal,
             sinks=sinks,
-            fields_every=self.case.fields_every,
+            fields_every=self.case.spec.output.fields_every,
             backlog=backlog,
             retention=retention,
             silence=silence,
@@ -206,7 +213,7 @@ class Wiring:
             return None
         first = next(iter(irregular.values()), None)
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
-        raise DataError(f"{self.case.frame.path}: {why}{wrong}.")
+        raise DataError(f"{self.case.path}: {why}{wrong}.")
 
     def _listened(self, heard: float) -> float:
         """Note whether the source is silent, and return when something came from it last."""
@@ -223,16 +230,16 @@ class Wiring:
     def _fed(self, data: Data) -> Feed:
         case, named = self.case, data if isinstance(data, str) else None
         if self._reads_all(data, named):
-            table = read_data(case.frame, case.columns, case.clock, named)
+            table = read_data(case, case.columns, case.clock, named)
             self._origin = table.origin
             last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
         self._intake, position = self._new_intake()
-        return Gathered(source_of(case.frame, data, position), self._intake)
+        return Gathered(source_of(case, data, position), self._intake)
 
     def _reads_all(self, data: Data, named: str | None) -> bool:
         """Return whether all rows are read at once, not followed one by one."""
-        frame, spec = self.case.frame, self.case.frame.spec.data
+        frame, spec = self.case, self.case.spec.data
         file, reader = (spec.file, frame.reader) if data is None else (named, None)
         if not isinstance(file, tuple):
             check_hours(frame, self.case.clock, file)
@@ -247,7 +254,7 @@ class Wiring:
     def _new_intake(self) -> tuple[Intake, str]:
         """Return an intake of rows that follow those of the journal, and the source's position."""
         case, journal = self.case, self._journal
-        options: dict[str, Any] = {"missing": case.frame.spec.data.missing}
+        options: dict[str, Any] = {"missing": case.spec.data.missing}
         position = ""
         if journal is not None:
             begun = journal.layout.attrs.get("origin")

@@ -88,7 +88,7 @@ def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], 
 def _settings(case: Case) -> str:
     """Return the common settings of members that step together, as text."""
     unread = {"channels": {"__all__": READ}}
-    return case.frame.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
+    return case.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
 
 
 def _refuses(one: Prepared) -> str:
@@ -136,7 +136,7 @@ class MemberBlock:
         self.status = "finished"
         self.error: DataError | None = None
         self._paths: list[Path] = []
-        self._kept = FleetRecords(case.model, case.fields_every)
+        self._kept = FleetRecords(case.model, case.spec.output.fields_every)
         self._events: list[list[Event]] = [[] for _ in self._each]
         self._taken = self._written = 0  # samples
 

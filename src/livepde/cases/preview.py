@@ -1,25 +1,30 @@
-"""Preview of a case: identifiability, discretisation error and unseen sensor errors."""
+"""Preview of a case: identifiability, discretisation and sensor errors, one more sensor."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import tee
+from itertools import islice, tee
+from typing import Any
 
 import numpy as np
 
 from livepde.cases.case import Prepared
 from livepde.diagnostics.identifiability import FLAT, identifiability
+from livepde.errors import ConfigurationError
+from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Combined, Observation, Points
 from livepde.result import Estimate
 from livepde.verdict import REFINE, Shifts, discretised
 
-__all__ = ["Identified", "Preview", "linearised", "preview"]
+__all__ = ["Advice", "Identified", "Preview", "advise", "linearised", "preview"]
 
 MOST_SAMPLES = 500
 NEVER = 1 << 60
@@ -202,3 +207,242 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
             label = f"{name} at {at} ({what})"
             found.append(Identified(label, float(prior[k]), float(posterior[k]), units[name]))
     return found
+
+
+MOST_CANDIDATES = 400  # positions that are compared
+SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
+NEW = "one more sensor"
+NOTHING = "advice on sensors: the data hold no measurement."
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """The best of all candidate positions for one more sensor.
+
+    Attributes
+    ----------
+    position
+        Coordinates, shape (d,).
+    now, then
+        Name of each unknown -> remaining share of its prior standard deviation with the present
+        sensors, and with the new one; of a field the root of the share of its mean variance.
+    candidates
+        Number of compared positions.
+    """
+
+    position: Array
+    now: Mapping[str, float]
+    then: Mapping[str, float]
+    candidates: int
+
+
+def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
+    """Return where one more point sensor would reduce the posterior most.
+
+    The criterion is the posterior variance over the prior variance, averaged over the unknowns (of
+    a field its mean over the domain; a sum would depend on the number of modes and on the choice of
+    units). The candidates are the vertices of the mesh, at most 400; the new sensor has the
+    median noise of the others, and measures whenever one of them does.
+
+    Linearised at the prior, the information of sensors adds up: with Y the sensitivity of a reading
+    to the reduced coordinates a ~ N(0, I), over its noise, the posterior covariance of a is
+    (I + sum of Y^T Y)^-1. So one run that assimilates nothing gives the sums of all candidates.
+
+    If unknowns move, the information of old samples fades and does not add up. Then the candidates
+    are ranked by the variance reduction of one more reading at each sample of the preview, from the
+    joint covariance of state and unknowns; each of the best few gets a preview of its own, and the
+    one with the smallest final variance is the advice.
+
+    Raises
+    ------
+    ConfigurationError
+        The law has no covariance, or it is not clear which component of the state a sensor would
+        see.
+    """
+    case, law = prepared.case, linearised(prepared.case.law)
+    if law is None:
+        raise ConfigurationError(
+            "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
+        )
+    if _moves(case.model, law):
+        return _advise_moving(prepared, law, list(samples))
+    here, each, factor = _information(prepared, law, samples)
+    if factor is None:
+        raise ConfigurationError(NOTHING)
+    weights = _weights(case.model, factor)
+    before = np.linalg.inv(here)
+    after = np.linalg.inv(here + each)
+    mean = sum(weights.values()) / len(weights)
+    best = int(np.einsum("ij,cji->c", mean, after).argmin())
+    now, then = (
+        {name: float(np.sqrt(np.sum(W * P))) for name, W in weights.items()}
+        for P in (before, after[best])
+    )
+    _, positions, _ = _candidates(prepared)
+    return Advice(positions[:, best], now, then, len(after))
+
+
+def _moves(model: Model, law: SensitivityLaw) -> bool:
+    """Return whether an unknown changes in time, by the law or by its own evolution."""
+    return bool(law.drift) or any(
+        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
+        for unknown in model.parameter_space.unknowns.values()
+    )
+
+
+def _information(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
+) -> tuple[Array, Array, Array | None]:
+    """Return the information on a, prior included, that of each candidate, and the factor of q.
+
+    Shapes (k, k), (candidates, k, k) and (m, k); without a measurement the factor is None.
+    """
+    here, each = np.zeros((0, 0)), np.zeros((0, 0, 0))
+    factor: Array | None = None
+    for Y, new, q_factor in islice(_sensitivities(prepared, law, samples), MOST_SAMPLES):
+        if not here.size:
+            k = Y.shape[1]
+            here, each = np.eye(k), np.zeros((len(new), k, k))
+        here += Y.T @ Y
+        each += new[:, :, None] * new[:, None, :]
+        factor = q_factor
+    return here, each, factor
+
+
+def _sensitivities(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample]
+) -> Iterator[tuple[Array, Array, Array]]:
+    """Yield the sensitivities of present readings to a, of candidates, and the factor of q.
+
+    Sensitivities are over the noise, shapes (readings, k) and (candidates, k), at each measurement.
+    """
+    silent = replace(prepared, assimilate_from=np.inf)
+    identifier = silent.identifier_with(SensitivityLaw(law.modes, law.noise, shadows=None))
+    values, _, part = _candidates(prepared)
+    noise = _noise(identifier, law)
+    known: dict[str, float] = {}
+    for sample in samples:
+        estimate = identifier.step(sample.t, sample.z, sample.inputs)
+        known |= _inputs(identifier, sample)
+        belief, seen = estimate.belief, np.isfinite(estimate.innovation)
+        if sample.t < prepared.assimilate_from or not seen.any():
+            continue
+        if belief.u_factor is None or belief.q_factor is None:
+            return
+        # Readings depend on the unknowns through the state, and where H_q is given directly.
+        H_u, H_q = identifier.observed.jacobian(
+            estimate.u, estimate.q, Moment(sample.t, Inputs(known))
+        )
+        Y = H_u @ belief.u_factor
+        if H_q is not None:
+            Y = Y + H_q @ belief.q_factor
+        new = (values @ belief.u_factor[part]) / np.median(noise)
+        yield (Y / noise[:, None])[seen], new, belief.q_factor
+
+
+def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
+    """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
+    case = prepared.case
+    block, part = case.model.state_space.component(case.observation.of)
+    # -(-n // m) is n / m, rounded up.
+    every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
+    return block.at_vertices[::every], block.field.mesh.p[:, ::every], part
+
+
+def _noise(identifier: Identifier, law: SensitivityLaw) -> Array:
+    """Return the noise of each sensor: that of the law, or of the observation."""
+    found = identifier.observed.noise if isinstance(law.noise, str | None) else law.noise
+    return np.broadcast_to(np.asarray(found, dtype=float), identifier.observed.size)
+
+
+def _advise_moving(prepared: Prepared, law: SensitivityLaw, samples: Sequence[Sample]) -> Advice:
+    """Return the advice where unknowns move: see `advise`."""
+    values, positions, part = _candidates(prepared)
+    model, told = prepared.case.model, np.zeros(positions.shape[1])
+    identifier = prepared.identifier
+    noise = float(np.median(_noise(identifier, law)))
+    weights: dict[str, Array] = {}
+    for belief in _previewed(prepared, law, samples, prepared.case.observation):
+        weights = weights or _weights(model, _physical(model, belief.prior_factor))
+        C = _reduced(model, belief)
+        if belief.u_factor is None:
+            continue
+        Y = (values @ belief.u_factor[part]) / noise
+        # One more reading y changes C C^T by C y y^T C^T / (1 + y^T y).
+        gain = np.einsum("cr,rs,cs->c", Y, C.T @ sum(weights.values()) @ C, Y)
+        told += gain / (1.0 + (Y**2).sum(axis=1))
+    if not weights:
+        raise ConfigurationError(NOTHING)
+    now = _left(weights, C)
+    # The ranking counts single readings; a preview of the best few counts all of them.
+    tried = []
+    for best in np.argsort(-told)[:SHORT_LIST]:
+        at: Any = positions[:, best].tolist()
+        point = Points(
+            {NEW: at if len(at) > 1 else at[0]}, noise=noise, of=prepared.case.observation.of
+        )
+        sensors = Combined([prepared.case.observation, point])
+        for belief in _previewed(prepared, law, samples, sensors):
+            C = _reduced(model, belief)
+        then = _left(weights, C)
+        tried.append((sum(share**2 for share in then.values()), int(best), then))
+    _, place, then = min(tried, key=lambda item: item[0])
+    return Advice(positions[:, place], now, then, len(told))
+
+
+def _previewed(
+    prepared: Prepared, law: SensitivityLaw, samples: Iterable[Sample], sensors: Observation
+) -> Iterator[Belief]:
+    """Yield the belief of a filter linearised at the prior, after each measurement."""
+    identifier = prepared.identifier_with(law, sensors)
+    own = [name for name in identifier.observed.names if name != NEW]
+    count = 0
+    for sample in samples:
+        given: Mapping[str, float] = sample.z  # type: ignore[assignment]
+        seen = any(np.isfinite(given.get(name, np.nan)) for name in own)
+        # The covariance does not depend on the value of a reading, only on its presence.
+        z = {**given, **({NEW: 0.0} if seen and NEW in identifier.observed.names else {})}
+        identifier.step(sample.t, z, sample.inputs)
+        if seen and sample.t >= prepared.assimilate_from:
+            count += 1
+            yield identifier.latent_belief()
+        if count >= MOST_SAMPLES:
+            break
+
+
+def _physical(model: Model, factor: Array | None) -> Array | None:
+    """Return a latent factor in physical coefficients, linearised at the prior."""
+    return None if factor is None else model.latent.tangent(model.latent.prior, factor)
+
+
+def _reduced(model: Model, belief: Belief) -> Array:
+    """Return the square root of the posterior covariance in reduced coordinates, (k, r)."""
+    if belief.prior_factor is None or belief.q_factor is None:
+        return np.zeros((0, 0))
+    reduced: Array = belief.prior_factor.T @ model.Q.dual(belief.q_factor)
+    return reduced
+
+
+def _left(weights: Mapping[str, Array], C: Array) -> dict[str, float]:
+    """Return the remaining share of the prior standard deviation of each unknown."""
+    return {name: float(np.sqrt(np.sum(W * (C @ C.T)))) for name, W in weights.items()}
+
+
+def _inputs(identifier: Identifier, sample: Sample) -> dict[str, float]:
+    """Return the inputs that a sample has."""
+    given = {**(sample.z if isinstance(sample.z, Mapping) else {}), **(sample.inputs or {})}
+    return {name: v for name in identifier.inputs if np.isfinite(v := given.get(name, np.nan))}
+
+
+def _weights(model: Model, factor: Array | None) -> dict[str, Array]:
+    """Return unknown -> W with trace(W P) its mean variance over that of the prior, P = I."""
+    space = model.parameter_space
+    if factor is None:
+        return {}
+    found = {label: np.outer(factor[k], factor[k]) for label, k in space.labels.items()}
+    # The mass matrix integrates the variance of a field over the domain. Division by the trace
+    # makes the share of the prior, P = I, equal to one.
+    for name in space.fields:
+        part = space.part(name)
+        found[name] = factor[part].T @ (model.parameter_mass[part, part] @ factor[part])
+    return {name: W / np.trace(W) for name, W in found.items()}

@@ -1,50 +1,42 @@
-"""Reader of case files: TOML to a checked specification, or one sentence about an error."""
+"""Reader of case files: TOML, with settings from outside, to a checked specification."""
 
 from __future__ import annotations
 
+import copy
 import difflib
 import os
 import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import is_dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import tomlkit
 from pydantic import BaseModel, ValidationError
 
-from livepde.cases.limits import check_document, check_text
-from livepde.cases.schema import (
-    AutoSpec,
-    CaseSpec,
-    ChannelSpec,
-    CorrelatedSpec,
-    DataSpec,
-    EvolutionSpec,
-    GradientSpec,
-    GuardsSpec,
-    JumpsSpec,
-    MeshSpec,
-    OutputSpec,
-    RegionSpec,
-    ReplaySpec,
-    SensitivitySpec,
-    ShadowsSpec,
-    StepsSpec,
-    UnknownSpec,
-    VariantSpec,
-)
+from livepde.cases.schema import CaseSpec
+from livepde.cases.units import LARGEST
 from livepde.errors import CaseError
 
 __all__ = [
     "BLANK",
+    "apply",
     "beside",
     "blanks_in",
+    "check_document",
+    "check_text",
     "did_you_mean",
     "is_blank",
+    "key_path",
+    "parse",
     "read_spec",
     "read_text",
     "read_toml",
     "spec_of",
+    "toml_key",
+    "toml_line",
 ]
 
 BLANK = "?"  # how a value begins that is still to be filled in
@@ -52,6 +44,29 @@ LONGEST = 1_000_000  # bytes of a case file
 DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case
 SHOWN = 60  # characters of a line that is shown
 LONGEST_SHOWN = 200  # characters of a value that is shown
+
+NAMED = ("unknowns", "channels")  # tables whose members are the case's own
+DEPTH = 32  # tables, lists and parts of a key within one another
+COUNTS = {  # keys that say how much is kept or tried -> the most
+    "every": 1_000_000,
+    "fields_every": 1_000_000_000,
+    "harmonics": 100,
+    "iterations": 1000,
+    "modes": 10_000,
+    "past": 10_000,
+    "queue": 10_000_000,
+    "seeds": 10_000,
+    "temperings": 100,
+    "thin": 1_000_000_000,
+    "window": 100_000,
+}
+OTHER = 1_000_000_000  # of any other whole number
+FREE = ("data.missing",)  # keys whose numbers only stand for something
+NAMES = 10_000  # of a table
+LONG_KEY = 200  # characters of a name
+NAME = re.compile(r"[\w\"'-]+")
+DOTTED = re.compile(r"(?:a\s?\.\s?){" + str(DEPTH) + "}")
+DIGITS = re.compile(r"[0-9_]{400}")
 
 # Type of pydantic's error -> what the message expects.
 EXPECTED = {
@@ -70,23 +85,7 @@ EXPECTED = {
     "too_short": "at least one entry",
     "string_too_short": "a name",
 }
-# Keys of a table, * for any name -> its model.
-TABLES: dict[str, type[BaseModel]] = {
-    "mesh": MeshSpec,
-    "data": DataSpec,
-    "steps": StepsSpec,
-    "output": OutputSpec,
-    "unknowns.*": UnknownSpec,
-    "regions.*": RegionSpec,
-    "channels.*": ChannelSpec,
-    "law.guards": GuardsSpec,
-    "law.shadows": ShadowsSpec,
-    "law.jumps": JumpsSpec,
-    "law.replay": ReplaySpec,
-    "variants.*": VariantSpec,
-    "*.evolution": EvolutionSpec,
-    "*.correlated": CorrelatedSpec,
-}
+UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # of a model, of a dataclass
 
 
 def read_text(path: Path) -> str:
@@ -199,27 +198,26 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     # where true, false or a table may stand, a table is not wrong for being no boolean.
     def rank(item: Any) -> tuple[bool, bool]:
         table = item["type"] == "bool_type" and isinstance(item["input"], dict)
-        return item["type"] != "extra_forbidden", table
+        return item["type"] not in UNKNOWN_KEY, table
 
     found = min(error.errors(), key=rank)
-    path = _path(found["loc"], raw)
-    key = ".".join(path)
     kind, got = found["type"], found["input"]
-    if kind == "extra_forbidden":
+    path = _path(found["loc"], raw, kind == "missing")
+    key = ".".join(path)
+    if kind in UNKNOWN_KEY:
         return f"there is no key '{key}'; {did_you_mean(path[-1], _keys(path[:-1], raw))}"
     if kind == "missing":
         return f"the key '{key}' is missing."
     context = found.get("ctx", {})
-    if kind == "union_tag_not_found":
-        return f"the key '{key}.kind' is missing; expected 'sensitivity' or 'gradient'."
     if kind == "union_tag_invalid":
         tag = str(context["tag"])
-        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, ['auto', 'sensitivity', 'gradient'])}"
+        return f"{key}.kind: got '{tag}'; {did_you_mean(tag, _choices(context['expected_tags']))}"
     if kind == "literal_error":
-        choices = str(context["expected"]).replace(" or ", ", ").replace("'", "").split(", ")
-        return f"{key}: got {_short(got)}; {did_you_mean(str(got), choices)}"
+        return f"{key}: got {_short(got)}; {did_you_mean(str(got), _choices(context['expected']))}"
     if kind == "value_error":
-        message = str(context["error"])
+        # Options of a law refuse a value themselves: "Guards: reach must be a positive number."
+        *_, last = "", *found["loc"]
+        message = str(context["error"]).removeprefix(f"{last}: ").removesuffix(".")
         shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
     expected = EXPECTED.get(kind)
@@ -231,14 +229,22 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     return f"{key}: got {_short(got)}; expected {expected}."
 
 
+def _choices(expected: str) -> list[str]:
+    """Return the words that a message of pydantic quotes."""
+    return re.findall(r"'([^']*)'", expected)
+
+
 def _short(value: Any) -> str:
     """Return a value as it is shown in a sentence."""
     text = repr(value)
     return text if len(text) <= LONGEST_SHOWN else f"{text[:LONGEST_SHOWN]}..."
 
 
-def _path(loc: tuple[int | str, ...], raw: Any) -> list[str]:
-    """Return the keys of an error as the file has them, without pydantic's own tags."""
+def _path(loc: tuple[int | str, ...], raw: Any, missing: bool) -> list[str]:
+    """Return the keys of an error as the file has them, without pydantic's own tags.
+
+    The last one of a key that is missing stands in no file.
+    """
     path: list[str] = []
     here = raw
     for k, part in enumerate(loc):
@@ -248,23 +254,198 @@ def _path(loc: tuple[int | str, ...], raw: Any) -> list[str]:
         elif isinstance(here, list) and isinstance(part, int) and part < len(here):
             here = here[part]
             path[-1] += f"[{part}]"
-        elif k == len(loc) - 1 and isinstance(here, dict):
-            path.append(str(part))  # a missing key
+        elif missing and k == len(loc) - 1:
+            path.append(str(part))
     return path or [str(part) for part in loc[:1]]
 
 
-def _keys(path: list[str], raw: Mapping[str, Any]) -> list[str]:
+def _keys(path: Iterable[str], raw: Mapping[str, Any]) -> list[str]:
     """Return the keys that a table may have."""
-    model: type[BaseModel] | None = CaseSpec
-    if path == ["law"]:
-        kind = raw["law"].get("kind") if isinstance(raw.get("law"), dict) else ""
-        laws: dict[str, type[BaseModel]] = {"auto": AutoSpec, "gradient": GradientSpec}
-        model = laws.get(str(kind), SensitivitySpec)
-    elif path:
-        first = path[0].partition("[")[0]  # variants[0] is one of the variants
-        region = "regions.*" if path[2:3] == ["regions"] and len(path) == 4 else ""
-        names = (region, ".".join(path), f"*.{path[-1]}", f"{first}.*")
-        model = next((TABLES[name] for name in names if name in TABLES), None)
-    if model is None:
-        return []
-    return [item.alias or name for name, item in model.model_fields.items()]
+    here: Any = raw
+    kinds: list[Any] = [CaseSpec]
+    for part in path:
+        key, _, number = part.partition("[")  # variants[0] is one of the variants
+        here = here[key][int(number[:-1])] if number else here[key]
+        below = [get_args(one)[1] if _is_named(one) else _fields(one).get(key) for one in kinds]
+        kinds = [inner for one in below for inner in _tables(one)]
+    # Of several laws it is the one that the table names.
+    tables = map(_fields, kinds)
+    kind = here.get("kind", "sensitivity")
+    fits = (known for known in tables if kind in get_args(known.get("kind", Literal[kind])))
+    return list(dict.fromkeys(chain.from_iterable(fits)))
+
+
+def _tables(kind: Any) -> Iterator[Any]:
+    """Yield the tables among the types that a value may have, and mappings from names."""
+    if _is_named(kind) or _fields(kind):
+        yield kind
+    else:
+        for inner in get_args(kind):
+            yield from _tables(inner)
+
+
+def _is_named(kind: Any) -> bool:
+    return get_origin(kind) is dict
+
+
+def _fields(kind: Any) -> dict[str, Any]:
+    """Return key -> type of a table; empty for another type."""
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return {item.alias or name: item.annotation for name, item in kind.model_fields.items()}
+    return get_type_hints(kind) if isinstance(kind, type) and is_dataclass(kind) else {}
+
+
+def parse(assignments: Iterable[str]) -> dict[str, Any]:
+    """Return key -> value of texts such as 'law.noise=2 K'; values are TOML, or else text.
+
+    >>> parse(["law.noise=2 K", "data.every=2", "expect="])
+    {'law.noise': '2 K', 'data.every': 2, 'expect': None}
+    """
+    found: dict[str, Any] = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not (equals and key.strip()):
+            raise CaseError(f"--set {text}: expected key=value, as law.memory='3 d'.")
+        if not value.strip():
+            found[key.strip()] = None
+            continue
+        try:
+            (found[key.strip()],) = tomllib.loads(f"value = {value}").values()
+        except (tomllib.TOMLDecodeError, ValueError):
+            found[key.strip()] = value.strip()
+    return found
+
+
+def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a case's document with other values.
+
+    Parameters
+    ----------
+    document
+        The parsed case.
+    settings
+        Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
+        sets the keys in it and leaves the others; None takes the key away.
+    where
+        For messages.
+
+    Raises
+    ------
+    CaseError
+        A key that is none, or an unknown, a channel or a key to take away that the case has not.
+    """
+    changed = copy.deepcopy(dict(document))
+    for key, given in settings.items():
+        for path, value in _leaves(key_path(key, where), given):
+            here = changed
+            for k, part in enumerate(path[:-1]):
+                if k == 1 and path[0] in NAMED and part not in here:
+                    raise CaseError(
+                        f"{where}: {'.'.join(path)}: the case has no '{path[0]}.{part}'; "
+                        f"{did_you_mean(part, here)}"
+                    )
+                if not isinstance(here.get(part), dict):
+                    here[part] = {}
+                here = here[part]
+            if value is not None:
+                here[path[-1]] = value
+            elif here.pop(path[-1], None) is None:
+                raise CaseError(
+                    f"{where}: there is no key '{'.'.join(path)}' to take away; "
+                    f"{did_you_mean(path[-1], here)}"
+                )
+    return changed
+
+
+def key_path(key: str, where: str) -> tuple[str, ...]:
+    """Return the keys of 'law.noise' as `--set` takes them; raises `CaseError`."""
+    try:
+        here: Any = tomllib.loads(f"{key} = 0")
+    except tomllib.TOMLDecodeError:
+        raise CaseError(f"{where}: '{key}' is no key; expected one as 'law.noise'.") from None
+    path = []
+    while isinstance(here, dict):
+        ((name, here),) = here.items()
+        path.append(name)
+    return tuple(path)
+
+
+def _leaves(path: tuple[str, ...], value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from _leaves((*path, name), item)
+    else:
+        yield path, value
+
+
+def toml_line(key: str, value: Any) -> str:
+    """Return a key and its value as a line of TOML.
+
+    >>> toml_line("T 1", {"role": "sensor", "at": 0.5})
+    '"T 1" = { role = "sensor", at = 0.5 }'
+    """
+    return f"{toml_key(key)} = {_value(value)}"
+
+
+def toml_key(name: str) -> str:
+    """Return a key as TOML has it, in quotes where they are needed."""
+    return tomlkit.key(name).as_string()
+
+
+def _value(value: Any) -> str:
+    """Return a value on one line, with blanks inside of the braces of an inline table."""
+    if isinstance(value, Mapping):
+        items = ", ".join(toml_line(key, item) for key, item in value.items())
+        return f"{{ {items} }}" if items else "{}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    shown: str = tomlkit.item(value).as_string()
+    return shown
+
+
+def check_text(text: str, where: str) -> None:
+    """Refuse a document that would take long to read, before it is read."""
+    if DOTTED.search(NAME.sub("a", text)):
+        raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
+    if DIGITS.search(text):
+        raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
+
+
+def check_document(document: Mapping[str, Any], where: str) -> None:
+    """Refuse numbers and depths that no case needs."""
+    for key, value, depth in _values(document, where):
+        if depth > DEPTH:
+            text = f"more than {DEPTH} tables or lists within one another"
+            raise CaseError(f"{where}: {key[:LONG_KEY]}: {text}.")
+        if max(map(len, key.split("."))) > LONG_KEY:
+            raise CaseError(f"{where}: {key[:LONG_KEY]}...: a name has at most {LONG_KEY} letters.")
+        if key.startswith(FREE) or isinstance(value, bool):
+            continue
+        name = key.rpartition(".")[2]
+        if isinstance(value, int) and abs(value) > COUNTS.get(name, OTHER):
+            most = COUNTS.get(name, OTHER)
+            raise CaseError(f"{where}: {key}: got {_digits(value)}; expected at most {most}.")
+        if isinstance(value, float) and LARGEST < abs(value) < float("inf"):
+            raise CaseError(f"{where}: {key}: got {value:g}; expected less than {LARGEST:g}.")
+
+
+def _digits(value: int) -> str:
+    return str(value) if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
+
+
+def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
+    """Iterate over all values with their keys and depths; deeper levels are not entered."""
+    stack: list[tuple[str, Any, int]] = [("", value, 0)]
+    while stack:
+        key, value, depth = stack.pop()
+        if depth > DEPTH or not isinstance(value, Mapping | list):
+            yield key, value, depth
+        elif isinstance(value, Mapping):
+            if len(value) > NAMES:
+                what = key or "the case"
+                raise CaseError(
+                    f"{where}: {what} has {len(value)} names; expected at most {NAMES}."
+                )
+            stack += [(f"{key}.{n}" if key else n, v, depth + 1) for n, v in value.items()]
+        else:
+            stack += [(key, item, depth + 1) for item in value]

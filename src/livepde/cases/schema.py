@@ -1,11 +1,15 @@
-"""Schema of case files, as pydantic models: a class for each table."""
+"""Schema of case files, as pydantic models: types of single values, and a class for each table."""
 
 from __future__ import annotations
 
+import codecs
+import re
 from collections.abc import Mapping
+from datetime import date, datetime
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -17,21 +21,14 @@ from pydantic import (
     model_validator,
 )
 
-from livepde.cases.values import (
-    Box,
-    Encoding,
-    Expected,
-    Identifier,
-    Instant,
-    Name,
-    Pair,
-    Point,
-    Quantity,
-    TimeFormat,
-)
 from livepde.fem import Scalar
-from livepde.laws import Guards, Jumps, Replay, SensitivityLaw, Shadows
+from livepde.laws import GradientLaw, Guards, Jumps, Replay, SensitivityLaw, Shadows
+from livepde.observation import Discrepancy
+from livepde.runs.live_loop import Backlog, Retention
+from livepde.runs.outcome import Bound, Sense
 from livepde.streams.csvfile import UTF_8
+from livepde.streams.intake import Policy
+from livepde.streams.mqtt import Broker
 
 __all__ = [
     "AutoSpec",
@@ -50,6 +47,76 @@ __all__ = [
     "TikhonovSpec",
     "UnknownSpec",
     "VariantSpec",
+]
+
+
+def _quantity(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        message = 'expected a number, or text with a unit as "20 h"'
+        raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
+    return value if isinstance(value, str) else float(value)
+
+
+def _limits(value: Any) -> Any:
+    """[low, high], "<= number" or ">= number" -> (sense, bound)."""
+    if isinstance(value, list) and len(value) == 2:
+        low, high = value
+        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
+            return "in", (float(low), float(high))
+    if isinstance(value, str):
+        match = re.fullmatch(r"\s*(<=|>=)\s*([-+0-9.eE]+)\s*", value)
+        if match:
+            try:
+                return match[1], float(match[2])
+            except ValueError:
+                pass
+    raise ValueError('expected [low, high], "<= number" or ">= number"')
+
+
+def _encoding(value: str) -> str:
+    try:
+        codecs.lookup(value)
+    except LookupError:
+        raise ValueError("expected the name of an encoding, as 'utf-8', 'cp1252'") from None
+    return value
+
+
+def _time_format(value: str) -> str:
+    moment = datetime(2001, 2, 3, 4)
+    try:
+        # A complete format returns the date that was written with it.
+        if datetime.strptime(moment.strftime(value), value).date() == moment.date():
+            return value
+    except (ValueError, re.error):  # the latter of a part that stands twice
+        pass
+    raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
+
+
+def _flat(value: Any) -> Any:
+    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
+    if not isinstance(value, dict):
+        return value
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        inner = _flat(item)
+        if isinstance(inner, dict):
+            found |= {f"{name}.{key}": one for key, one in inner.items()}
+        else:
+            found[name] = item
+    return found
+
+
+Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
+Pair: TypeAlias = tuple[Quantity, Quantity]
+Point: TypeAlias = Quantity | tuple[Quantity, ...]
+Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
+Instant: TypeAlias = date | datetime | float | str
+Encoding: TypeAlias = Annotated[str, AfterValidator(_encoding)]
+Name: TypeAlias = Annotated[str, Field(min_length=1)]
+Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+TimeFormat: TypeAlias = Annotated[str, AfterValidator(_time_format)]
+Expected: TypeAlias = Annotated[
+    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_limits)]], BeforeValidator(_flat)
 ]
 
 
@@ -109,12 +176,12 @@ class MeshSpec(Spec):
 class BrokerSpec(Spec):
     """How to reach a message broker (MQTT)."""
 
-    host: Name = "localhost"
-    port: Annotated[int, Field(gt=0, lt=65536)] = 1883
+    host: Name = Broker.host
+    port: Annotated[int, Field(gt=0, lt=65536)] = Broker.port
     client_id: Name | None = None
     username: Name | None = None
     password_env: Name | None = None
-    tls: StrictBool = False
+    tls: StrictBool = Broker.tls
     ca_file: Name | None = None
     session: Quantity = "7 d"
 
@@ -226,12 +293,12 @@ class DataSpec(Spec):
 class IntakeSpec(Spec):
     """Policy for rows that are late, repeated, malformed or too fast."""
 
-    wait: Quantity = 0.0
-    tolerance: Quantity = 0.0
+    wait: Quantity = Policy.wait
+    tolerance: Quantity = Policy.tolerance
     leap: Quantity | None = None
-    repeated: Literal["first", "last"] = "first"
-    overflow: Literal["queue", "merge", "drop"] = "queue"
-    queue: PositiveInt = 1000
+    repeated: Literal["first", "last"] = Policy.repeated
+    overflow: Literal["queue", "merge", "drop"] = Backlog.overflow
+    queue: PositiveInt = Backlog.length
     silence: Quantity | None = None
 
 
@@ -407,67 +474,32 @@ class ChannelSpec(Spec):
         return self.columns or (str(self.column),)
 
 
-class ReplaySpec(Spec):
-    """Options of the replay."""
+class FilterSpec(Spec):
+    """Keys of the laws with a covariance."""
 
-    window: PositiveInt = Replay.window
-    first: PositiveInt = Replay.first
-    iterations: PositiveInt = Replay.iterations
-
-
-class JumpsSpec(Spec):
-    """Options of the test for sudden changes."""
-
-    probability: PositiveFloat = Jumps.probability
-    window: PositiveInt = Jumps.window
-    size: PositiveFloat = Jumps.size
-    settle: NonNegativeInt = Jumps.settle
-    unknowns: Annotated[tuple[Name, ...], Field(min_length=1)] | None = None
+    kind: str
+    noise: Quantity | None = None
+    modes: PositiveInt | Literal["auto"] = "auto"
+    gate: PositiveFloat = SensitivityLaw.gate
+    shadows: StrictBool | Shadows = True
 
 
-class GuardsSpec(Spec):
-    """When the law is out of its depth: how far a sample moves an unknown, and when to restart."""
-
-    reach: PositiveFloat = Guards.reach
-    iterations: PositiveInt = Guards.iterations
-    temperings: NonNegativeInt = Guards.temperings
-    runaway: PositiveFloat = Guards.runaway
-    past: PositiveInt = Guards.past
-
-
-class ShadowsSpec(Spec):
-    """Discretisation errors that are followed and widen the reported intervals."""
-
-    step: StrictBool = Shadows.step
-    mesh: StrictBool = Shadows.mesh
-    inputs: StrictBool = Shadows.inputs
-    largest: PositiveInt = Shadows.largest
-
-
-class SensitivitySpec(Spec):
+class SensitivitySpec(FilterSpec):
     """The law for sparse, noisy sensors."""
 
     kind: Literal["sensitivity"]
-    noise: Quantity | None = None
-    modes: PositiveInt | Literal["auto"] = "auto"
-    drift: Quantity = 0.0
+    drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
-    replay: StrictBool | ReplaySpec = False
-    gate: PositiveFloat = SensitivityLaw.gate
-    jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | JumpsSpec = False
-    guards: StrictBool | GuardsSpec = True
-    shadows: StrictBool | ShadowsSpec = True
+    replay: StrictBool | Replay = False
+    jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | Jumps = False
+    guards: StrictBool | Guards = True
     verdict: StrictBool | Literal["cheap"] = True
 
 
-class AutoSpec(Spec):
+class AutoSpec(FilterSpec):
     """The law for sparse, noisy sensors that tunes itself."""
 
     kind: Literal["auto"]
-    noise: Quantity | None = None
-    modes: PositiveInt | Literal["auto"] = "auto"
-    gate: PositiveFloat = SensitivityLaw.gate
-    shadows: StrictBool | ShadowsSpec = True
 
 
 class TikhonovSpec(Spec):
@@ -475,18 +507,18 @@ class TikhonovSpec(Spec):
 
     norm: Literal["X", "V"] = "V"
     alpha: PositiveFloat | Literal["discrepancy"] = "discrepancy"
-    tau: PositiveFloat = 1.1
+    tau: PositiveFloat = Discrepancy.tau
 
 
 class GradientSpec(Spec):
     """The paper's law, for observed subdomains and averages."""
 
     kind: Literal["gradient"]
-    gain: float | Literal["auto"] = 1.0
+    gain: float | Literal["auto"] = GradientLaw.gain
     c1: float | None = None
     mu: float | None = None
-    nu: float = 0.0
-    sigma: float = 0.0
+    nu: float = GradientLaw.nu
+    sigma: float = GradientLaw.sigma
     tikhonov: bool | TikhonovSpec = False
 
     @model_validator(mode="after")
@@ -516,7 +548,7 @@ class OutputSpec(Spec):
 
     fields_every: PositiveInt = 24
     retain: Quantity | None = None
-    thin: PositiveInt = 1
+    thin: PositiveInt = Retention.every
     smoothed: StrictBool = False
     mqtt: PublishSpec | None = None
 

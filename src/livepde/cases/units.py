@@ -6,14 +6,18 @@ import math
 import re
 from dataclasses import dataclass
 from functools import cache
+from itertools import permutations
 from tokenize import TokenError
 from typing import Any
 
-from livepde.cases.limits import LARGEST, check_unit
 from livepde.errors import CaseError
 
-__all__ = ["SI", "Affine", "conversion", "convert", "in_si"]
+__all__ = ["LARGEST", "SI", "SMALLEST", "Affine", "check_unit", "conversion", "convert", "in_si"]
 
+LARGEST = 1e60  # of a number: products of four are finite
+SMALLEST = 1e-60  # of a standard deviation, a rate, a length
+UNIT = 100  # characters of a unit
+POWER = r"(?:\^|\*\*)"
 KINDS = (("s", "min", "h", "d"), ("mm", "cm", "m", "ft"), ("degC", "K", "degF"))  # for hints
 # What pint's parser lets through for text that is no unit at all.
 NOT_A_UNIT = (
@@ -40,53 +44,28 @@ BASE = {
     "[luminosity]": "cd",
 }
 
-# What pint finds for units of many cases, to the last bit: its registry takes longer to load than
+TIMES = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+LENGTHS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "km": 1000.0}
+RATES = (("m^2", "m^2"), ("m", "m"), ("1", "1"), ("K", "K"), ("degC", "K"), ("K", "degC"))
+
+# What pint finds for units of many cases, to one rounding: its registry takes longer to load than
 # all the rest of a case. (given, unit) -> factor and offset.
 USUAL = {
-    ("ms", "s"): (0.001, 0.0),
-    ("ms", "min"): (1.6666666666666667e-05, 0.0),
-    ("ms", "h"): (2.7777777777777776e-07, 0.0),
-    ("ms", "d"): (1.1574074074074074e-08, 0.0),
-    ("s", "min"): (0.016666666666666666, 0.0),
-    ("s", "h"): (0.0002777777777777778, 0.0),
-    ("s", "d"): (1.1574074074074073e-05, 0.0),
-    ("min", "s"): (60.0, 0.0),
-    ("min", "h"): (0.016666666666666666, 0.0),
-    ("min", "d"): (0.0006944444444444444, 0.0),
-    ("h", "s"): (3600.0, 0.0),
-    ("h", "min"): (60.0, 0.0),
-    ("h", "d"): (0.041666666666666664, 0.0),
-    ("d", "s"): (86400.0, 0.0),
-    ("d", "min"): (1440.0, 0.0),
-    ("d", "h"): (24.0, 0.0),
-    ("mm", "cm"): (0.1, 0.0),
-    ("mm", "m"): (0.001, 0.0),
-    ("cm", "mm"): (10.0, 0.0),
-    ("cm", "m"): (0.01, 0.0),
-    ("m", "mm"): (1000.0, 0.0),
-    ("m", "cm"): (100.0, 0.0),
-    ("km", "mm"): (1000000.0, 0.0),
-    ("km", "cm"): (100000.0, 0.0),
-    ("km", "m"): (1000.0, 0.0),
+    **{
+        (given, unit): (kind[given] / kind[unit], 0.0)
+        for kind in (TIMES, LENGTHS)
+        for given, unit in permutations(kind, 2)
+    },
+    **{(f"{a}/{t}", f"{b}/s"): (1 / TIMES[t], 0.0) for a, b in RATES for t in ("min", "h", "d")},
+    **{(f"{given}/s", f"{unit}/s"): (1.0, 0.0) for given, unit in RATES[-2:]},
+    **{
+        (f"{a}^2{per}", f"m^2{per}"): (LENGTHS[a] ** 2, 0.0)
+        for a in ("mm", "cm")
+        for per in ("", "/s")
+    },
+    ("mm/s", "m/s"): (0.001, 0.0),
     ("degC", "K"): (1.0, 273.15),
     ("K", "degC"): (1.0, -273.15),
-    ("mm^2", "m^2"): (1e-06, 0.0),
-    ("cm^2", "m^2"): (0.0001, 0.0),
-    ("mm^2/s", "m^2/s"): (1e-06, 0.0),
-    ("m^2/h", "m^2/s"): (0.0002777777777777778, 0.0),
-    ("m^2/d", "m^2/s"): (1.1574074074074073e-05, 0.0),
-    ("mm/s", "m/s"): (0.001, 0.0),
-    ("m/h", "m/s"): (0.0002777777777777778, 0.0),
-    ("m/d", "m/s"): (1.1574074074074073e-05, 0.0),
-    ("1/min", "1/s"): (0.016666666666666666, 0.0),
-    ("1/h", "1/s"): (0.0002777777777777778, 0.0),
-    ("1/d", "1/s"): (1.1574074074074073e-05, 0.0),
-    ("degC/s", "K/s"): (1.0, 0.0),
-    ("K/s", "degC/s"): (1.0, 0.0),
-    ("K/h", "degC/s"): (0.0002777777777777778, 0.0),
-    ("K/h", "K/s"): (0.0002777777777777778, 0.0),
-    ("K/d", "degC/s"): (1.1574074074074073e-05, 0.0),
-    ("K/d", "K/s"): (1.1574074074074073e-05, 0.0),
 }
 
 
@@ -198,6 +177,38 @@ def in_si(unit: str) -> SI | None:
     whole = {name: int(power) for name, power in exponents.items()}
     offset = float(zero.magnitude)
     return SI(float(one.magnitude) - offset, offset, whole)
+
+
+def check_unit(unit: str, where: str) -> None:
+    """Refuse a unit that is too long, or that raises a power to a power."""
+    if len(unit) > UNIT:
+        raise CaseError(f"{where}: a unit has at most {UNIT} characters; got {len(unit)}.")
+    flat = re.sub(rf"\s*({POWER}|[()])\s*", r"\1", unit)
+    if re.search(rf"{POWER}[-+(]*[0-9]{{3,}}", flat) or _towers(flat):
+        raise CaseError(
+            f"{where}: '{unit}' is not a unit: powers are numbers below 100, and none is raised to "
+            "another."
+        )
+    if re.search(r"[0-9]{10}", flat):
+        raise CaseError(f"{where}: '{unit}' is not a unit: its numbers have less than 10 digits.")
+
+
+def _towers(unit: str) -> bool:
+    """Return whether a power, or a group with a power in it, is raised to a power."""
+    if re.search(rf"{POWER}[-+(]*[0-9.]*\)*{POWER}", unit):
+        return True
+    powers, marks = 0, []
+    for match in re.finditer(rf"\(|\)|{POWER}", unit):
+        sign = match[0]
+        if sign == "(":
+            marks.append(powers)
+        elif sign == ")":
+            inside = powers > (marks.pop() if marks else powers)
+            if inside and re.match(POWER, unit[match.end() :]):
+                return True
+        else:
+            powers += 1
+    return False
 
 
 def _expected(unit: str, given: str) -> str:

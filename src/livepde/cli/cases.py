@@ -10,13 +10,13 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from livepde.cli.options import names_in
+from livepde.cli.options import names_in, option
 from livepde.cli.printing import named, print_table, terminal
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from livepde.cases.from_table import FoundChannel
     from livepde.cases.measured import Measured
+    from livepde.cases.new_case import FoundChannel
     from livepde.models import Equation
 
 __all__ = ["equations", "init"]
@@ -26,11 +26,10 @@ def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],
     data: Annotated[
         list[Path] | None,
-        typer.Option(
-            metavar="FILE.csv",
-            help="Your own table, with a header: what it tells is filled in. Repeatable: several "
+        option(
+            "Your own table, with a header: what it tells is filled in. Repeatable: several "
             "are joined by time.",
-            show_default=False,
+            metavar="FILE.csv",
         ),
     ] = None,
     equation: Annotated[
@@ -43,27 +42,21 @@ def init(
     ] = None,
     time_format: Annotated[
         str,
-        typer.Option(
+        option(
+            "With --data: of its dates, as '%d.%m.%Y %H:%M'. Default: found from the rows.",
             metavar="FORMAT",
-            help="With --data: of its dates, as '%d.%m.%Y %H:%M'. Default: found from the rows.",
-            show_default=False,
         ),
     ] = "",
     skip: Annotated[
         int | None,
-        typer.Option(
-            min=0,
-            help="With --data: lines before the header. Default: found from the lines.",
-            show_default=False,
-        ),
+        option("With --data: lines before the header. Default: found from the lines.", min=0),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "With --data: what you know beside the table, as mesh.to='40 cm'; repeatable.",
             "--set",
             metavar="KEY=VALUE",
-            help="With --data: what you know beside the table, as mesh.to='40 cm'; repeatable.",
-            show_default=False,
         ),
     ] = None,
 ) -> None:
@@ -74,7 +67,7 @@ def init(
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
-    from livepde.cases.template import check_free, files_for, write_files, write_template
+    from livepde.cases.new_case import check_free, files_for, write_files, write_template
     from livepde.models import EQUATIONS
 
     console = terminal()
@@ -123,7 +116,7 @@ def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int 
 def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
     """Return the text of a case with the values given by --set and by answers to questions."""
     from livepde.cases.fill import filled
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
     from livepde.cli.questions import answered, asks
 
     text = filled(text, parse(settings), where)
@@ -146,7 +139,7 @@ def _show_written(
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:
     """Print a summary of the tables: times, and columns with roles, units and ranges."""
-    from livepde.cases.from_table import channels_in
+    from livepde.cases.new_case import channels_in
     from livepde.runs import Table
 
     rows = [_channel_row(item, read, equation) for item in channels_in(read, equation)]
@@ -209,10 +202,10 @@ def _entries(found: Equation) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = [("state", "u", found.state.text, unit, "")]
     for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):
         rows += [(table, key, item.text, item.unit, "") for key, item in known.items()]
-    for key, option in found.options.items():
-        default = "needed" if option.default is None else str(option.default)
-        choices = f" ({', '.join(option.choices)})" if option.choices else ""
-        rows.append(("[options]", key, option.text + choices, option.unit, default))
+    for key, entry in found.options.items():
+        default = "needed" if entry.default is None else str(entry.default)
+        choices = f" ({', '.join(entry.choices)})" if entry.choices else ""
+        rows.append(("[options]", key, entry.text + choices, entry.unit, default))
     for key, item in found.quantities.items():
         rows.append(("[channels], quantity", key, item.text, unit, ""))
     if found.fluxes is not None:

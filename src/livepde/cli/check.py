@@ -10,7 +10,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case
+from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, print_table, terminal
 
 if TYPE_CHECKING:
@@ -26,9 +26,7 @@ def check(
     case: CaseArgument,
     data: Annotated[
         str | None,
-        typer.Option(
-            help="Other data than the case names (.csv, .jsonl, .parquet).", show_default=False
-        ),
+        option("Other data than the case names (.csv, .jsonl, .parquet)."),
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
@@ -112,11 +110,11 @@ def _percent(share: float) -> str:
 
 def _show_advice(console: Console, prepared: Prepared) -> None:
     """Print where one more sensor would help most."""
-    from livepde.cases.placement import advise
+    from livepde.cases.preview import advise
     from livepde.runs import Table
 
     found = advise(prepared, prepared.stream)
-    unit = prepared.case.frame.equation.length_unit
+    unit = prepared.case.equation.length_unit
     at = ", ".join(f"{x:.3g}" for x in found.position)
     rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
@@ -131,27 +129,27 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
 
 def _show_wiring(console: Console, case: Case) -> None:
     """Print the source of a process's samples, and the intake policy of each channel."""
-    from livepde.cases.data_sources import policy_of, source_text
+    from livepde.cases.data import policy_of, source_text
     from livepde.runs import Table
 
-    policy, unit = policy_of(case.frame), case.frame.equation.time_unit
+    policy, unit = policy_of(case), case.equation.time_unit
     rows = []
     for name, column in case.columns.items():
-        habit, spec = policy.habit(name), case.frame.spec.channels[column.noise_of or name]
+        habit, spec = policy.habit(name), case.spec.channels[column.noise_of or name]
         low, high = column.valid
         rows.append(
             (
                 name,
                 "noise" if column.noise_of else spec.role,
                 ", ".join(column.names),
-                "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.frame.unit(name)}",
+                "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.unit(name)}",
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "go on",
             )
         )
     columns = ("channel", "role", "column", "valid", "waits", "of two", "missing")
-    print_table(console, Table(f"Channels from {source_text(case.frame)}", columns, rows))
+    print_table(console, Table(f"Channels from {source_text(case)}", columns, rows))
     console.print(
         "Add --data FILE, a recording with the same columns, to see what its sensors can identify.",
         soft_wrap=True,
@@ -160,7 +158,7 @@ def _show_wiring(console: Console, case: Case) -> None:
 
 def _show_model(console: Console, case: Case) -> None:
     model = case.model
-    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.frame.equation.formula)}")
+    console.print(f"[bold]{escape(case.title)}[/]\n{escape(case.equation.formula)}")
     from livepde.stepping import ForwardStage
 
     engine = ForwardStage(model).engine
@@ -177,7 +175,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
     from livepde.runs import Table
 
     steps = np.diff(samples.t)
-    unit = case.frame.equation.time_unit
+    unit = case.equation.time_unit
     begin = f" from {prepared.origin}" if prepared.origin else ""
     text = f"Data: {len(samples)} samples{begin}, t = {samples.t[0]:g} to {samples.t[-1]:g} {unit}"
     if len(steps):
@@ -193,10 +191,10 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
         rows.append(
             (
                 name,
-                "noise" if of else case.frame.spec.channels[name].role,
+                "noise" if of else case.spec.channels[name].role,
                 least,
                 largest,
-                case.frame.unit(of).replace("degC", "K") if of else case.frame.unit(name),
+                case.unit(of).replace("degC", "K") if of else case.unit(name),
                 len(values) - len(present),
                 _longest_gap(np.isfinite(values)),
             )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.options import JsonOption, OutOption, names_in
+from livepde.cli.options import JsonOption, OutOption, names_in, option
 from livepde.cli.printing import can_draw, named, report_outcome, show, terminal
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from livepde.runs import Outcome, RunWriter
 
-__all__ = ["demo", "reproduce"]
+__all__ = ["conducted", "demo", "reproduce"]
 
 
 def demo(out: OutOption = None) -> None:
@@ -52,6 +52,21 @@ def demo(out: OutOption = None) -> None:
     console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
 
 
+def conducted(
+    run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str
+) -> Outcome:
+    """Run an experiment, keep its outcome in a new run directory if one is named, and return it."""
+    from livepde.runs import RunWriter
+
+    writer = None
+    if out is not None:
+        writer = RunWriter.create(out, version=__version__, command=list(command), title=title)
+    outcome = run()
+    if writer is not None:
+        _finish(writer, outcome, terminal(err=True))
+    return outcome
+
+
 def _finish(writer: RunWriter, outcome: Outcome, console: Console) -> Iterable[str]:
     """Write the outcome of an experiment; return the names of its figures, if any can be drawn."""
     figures = outcome.figures if can_draw(console) else {}
@@ -76,16 +91,15 @@ def reproduce(
     ],
     truth: Annotated[
         str | None,
-        typer.Option(
-            help="Where the data come from: discrete (the same scheme), fine (a finer grid), "
-            "analytic (a formula).",
-            show_default=False,
+        option(
+            "Where the data come from: discrete (the same scheme), fine (a finer grid), "
+            "analytic (a formula)."
         ),
     ] = None,
     as_json: JsonOption = False,
     out: Annotated[
         Path | None,
-        typer.Option(help="Keep dataset and figures in a new run directory.", show_default=False),
+        option("Keep dataset and figures in a new run directory."),
     ] = None,
 ) -> None:
     """Run a published or stated experiment and compare it with its expected numbers.
@@ -93,7 +107,6 @@ def reproduce(
     Example:  livepde reproduce seed --json
     """
     from livepde.reproduce import EXPERIMENTS
-    from livepde.runs import RunWriter
 
     if name == "list":
         for item in EXPERIMENTS.values():
@@ -101,12 +114,7 @@ def reproduce(
         return
     experiment = named(name, EXPERIMENTS, "experiment")
     command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
-    writer = None
-    if out is not None:
-        writer = RunWriter.create(
-            out, version=__version__, command=command, title=experiment.summary
-        )
-    outcome = experiment.run(truth, progress=not as_json)
-    if writer is not None:
-        _finish(writer, outcome, terminal(err=True))
+    outcome = conducted(
+        lambda: experiment.run(truth, progress=not as_json), out, command, experiment.summary
+    )
     report_outcome(outcome, command, as_json)

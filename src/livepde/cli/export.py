@@ -1,41 +1,48 @@
-"""Write a run in the formats of other programs."""
+"""Write a run, or the identifier of a case, for other programs."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
 
-from livepde.cli.printing import terminal
+from livepde.cli.options import (
+    CodeOption,
+    ForceOption,
+    JsonOption,
+    RunArgument,
+    SetOption,
+    argument,
+    load_case,
+    option,
+)
+from livepde.cli.printing import present, terminal
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from xarray import Dataset
 
-__all__ = ["export"]
+__all__ = ["export", "fmu"]
 
 REPORT = ".html"
 
 
 def export(
-    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run directory.")],
+    folder: RunArgument,
     targets: Annotated[
         list[Path],
-        typer.Argument(
-            metavar="TARGET...",
-            help="Files to write: .nc, .zarr, .csv, .xdmf, .vtu, .vtk or .html.",
-            show_default=False,
+        argument(
+            "Files to write: .nc, .zarr, .csv, .xdmf, .vtu, .vtk or .html.", metavar="TARGET..."
         ),
     ],
     at: Annotated[
         str | None,
-        typer.Option(
-            help="Of .vtu and .vtk: the time of the fields, as 3600, '1 h' or a date. "
-            "Default: the last.",
-            show_default=False,
+        option(
+            "Of .vtu and .vtk: the time of the fields, as 3600, '1 h' or a date. Default: the last."
         ),
     ] = None,
     salvage: Annotated[
@@ -45,7 +52,7 @@ def export(
             help="Of a damaged journal: write the estimates that are whole, and say which are not.",
         ),
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    force: ForceOption = False,
 ) -> None:
     """Write a run, also one that still goes on, in formats that other programs open.
 
@@ -108,3 +115,52 @@ def _moment(text: str, data: Dataset) -> float:
         date = date.astimezone(UTC).replace(tzinfo=None)
     origin, second = dates
     return (date - origin).total_seconds() / second
+
+
+class Standard(StrEnum):
+    """Versions of the interface."""
+
+    two = "2"
+    three = "3"
+
+
+def fmu(
+    source: Annotated[
+        str,
+        argument(
+            "The case file (TOML); or file.py:function or module:function of your own, which "
+            "returns an Identifier.",
+            metavar="CASE",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        option("File to write. Default: the case's name."),
+    ] = None,
+    fmi: Annotated[Standard, typer.Option(help="Version of the standard: FMI 2.0 or 3.0.")] = (
+        Standard.two
+    ),
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+    allow_code: CodeOption = False,
+    settings: SetOption = None,
+) -> None:
+    """Write a case as a co-simulation unit (FMU) for Simulink, Modelica tools and others.
+
+    Its inputs are the channels of the case, its outputs the estimates with their deviations, the
+    model's value at each sensor, and a status. Where it runs, Python has to find livepde.
+
+    Example:  livepde fmu mycase/case.toml --out rod.fmu
+    """
+    from livepde.exchange.fmu_export import is_code, write_unit
+    from livepde.exchange.recipe import recipe_of
+
+    code = is_code(source)
+    if code and settings:
+        raise ConfigurationError(f"--set belongs to a case; {source} is code.")
+    recipe = recipe_of(source if code else load_case(Path(source), allow_code, settings))
+    process = recipe.process
+    path = write_unit(recipe, out, fmi=2 if fmi is Standard.two else 3, force=force)
+    inside = f"{len(process.inputs)} inputs, {len(process.outputs()) + 1} outputs"
+    lines = [escape(f"Written: {path} ({inside})")]
+    present([], [], process.notes, as_json=as_json, lines=lines, unit=str(path))

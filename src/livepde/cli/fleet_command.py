@@ -14,8 +14,8 @@ import typer
 from rich.markup import escape
 
 from livepde.cli.fleet_parts import Backend, in_parts
-from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case
-from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, print_json, show, terminal
+from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case, option
+from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
 from livepde.cli.run import batch, concluded, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
 
@@ -90,27 +90,23 @@ def fleet(
     case: CaseArgument,
     members: Annotated[
         Path,
-        typer.Option(
-            help="A .csv file with a row for each run. Columns: name; data, a file beside the "
-            "table; and keys of the case, as unknowns.alpha.prior, with a value for each run.",
-            show_default=False,
+        option(
+            "A .csv file with a row for each run. Columns: name; data, a file beside the "
+            "table; and keys of the case, as unknowns.alpha.prior, with a value for each run."
         ),
     ],
     out: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder for the run directories. Default: a new one in runs/.", show_default=False
-        ),
+        option("Folder for the run directories. Default: a new one in runs/."),
     ] = None,
     jobs: Annotated[
         int, typer.Option(min=-1, help="Processes at once; -1 for one on each processor.")
     ] = 1,
     backend: Annotated[
         Backend | None,
-        typer.Option(
-            help="Backend of joblib for the processes: loky on this machine (default with --jobs); "
-            "Dask or Ray, with the cluster that DASK_SCHEDULER_ADDRESS or RAY_ADDRESS names.",
-            show_default=False,
+        option(
+            "Backend of joblib for the processes: loky on this machine (default with --jobs); "
+            "Dask or Ray, with the cluster that DASK_SCHEDULER_ADDRESS or RAY_ADDRESS names."
         ),
     ] = None,
     resume: Annotated[
@@ -159,12 +155,9 @@ def _report(
     """Print the outcomes of all members; a member that failed ends the command with an error."""
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *told, *_complaints(ended)]
-    if as_json:
-        print_json([_table(summary)], [], notes, run=str(folder), failed=len(wrong))
-    else:
-        console = terminal()
-        show(console, [_table(summary)], [], notes)
-        console.print(f"[bold]Run directories: {escape(str(folder))}[/]", soft_wrap=True)
+    lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
+    run, tables = str(folder), [_table(summary)]
+    present(tables, [], notes, as_json=as_json, lines=lines, run=run, failed=len(wrong))
     if any(item.status == "interrupted" for item in ended):
         raise typer.Exit(INTERRUPTED)
     if wrong:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,13 +16,27 @@ if TYPE_CHECKING:
 __all__ = [
     "CaseArgument",
     "CodeOption",
+    "ForceOption",
     "JsonOption",
     "OutOption",
+    "RunArgument",
     "SetOption",
+    "argument",
     "load_case",
     "names_in",
+    "option",
     "prepare_again",
 ]
+
+
+def option(text: str, *names: str, **more: Any) -> Any:
+    """Return an option whose help says its default itself, or needs none."""
+    return typer.Option(*names, help=text, show_default=False, **more)
+
+
+def argument(text: str, **more: Any) -> Any:
+    """Return an argument without a default."""
+    return typer.Argument(help=text, show_default=False, **more)
 
 
 JsonOption = Annotated[
@@ -30,7 +44,7 @@ JsonOption = Annotated[
 ]
 OutOption = Annotated[
     Path | None,
-    typer.Option(help="Run directory to make. Default: a new one in runs/.", show_default=False),
+    option("Run directory to make. Default: a new one in runs/."),
 ]
 CodeOption = Annotated[
     bool,
@@ -40,15 +54,16 @@ CodeOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option(
+    option(
+        "Another value than the case has, as law.noise='2 K'; nothing after the = takes the "
+        "key away. Repeat it for more.",
         "--set",
         metavar="KEY=VALUE",
-        help="Another value than the case has, as law.noise='2 K'; nothing after the = takes the "
-        "key away. Repeat it for more.",
-        show_default=False,
     ),
 ]
-CaseArgument = Annotated[Path, typer.Argument(help="The case file (TOML).", show_default=False)]
+RunArgument = Annotated[Path, argument("A run directory.", metavar="RUN")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Write over what is there.")]
+CaseArgument = Annotated[Path, argument("The case file (TOML).")]
 
 
 def names_in(place: str) -> Callable[[str], list[str]]:
@@ -66,7 +81,7 @@ def names_in(place: str) -> Callable[[str], list[str]]:
 def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> Case:
     """Read a case with the settings of the command line."""
     from livepde import cases
-    from livepde.cases.settings import parse
+    from livepde.cases.read import parse
 
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 

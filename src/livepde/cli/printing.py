@@ -25,7 +25,7 @@ __all__ = [
     "can_draw",
     "figures_of",
     "named",
-    "print_json",
+    "present",
     "print_table",
     "report_outcome",
     "show",
@@ -44,11 +44,9 @@ def terminal(*, err: bool = False) -> Console:
 def named(name: str, known: Mapping[str, Any], what: str) -> Any:
     """Return an item by name; one sentence with the closest name if there is none."""
     if name not in known:
-        import difflib
+        from livepde.cases.read import did_you_mean
 
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"expected one of {', '.join(known)}."
-        raise ConfigurationError(f"there is no {what} '{name}'; {hint}")
+        raise ConfigurationError(f"there is no {what} '{name}'; {did_you_mean(name, known)}")
     return known[name]
 
 
@@ -73,27 +71,44 @@ def figures_of(dataset: Any, title: str) -> dict[str, Any]:
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:
     """Print an outcome; with `as_json` a failed check ends the command with exit code 1."""
-    if as_json:
-        print_json(outcome.tables, outcome.checks, outcome.notes, command=" ".join(command))
-    else:
-        show(terminal(), outcome.tables, outcome.checks, outcome.notes)
+    results = outcome.tables, outcome.checks, outcome.notes
+    present(*results, as_json=as_json, command=" ".join(command))
     if as_json and not outcome.ok:
         raise typer.Exit(CHECK_FAILED)
 
 
-def print_json(
+def present(
     shown: Iterable[Table],
     checks: Iterable[Check],
     notes: Iterable[str],
     *,
+    as_json: bool,
+    title: str = "",
+    lines: Iterable[str] = (),
     dataset: Any = None,
-    **more: Any,
+    **facts: Any,
 ) -> None:
-    """Print one JSON object; `dataset`: with the measures of a run."""
+    """Print results as text, or as one JSON object.
+
+    Parameters
+    ----------
+    title, lines
+        Of the text, before and after the results; with markup.
+    dataset, facts
+        Of the object: the run whose measures and verdict it has, and further entries.
+    """
+    console = terminal()
+    if not as_json:
+        if title:
+            console.print(title, soft_wrap=True)
+        show(console, shown, checks, notes)
+        for line in lines:
+            console.print(line, soft_wrap=True)
+        return
     from livepde.runs import measures, verdict
     from livepde.runs.directory import plain
 
-    content: dict[str, Any] = {"livepde": __version__, **more}
+    content: dict[str, Any] = {"livepde": __version__, **facts}
     content["checks"] = [item.to_dict() for item in checks]
     if dataset is not None:
         content["measures"] = measures(dataset)
@@ -161,12 +176,10 @@ def _cell(value: Any) -> str:
 
 
 def _print_checks(console: Console, checks: Sequence[Check]) -> None:
-    from livepde.runs.directory import bound_text
-
     if not checks:
         return
     grid = RichTable.grid(padding=(0, 2))
     for item in checks:
         mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
-        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, bound_text(item))
+        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
     console.print(grid)

@@ -14,12 +14,10 @@ from livepde.cli.cases import equations, init
 from livepde.cli.check import check
 from livepde.cli.citation import citation
 from livepde.cli.experiments import demo, reproduce
-from livepde.cli.explain import explain
-from livepde.cli.export import export
+from livepde.cli.export import export, fmu
 from livepde.cli.fleet_command import fleet
-from livepde.cli.fmu import fmu
 from livepde.cli.printing import BAD_INPUT, terminal
-from livepde.cli.report import report
+from livepde.cli.report import explain, report
 from livepde.cli.run import run
 from livepde.cli.watch import watch
 from livepde.errors import LivepdeError

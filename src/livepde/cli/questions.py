@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from livepde.cases.fill import Blank, blanks, filled, with_channel
-from livepde.cases.settings import parse
+from livepde.cases.read import parse
 from livepde.cases.units import convert
 from livepde.errors import CaseError
 from livepde.models import Equation

@@ -23,14 +23,14 @@ from livepde.cli.options import (
     OutOption,
     SetOption,
     load_case,
+    option,
 )
 from livepde.cli.printing import (
     CHECK_FAILED,
     INTERRUPTED,
     can_draw,
     figures_of,
-    print_json,
-    show,
+    present,
     terminal,
 )
 from livepde.errors import ConfigurationError, LivepdeError
@@ -56,10 +56,9 @@ def run(
     case: CaseArgument,
     data: Annotated[
         str | None,
-        typer.Option(
-            help="Other data than the case names: a .csv, .jsonl or .parquet file, or - for JSON "
-            "lines from standard input. With data.follow it is followed as the case's own file.",
-            show_default=False,
+        option(
+            "Other data than the case names: a .csv, .jsonl or .parquet file, or - for JSON "
+            "lines from standard input. With data.follow it is followed as the case's own file."
         ),
     ] = None,
     out: OutOption = None,
@@ -82,35 +81,25 @@ def run(
     ] = False,
     speed: Annotated[
         float | None,
-        typer.Option(
-            help="With --realtime: how many times faster than it happened a file is replayed; inf "
-            "for as fast as it goes. Default: 1.",
-            show_default=False,
+        option(
+            "With --realtime: how many times faster than it happened a file is replayed; inf "
+            "for as fast as it goes. Default: 1."
         ),
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "Serve /health and /metrics (Prometheus) there while the run goes on.",
             metavar="[HOST:]PORT",
-            help="Serve /health and /metrics (Prometheus) there while the run goes on.",
-            show_default=False,
         ),
     ] = None,
     watch: Annotated[
         str | None,
-        typer.Option(
-            metavar="[HOST:]PORT",
-            help="Serve the live page there while the run goes on.",
-            show_default=False,
-        ),
+        option("Serve the live page there while the run goes on.", metavar="[HOST:]PORT"),
     ] = None,
     token: Annotated[
         str,
-        typer.Option(
-            envvar="LIVEPDE_TOKEN",
-            help="What visitors of --listen and --watch have to know.",
-            show_default=False,
-        ),
+        option("What visitors of --listen and --watch have to know.", envvar="LIVEPDE_TOKEN"),
     ] = "",
     estimates: Annotated[
         bool,
@@ -131,7 +120,7 @@ def run(
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs.logs import configure
+    from livepde.runs.standard_streams import configure
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
@@ -203,15 +192,18 @@ def _refuse(how: Beside, live: bool, as_json: bool) -> None:
 
 def _report(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: bool) -> None:
     """Print the results of a run, and where they are."""
-    dataset, shown, checks, notes = found
-    if as_json:
-        print_json(shown, checks, notes, run=str(folder), status=driven.status, dataset=dataset)
-        return
-    console = terminal()
-    console.print(f"[bold]{escape(title)}[/]  {len(driven.result)} samples")
-    show(console, shown, checks, notes)
-    console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
-    console.print(f"Look at it: livepde watch {escape(str(folder))}", soft_wrap=True)
+    where = escape(str(folder))
+    present(
+        found.tables,
+        found.checks,
+        found.notes,
+        as_json=as_json,
+        title=f"[bold]{escape(title)}[/]  {len(driven.result)} samples",
+        lines=[f"[bold]Run directory: {where}[/]", f"Look at it: livepde watch {where}"],
+        dataset=found.dataset,
+        run=str(folder),
+        status=driven.status,
+    )
 
 
 def writer_of(
@@ -261,7 +253,7 @@ def batch(
         prepared.stream,
         progress=not quiet,
         total=len(table) if table else None,
-        fields_every=prepared.case.fields_every,
+        fields_every=prepared.case.spec.output.fields_every,
         journal=journal,
     )
     return writer, (prepared, driven)
@@ -302,7 +294,7 @@ def concluded(
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
-    driving = loaded.frame.roles("boundary", "input")
+    driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
         return verdict(dataset).with_findings(input_findings(driven.journal, driving))
@@ -318,7 +310,7 @@ def concluded(
     notes[:0] = [*loaded.notes, *found.sentences]
     if len(driven.result):
         notes += attempted("Identifiability", lambda: _traded(loaded, identifier), nothing, notes)
-        if loaded.smoothed:
+        if loaded.spec.output.smoothed:
             smooth = partial(_with_smoothed, prepared, driven, dataset)
             dataset, told = attempted("The smoother", smooth, (dataset, nothing), notes)
             notes += told
@@ -349,7 +341,7 @@ def _with_smoothed(
     samples = ((taken.t, taken.values) for taken in driven.journal.taken())
     begun = prepared.identifier_with(prepared.case.law)
     try:
-        smoothed = begun.smoothed(samples, fields_every=prepared.case.fields_every)
+        smoothed = begun.smoothed(samples, fields_every=prepared.case.spec.output.fields_every)
     except LivepdeError as error:  # the estimates of the run are kept
         return dataset, [f"Nothing is smoothed: {error}"]
     return with_smoothed(dataset, smoothed), []

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
+from livepde.cli.options import option
 from livepde.cli.printing import terminal
 
 if TYPE_CHECKING:
@@ -26,19 +27,17 @@ def watch(
     ],
     address: Annotated[
         str,
-        typer.Option(
+        option(
+            "Where to listen. Default: port 8050 of this machine, reachable from it only.",
             metavar="HOST:PORT",
-            help="Where to listen. Default: port 8050 of this machine, reachable from it only.",
-            show_default=False,
         ),
     ] = "",
     token: Annotated[
         str,
-        typer.Option(
-            help="What a visitor has to know. Asked for on any address but this machine's own: "
+        option(
+            "What a visitor has to know. Asked for on any address but this machine's own: "
             "then one is made if none is given.",
             envvar="LIVEPDE_TOKEN",
-            show_default=False,
         ),
     ] = "",
     attached: Annotated[

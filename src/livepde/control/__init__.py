@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from livepde.control.affine import Discrete, Output
-from livepde.control.estimators import Estimator, Known, Learned
+from livepde.control.estimators import Estimator, Known, Learned, Trust
 from livepde.control.goal import Controller, Decision, Goal, Plan
 from livepde.control.kalman import Kalman
+from livepde.control.linear import Discrete, Output
 from livepde.control.loop import Action, Loop
 from livepde.control.lq import LQ
 from livepde.control.mpc import MPC
 from livepde.control.reduced import ReducedModel, reduce
-from livepde.control.trust import Trust
 
 __all__ = [
     "LQ",

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.control.affine import Output
-from livepde.control.linear import Linear, Linearisation
+from livepde.control.linear import Linear, Linearisation, Output
 from livepde.errors import ConfigurationError, ModelError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array

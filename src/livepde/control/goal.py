@@ -1,4 +1,4 @@
-"""Control objective, preview data at a sample, and decision of a controller."""
+"""Control objective, and what a controller is given and returns at a sample."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from livepde.control.known import Known
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
-__all__ = ["Controller", "Decision", "Goal", "Plan", "check"]
+__all__ = ["Controller", "Decision", "Goal", "Known", "Plan", "Source", "check"]
 
 FREE = (-np.inf, np.inf)
+Source: TypeAlias = Literal["estimate", "fallback"]
 
 
 def _finite(value: Any) -> bool:
@@ -116,6 +116,55 @@ class Goal:
         """Return least and largest values of the controls, shapes (controls,)."""
         low, high = zip(*(self.inputs.get(name, FREE) for name in model.controls), strict=True)
         return np.array(low), np.array(high)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """Estimated state and unknown numbers of a reduced model at one time.
+
+    Attributes
+    ----------
+    x, q
+        Coordinates of the state, shape (r,), and unknown numbers, shape (m,).
+    factor
+        Square root of the covariance of q, shape (m, k); without columns q counts as exact.
+    offset
+        Estimated unmeasured disturbance added to each channel, shape (channels,); None: zero. It
+        acts on the state equation.
+    model
+        Reduced model relinearised at the estimate, for unknown fields and models that are not
+        affine in u. None: the model of the controller. Its basis is that of the controller's model;
+        a controller uses its own outputs.
+    source, why
+        "estimate", or "fallback" with the reason why the estimate is not trusted.
+    """
+
+    x: Array
+    q: Array
+    factor: Array
+    source: Source = "estimate"
+    why: str = ""
+    offset: Array | None = None
+    model: ReducedModel | None = None
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of each unknown number, shape (m,)."""
+        return np.asarray(np.linalg.norm(self.factor, axis=1))
+
+    def scenarios(self, kappa: float, most: int) -> Array:
+        """Return q, and q +- kappa standard deviations along principal directions, shape (k, m).
+
+        Parameters
+        ----------
+        kappa
+            Number of standard deviations.
+        most
+            Maximum number of directions.
+        """
+        axes, sizes, _ = np.linalg.svd(self.factor, full_matrices=False)
+        shifts = kappa * (axes * sizes).T[:most]
+        return np.vstack([self.q[None], self.q + shifts, self.q - shifts])
 
 
 @dataclass(frozen=True, eq=False)

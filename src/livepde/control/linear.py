@@ -1,9 +1,9 @@
-"""Linear state-space form of a model in its free coefficients, for given unknown numbers."""
+"""Linear state-space forms for given unknown numbers: of a model, and of a reduced one."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 
-__all__ = ["Linear", "Linearisation"]
+__all__ = ["Discrete", "Linear", "Linearisation", "Output"]
 
 # Relative difference that is attributed to rounding.
 SAME = 1e-9
@@ -137,3 +137,47 @@ class Linearisation:
 def _differ(one: Array, other: Array) -> bool:
     size = max(float(np.abs(one).max(initial=0.0)), float(np.abs(other).max(initial=0.0)))
     return bool(np.abs(one - other).max(initial=0.0) > SAME * size)
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """Output equation of a reduced model: y = C x + D c + d for the channels c.
+
+    Attributes
+    ----------
+    names
+        Names of the outputs.
+    C, D, d
+        Shapes (outputs, r), (outputs, channels) and (outputs,).
+    noise
+        Measurement noise of each output as a standard deviation, shape (outputs,); None if unknown.
+    """
+
+    names: tuple[str, ...]
+    C: Array
+    D: Array
+    d: Array
+    noise: Array | None = None
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the outputs, shape (outputs,)."""
+        y: Array = self.C @ x + self.D @ c + self.d
+        return y
+
+
+@dataclass(frozen=True, eq=False)
+class Discrete:
+    """Discrete-time model x+ = A x + B c + f with a zero-order hold of the channels c."""
+
+    A: Array
+    B: Array
+    f: Array
+
+    def with_offset(self, offset: Array | None) -> Discrete:
+        """Return the model with a constant added to the channels, shape (channels,)."""
+        return self if offset is None else replace(self, f=self.f + self.B @ offset)
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the state at the end of the step."""
+        after: Array = self.A @ x + self.B @ c + self.f
+        return after

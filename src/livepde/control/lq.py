@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import null_space, solve_discrete_are
 
-from livepde.control.affine import Discrete
-from livepde.control.goal import Decision, Goal, Plan, check
-from livepde.control.known import Known
+from livepde.control.goal import Decision, Goal, Known, Plan, check
+from livepde.control.linear import Discrete
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array

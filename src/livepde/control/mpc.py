@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.control.goal import Decision, Goal, Plan, check
-from livepde.control.known import Known
+from livepde.control.goal import Decision, Goal, Known, Plan, check
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array

@@ -1,6 +1,6 @@
 """The live page of a run in a browser, during the run and afterwards.
 
-`serve` starts it; `figures` draws datasets, also for reports.
+`serve` starts it; `panels` draws datasets, also for reports.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ def check_installed() -> None:
     """Raise `ConfigurationError` if the page cannot be shown for want of a package."""
     import importlib.util
 
-    if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "cheroot")):
+    if any(importlib.util.find_spec(name) is None for name in ("dash", "plotly", "waitress")):
         raise ConfigurationError(
-            "The live page needs Dash, Plotly and cheroot: pip install 'livepde[dashboard]'."
+            "The live page needs Dash, Plotly and waitress: pip install 'livepde[dashboard]'."
         )
 
 

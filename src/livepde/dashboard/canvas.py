@@ -8,21 +8,25 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard.times import TimeAxis, when_axis
+from livepde.dates import dated
 from livepde.linalg import Array
-from livepde.plots import PALETTE, labelled
+from livepde.plots import PALETTE, labelled, time_scale
 from livepde.runs import jumps
+from livepde.streams.clock import since_1970
 
 __all__ = [
     "CONFIG",
     "GRID",
     "MARKS",
+    "TimeAxis",
+    "at_time",
     "band",
     "empty",
     "line",
@@ -31,8 +35,10 @@ __all__ = [
     "text",
     "unit_label",
     "unit_of",
+    "when_axis",
 ]
 
+FAR = 1e11  # seconds from the origin beyond which times are numbers
 DECADES = 100.0  # from which ratio on a scale is logarithmic
 INK, GRID = "#1f2933", "#e4e7eb"
 HEIGHT = 320
@@ -143,3 +149,54 @@ def show(figure: go.Figure, parts: Sequence[Array]) -> None:
         figure.update_layout(yaxis_type="log")
     margin = 0.06 * (high - low) or 0.1 * abs(high) or 1.0
     figure.update_layout(yaxis_range=[low - margin, high + margin])
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """Axis of model times: dates, or numbers in a unit that suits the span.
+
+    Attributes
+    ----------
+    scale, start
+        Coefficients of the coordinate `start + t * scale`; of dates in milliseconds since 1970, the
+        convention of Plotly.
+    unit
+        Unit of numbers.
+    dates
+        Whether times are dates.
+    """
+
+    scale: float
+    start: float = 0.0
+    unit: str = ""
+    dates: bool = False
+
+    def values(self, t: Any) -> Any:
+        """Return the coordinates of times on the axis."""
+        return self.start + np.asarray(t, dtype=float) * self.scale
+
+    def text(self, t: float) -> str:
+        """Return one time as text."""
+        value = self.values(t)
+        if self.dates and np.isfinite(value):
+            return str(np.datetime64(int(value), "ms").astype("datetime64[s]")).replace("T", " ")
+        return f"{value:.5g} {self.unit}".rstrip()
+
+
+def when_axis(data: xr.Dataset) -> TimeAxis:
+    """Return the time axis of a dataset."""
+    dates = dated(data)
+    if dates is not None:
+        origin, second = dates
+        if bool((np.abs(data["time"].values) * second < FAR).all()):
+            return TimeAxis(1000.0 * second, 1000.0 * since_1970(origin), dates=True)
+    factor, name = time_scale(data)
+    return TimeAxis(1.0 / factor, unit=name)
+
+
+def at_time(data: xr.Dataset, dimension: str, at: float | None) -> int:
+    """Return the index of the last entry up to a time; -1 of an empty dataset."""
+    times = data[dimension].values
+    if at is None or not len(times):
+        return len(times) - 1
+    return max(int(np.searchsorted(times, at, "right")) - 1, 0)

@@ -15,8 +15,7 @@ import numpy as np
 import xarray as xr
 from dash import html
 
-from livepde.dashboard.canvas import unit_label
-from livepde.dashboard.times import at_time, when_axis
+from livepde.dashboard.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
 from livepde.plots.dataset import (
     field_names,
@@ -29,7 +28,6 @@ from livepde.plots.dataset import (
 )
 from livepde.records import STATUS_CODES
 from livepde.runs import severities
-from livepde.runs.directory import bound_text
 from livepde.runs.summary import channel_errors, determination, digits
 from livepde.verdict import Severity
 
@@ -156,7 +154,7 @@ def _found(seen: RunView) -> list[tuple[Level, str]]:
     """Return the findings on a run: level and sentence."""
     data = seen.dataset
     found: list[tuple[Level, str]] = [("bad", text) for text in _failures(seen)]
-    found += [("bad", f"Expected {c.name} {c.sense} {bound_text(c)}, but it is {c.value:.4g}.")
+    found += [("bad", f"Expected {c.name} {c.sense} {c.bound_text}, but it is {c.value:.4g}.")
               for c in seen.checks if not c.ok]  # fmt: skip
     # The notes of a thinned run that ended stand in the place of doubts, without a severity.
     graves = {} if data is None else severities(data)
@@ -300,7 +298,7 @@ def _event_tables(seen: RunView) -> Iterator[Any]:
         yield _table("Irregular rows and values", ("reason", "channel", "number"), counts)
     if seen.checks:
         checks = [
-            ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {bound_text(c)}")
+            ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {c.bound_text}")
             for c in seen.checks
         ]
         columns = ("", "number", "value", "expected")

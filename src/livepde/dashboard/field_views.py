@@ -11,8 +11,17 @@ import plotly.graph_objects as go
 import xarray as xr
 
 from livepde.dashboard import cuts
-from livepde.dashboard.canvas import GRID, band, empty, line, show, text, unit_label, unit_of
-from livepde.dashboard.times import at_time
+from livepde.dashboard.canvas import (
+    GRID,
+    at_time,
+    band,
+    empty,
+    line,
+    show,
+    text,
+    unit_label,
+    unit_of,
+)
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
 

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 from livepde import runs
 from livepde.errors import ConfigurationError, RunError
 from livepde.runs import Check, Journal, Run, Table
-from livepde.runs.directory import CASE, JOURNAL, bound_text
+from livepde.runs.directory import CASE, JOURNAL
 from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
 
 if TYPE_CHECKING:
-    from livepde.dashboard.times import TimeAxis
+    from livepde.dashboard.canvas import TimeAxis
 
 __all__ = ["page_of", "write_report"]
 
@@ -57,9 +57,8 @@ def page_of(run: Run) -> str:
         raise ConfigurationError(
             "A report as HTML needs Plotly and Jinja2: pip install 'livepde[dashboard]'."
         ) from None
-    from livepde.dashboard.canvas import CONFIG
+    from livepde.dashboard.canvas import CONFIG, when_axis
     from livepde.dashboard.panels import SECTIONS, panels
-    from livepde.dashboard.times import when_axis
 
     data = run.dataset
     if not data.sizes["time"]:
@@ -125,7 +124,7 @@ def _shown(table: Table) -> Table:
 
 def _checked(check: Check) -> tuple[str, ...]:
     result = "ok" if check.ok else "FAILED"
-    return check.name, f"{check.value:.5g}", f"{check.sense} {bound_text(check)}", result
+    return check.name, f"{check.value:.5g}", f"{check.sense} {check.bound_text}", result
 
 
 def _written(run: Run) -> str:

@@ -13,9 +13,8 @@ from werkzeug.middleware.dispatcher import DispatcherMiddleware
 
 from livepde import __version__
 from livepde.dashboard import cards
-from livepde.dashboard.canvas import unit_of
+from livepde.dashboard.canvas import unit_of, when_axis
 from livepde.dashboard.page import application, harden, page
-from livepde.dashboard.times import when_axis
 from livepde.dashboard.view import RunView, View
 from livepde.plots.dataset import labelled, scalars
 from livepde.runs import run_names

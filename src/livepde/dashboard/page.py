@@ -11,9 +11,8 @@ from dash import ALL, Input, Output, State, dcc, html, no_update
 
 from livepde import __version__
 from livepde.dashboard import cards
-from livepde.dashboard.canvas import CONFIG
+from livepde.dashboard.canvas import CONFIG, when_axis
 from livepde.dashboard.panels import SECTIONS, Panel, panels
-from livepde.dashboard.times import when_axis
 from livepde.dashboard.view import View
 
 if TYPE_CHECKING:

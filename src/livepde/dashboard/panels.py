@@ -1,4 +1,4 @@
-"""Panels of a run in a browser: figures in sections, each with a caption.
+"""Panels of a run in a browser: figures over time in sections, each with a caption.
 
 Pure functions: a dataset as `Result.to_xarray()` or `Layout.dataset` gives it, and the time to look
 back to.
@@ -6,16 +6,42 @@ back to.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
+from livepde.dashboard.canvas import (
+    MARKS,
+    TimeAxis,
+    at_time,
+    band,
+    empty,
+    line,
+    over_time,
+    show,
+    text,
+    unit_label,
+    when_axis,
+)
 from livepde.dashboard.field_views import drawn_by, field_profile
-from livepde.dashboard.figures import correlation, open_shares, ratio, residuals, told, unknowns
-from livepde.dashboard.times import at_time, when_axis
-from livepde.plots.dataset import MOST_LINES, groups, note
+from livepde.linalg import Array
+from livepde.plots import GREY, PALETTE
+from livepde.plots.dataset import (
+    MOST_LINES,
+    field_names,
+    groups,
+    interval_95,
+    modes_told,
+    note,
+    prior_left,
+    scalars,
+    scored_from,
+)
+from livepde.runs.summary import shown
 
 __all__ = ["SECTIONS", "Panel", "panels"]
 
@@ -24,6 +50,8 @@ SECTIONS = {
     "sensors": "Sensors against the model",
     "told": "What the data have told",
 }
+MOST_POINTS = 2000  # of a line
+SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: pinned, hardly identified
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,3 +175,196 @@ def _crowd(data: xr.Dataset, dimension: str) -> str:
     """Return how many sensors are drawn as one."""
     count = data.sizes[dimension]
     return f" Line: root mean square of {count}; band: their range." if count > MOST_LINES else ""
+
+
+def _bounded(data: xr.Dataset) -> xr.Dataset:
+    """Return a dataset thinned to evenly spread samples; failed steps and jumps are kept."""
+    count = data.sizes["time"]
+    if count <= MOST_POINTS:
+        return data
+    kept = np.zeros(count, dtype=bool)
+    kept[np.linspace(0, count - 1, MOST_POINTS).round().astype(int)] = True
+    notable = data["status"].values != 0
+    alarms = note(data, "jump")
+    if alarms is not None:
+        notable |= alarms > 0.0
+    kept[np.flatnonzero(notable)[:MOST_POINTS]] = True
+    return data.isel(time=kept)
+
+
+def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -> go.Figure:
+    """Draw numbers of one unit over time, with their 95 % bands, reference and bounds.
+
+    Parameters
+    ----------
+    labels
+        Scalar unknowns of the dataset.
+    """
+    data = _bounded(data)
+    figure, axis = over_time(data, unit_label(data, labels[0]), at)
+    t = axis.values(data["time"].values)
+    # The prior's band would flatten everything that follows.
+    late = slice(max(len(t) // 2, scored_from(data) + len(t) // 20), None)
+    reach: list[Array] = []
+    opacity = 0.2 if len(labels) <= 2 else 0.1
+    for k, label in enumerate(labels):
+        colour = PALETTE[k % len(PALETTE)]
+        value = data[label].values
+        low, high = interval_95(data, label)
+        reach.append(value)
+        if np.isfinite(low[late]).any():
+            reach += [low[late], high[late]]
+            if len(labels) <= MOST_LINES:
+                band(figure, t, low, high, colour, label, opacity)
+        std = np.zeros_like(value)
+        if f"{label}_std" in data:
+            std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
+        figure.add_scatter(
+            x=t,
+            y=value,
+            mode="lines+markers" if len(t) == 1 else "lines",
+            line={"color": colour, "width": 2},
+            name=text(_short(label)),
+            legendgroup=label,
+            showlegend=len(labels) > 1,
+            customdata=std,
+            hovertemplate="%{y:.4g} ± %{customdata:.2g}" if std.any() else "%{y:.4g}",
+        )
+        reference = data[label].attrs.get("reference")
+        if reference is not None:
+            reach.append(np.array([float(reference)]))
+            about = {"legendgroup": label, "showlegend": k == 0, "hovertemplate": "%{y:.4g}"}
+            ends = [float(reference)] * 2
+            line(figure, t[[0, -1]], ends, colour, 1.2, "dash", name="reference", **about)
+    show(figure, reach)
+    _mark_failures(figure, data, axis)
+    return figure
+
+
+def _short(label: str) -> str:
+    """Return the region of a label that has one."""
+    return label.partition("[")[2].removesuffix("]") or label
+
+
+def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: TimeAxis) -> None:
+    failed = data["time"].values[data["status"].values != 0]
+    if not len(failed):
+        return
+    figure.add_scatter(
+        x=axis.values(failed),
+        y=np.full(len(failed), 0.02),
+        yaxis="y2",
+        mode="markers",
+        marker={"symbol": "x", "color": PALETTE[1], "size": 8},
+        name="failed step",
+        hoverinfo="skip",
+    )
+    figure.update_layout(yaxis2=MARKS)
+
+
+def residuals(
+    data: xr.Dataset, variable: str, dimension: str, at: float | None = None
+) -> go.Figure:
+    """Draw errors of sensors over time: each, or of many their range.
+
+    Parameters
+    ----------
+    variable, dimension
+        "innovation" over "sensor", or "withheld_error" over "withheld".
+    """
+    data = _bounded(data)
+    figure, axis = over_time(data, unit_label(data, variable), at)
+    t, errors = axis.values(data["time"].values), data[variable].values
+    names = [str(name) for name in data[dimension].values]
+    mode = "lines" if len(t) > 60 else "lines+markers"
+    if len(names) <= MOST_LINES:
+        for k, name in enumerate(names):
+            about = {"name": text(name), "mode": mode, "hovertemplate": "%{y:+.3g}"}
+            colour = PALETTE[k % len(PALETTE)]
+            line(figure, t, errors[:, k], colour, 1.3, marker={"size": 5}, **about)
+        figure.update_layout(showlegend=True)
+        return figure
+    some = np.isfinite(errors).any(axis=1)
+    t, errors = t[some], errors[some]
+    if len(t):
+        low, high = np.nanmin(errors, axis=1), np.nanmax(errors, axis=1)
+        band(figure, t, low, high, PALETTE[0], "range")
+        root = np.sqrt(np.nanmean(errors**2, axis=1))
+        about = {"name": "root mean square", "mode": mode, "hovertemplate": "%{y:.3g}"}
+        line(figure, t, root, PALETTE[0], 1.8, showlegend=True, **about)
+    return figure
+
+
+def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
+    """Draw the ratio of squared innovations to their expected square."""
+    data = _bounded(data)
+    figure, axis = over_time(data, "", at)
+    t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
+    about = {"name": "misses to expected", "hovertemplate": "%{y:.3g}"}
+    line(figure, t, values, PALETTE[0], 2, **about)
+    for level, name, colour in ((1.0, "as expected", GREY), (4.0, "too large", PALETTE[1])):
+        line(figure, t[[0, -1]], [level] * 2, colour, 1.2, "dash", name=name, hoverinfo="skip")
+    figure.update_yaxes(rangemode="tozero")
+    return figure
+
+
+def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
+    """Return unknown -> remaining share of its prior standard deviation; of fields over modes."""
+    found: dict[str, float] = {}
+    k = at_time(data, "time", at)
+    for label in scalars(data):
+        left = prior_left(data, label, k)
+        if math.isfinite(left):
+            found[label] = left
+    for name in field_names(data):
+        if f"{name}_modes" in data:
+            some, count, left = modes_told(data, name, at_time(data, "snapshot", at))
+            found[f"{name} ({some:.1f} of {count} modes told)"] = left
+    return found
+
+
+def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
+    """Draw the remaining share of the prior standard deviation of each unknown."""
+    known = dict(reversed(open_shares(data, at).items()))
+    figure = empty("prior standard deviation left [%]", height=max(170, 90 + 26 * len(known)))
+    shares = [100.0 * left for left in known.values()]
+    colours = [
+        PALETTE[2] if share <= 100 * SURE else PALETTE[1] if share > 100 * FLAT else PALETTE[0]
+        for share in shares
+    ]
+    figure.add_bar(
+        x=shares,
+        y=[text(name) for name in known],
+        orientation="h",
+        marker={"color": colours},
+        text=[shown(share, ".2g" if share < 100 else ".0f", " %") for share in shares],
+        textposition="auto",
+        hoverinfo="skip",
+    )
+    for level in (SURE, FLAT):
+        figure.add_vline(x=100 * level, line={"color": GREY, "dash": "dash", "width": 1})
+    figure.update_layout(hovermode=False, xaxis_range=[0, max(105.0, 1.05 * max(shares))])
+    figure.update_yaxes(type="category")
+    return figure
+
+
+def correlation(data: xr.Dataset) -> go.Figure:
+    """Draw how the newest estimates of numbers are correlated."""
+    names = [text(name) for name in data["unknown"].values]
+    values = data["correlation"].values
+    figure = empty(height=max(260, 120 + 30 * len(names)))
+    figure.add_heatmap(
+        x=names,
+        y=names,
+        z=values,
+        zmin=-1,
+        zmax=1,
+        colorscale="RdBu_r",
+        colorbar={"thickness": 14, "outlinewidth": 0},
+        texttemplate="%{z:.2f}" if len(names) <= 10 else "",
+        hovertemplate="%{y}, %{x}: %{z:.2f}<extra></extra>",
+    )
+    figure.update_layout(hovermode="closest")
+    figure.update_xaxes(type="category", showgrid=False)
+    figure.update_yaxes(type="category", showgrid=False, autorange="reversed")
+    return figure

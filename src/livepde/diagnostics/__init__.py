@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.constants import Part, Spaces, constants
 from livepde.diagnostics.error_bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
@@ -24,10 +24,10 @@ from livepde.diagnostics.stopping import (
     reconstruction_matrix,
     stopping_time,
 )
-from livepde.diagnostics.theory import OnlineTracker, Sheet, TheoryReport, theory_report
+from livepde.diagnostics.theory import OnlineTracker, TheoryReport, theory_report
 
 __all__ = [
-    "CheckLine",
+    "Check",
     "CheckReport",
     "Direction",
     "Errors",
@@ -40,7 +40,6 @@ __all__ = [
     "OnlineStopping",
     "OnlineTracker",
     "Part",
-    "Sheet",
     "Spaces",
     "Spectrum",
     "StoppingState",

@@ -1,50 +1,126 @@
-"""Check reports: measured properties as values and as a table."""
+"""Measured numbers: checks against a bound, tables, and reports on one object."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from livepde.errors import ConfigurationError
 
-__all__ = ["CheckLine", "CheckReport"]
+__all__ = ["Bound", "Check", "CheckReport", "Sense", "Table"]
+
+Sense: TypeAlias = Literal["<=", ">=", "in"]
+Bound: TypeAlias = float | tuple[float, float]
 
 
 @dataclass(frozen=True)
-class CheckLine:
-    """One measured property.
+class Check:
+    """A number and the bound that it must satisfy.
 
     Attributes
     ----------
     name
-        The property, in words or as an equation.
-    value, bound
-        Measured value, and the bound that it is compared with.
-    ok
-        True if the property holds.
-    remedy
-        Advice if it does not hold.
+        The measured quantity, in words or as an equation.
+    value
+        The number; NaN never satisfies anything.
+    bound
+        One number for "<=" and ">=", a pair (low, high) for "in".
     sense
-        Comparison of value and bound, "<=" or ">=".
+        "<=", ">=" or "in".
+    remedy
+        Advice if the bound is missed.
+
+    Examples
+    --------
+    >>> Check("error of q", 0.04, 0.05, "<=").ok
+    True
+    >>> Check("k", 2.5, (2.6, 3.1), "in").ok
+    False
     """
 
     name: str
     value: float
-    bound: float
-    ok: bool
-    remedy: str
-    sense: str = "<="
+    bound: Bound
+    sense: Sense
+    remedy: str = ""
+
+    def __post_init__(self) -> None:
+        if self.sense not in ("<=", ">=", "in"):
+            raise ConfigurationError(
+                f"check '{self.name}': got sense {self.sense!r}; expected '<=', '>=' or 'in'."
+            )
+        if isinstance(self.bound, tuple) != (self.sense == "in"):
+            raise ConfigurationError(
+                f"check '{self.name}': got bound {self.bound!r}; '{self.sense}' needs "
+                + ("a pair (low, high)." if self.sense == "in" else "one number.")
+            )
 
     @classmethod
-    def at_most(cls, name: str, value: float, bound: float, remedy: str) -> CheckLine:
-        """Return a line that holds if value <= bound; NaN never holds."""
-        return cls(name, float(value), bound, bool(value <= bound), remedy)
+    def at_most(cls, name: str, value: float, bound: float, remedy: str) -> Check:
+        """Return a check of value <= bound."""
+        return cls(name, float(value), bound, "<=", remedy)
 
     @classmethod
-    def at_least(cls, name: str, value: float, bound: float, remedy: str) -> CheckLine:
-        """Return a line that holds if value >= bound; NaN never holds."""
-        return cls(name, float(value), bound, bool(value >= bound), remedy, ">=")
+    def at_least(cls, name: str, value: float, bound: float, remedy: str) -> Check:
+        """Return a check of value >= bound."""
+        return cls(name, float(value), bound, ">=", remedy)
+
+    @property
+    def ok(self) -> bool:
+        """True if the number satisfies the bound."""
+        if isinstance(self.bound, tuple):
+            return bool(self.bound[0] <= self.value <= self.bound[1])
+        return bool(self.value <= self.bound if self.sense == "<=" else self.value >= self.bound)
+
+    @property
+    def bound_text(self) -> str:
+        """The bound as text."""
+        if isinstance(self.bound, tuple):
+            return f"[{self.bound[0]:g}, {self.bound[1]:g}]"
+        return f"{self.bound:g}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object: name, value, bound, sense, ok."""
+        bound = list(self.bound) if isinstance(self.bound, tuple) else self.bound
+        return {
+            "name": self.name,
+            "value": self.value,
+            "bound": bound,
+            "sense": self.sense,
+            "ok": self.ok,
+        }
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows to print; numbers stay numbers until they are shown."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object."""
+        return {
+            "title": self.title,
+            "columns": list(self.columns),
+            "rows": [list(row) for row in self.rows],
+        }
+
+    def markdown(self, digits: int = 5) -> str:
+        """Return the table in Markdown, with so many significant digits; without rows its title."""
+
+        def line(cells: Iterable[Any]) -> str:
+            shown = (f"{c:.{digits}g}" if isinstance(c, float) else str(c) for c in cells)
+            return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
+
+        if not self.rows:
+            return f"## {self.title}"
+        rule = "|" + "---|" * len(self.columns)
+        return "\n".join([f"## {self.title}", "", line(self.columns), rule, *map(line, self.rows)])
 
 
 @dataclass(frozen=True)
@@ -62,14 +138,14 @@ class CheckReport:
 
     Examples
     --------
-    >>> line = CheckLine.at_most("P P = P", 3e-16, 1e-12, "")
+    >>> line = Check.at_most("P P = P", 3e-16, 1e-12, "")
     >>> print(CheckReport("observation", (line,)))
     observation: ok
       ok    P P = P  3.0e-16 <= 1.0e-12
     """
 
     name: str
-    lines: tuple[CheckLine, ...]
+    lines: tuple[Check, ...]
     error: type[ConfigurationError] = ConfigurationError
 
     @property
@@ -78,7 +154,7 @@ class CheckReport:
         return all(line.ok for line in self.lines)
 
     @property
-    def failed(self) -> tuple[CheckLine, ...]:
+    def failed(self) -> tuple[Check, ...]:
         """Lines of properties that do not hold."""
         return tuple(line for line in self.lines if not line.ok)
 
@@ -114,8 +190,10 @@ class CheckReport:
         return "\n".join(rows)
 
 
-def _number(value: float) -> str:
+def _number(value: Bound) -> str:
     """Return a number as text: counts and rates plainly, others in scientific notation."""
+    if isinstance(value, tuple):
+        return f"[{_number(value[0])}, {_number(value[1])}]"
     if not np.isfinite(value):
         return str(value)
     if value == int(value) and abs(value) < 1e5:

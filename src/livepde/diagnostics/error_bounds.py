@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.constants import Spaces
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
@@ -286,8 +286,8 @@ def conditions(
     first, second, third = CONDITIONS[data]
     asked_theta, asked_nu = _asked(data, c, sigma)
 
-    def line(name: str, holds: Any, remedy: str) -> CheckLine:
-        return CheckLine.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)
+    def line(name: str, holds: Any, remedy: str) -> Check:
+        return Check.at_least(f"{name} (share of samples)", np.mean(holds), 1.0, remedy)
 
     theta = _values(errors, lambda item: item.theta) * (1 + ROUNDING)
     lines = []
@@ -379,7 +379,7 @@ def bounds(
     # sigma pulls q to zero, where ||e||_Q = ||q*||_Q.
     limit = max(start, q_true**2) if sigma > 0 else start
     lines = [
-        CheckLine.at_most(
+        Check.at_most(
             f"1. ||e||^2 + ||{label}||^2",
             float(_values(kept, energy).max()),
             limit * (1 + ROUNDING),
@@ -393,16 +393,16 @@ def bounds(
         b = c.C_N**2 * C**4 / c.c_N**2 * float(_values(kept, lambda item: item.Pu**2).max())
         b += c.C_A * C**2 / (c.c_N * nu) * limit
         lines.append(
-            CheckLine.at_most(
+            Check.at_most(
                 "2. ||p||^2", largest_p, max(p0, 2.0 * b) * (1 + ROUNDING), "p grew. " + UNUSED
             )
         )
     elif largest_p == 0.0:
-        lines.append(CheckLine.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
+        lines.append(Check.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
     if sigma == 0 and c.L_C > 0:
         part = _integral(kept, lambda item: item.p.V * residual(item))
         lines.append(
-            CheckLine.at_most(
+            Check.at_most(
                 f"3. integral of ||p||_V ||{label}||_X",
                 part,
                 start / (2.0 * c.L_C) * (1 + ROUNDING),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.space_checks import definite, largest, relative
 from livepde.errors import LinearAlgebraError, ModelError
 from livepde.fem import Composed, Form, Inputs, Moment
@@ -160,14 +160,14 @@ def _plain(form: Form | Composed) -> Form:
     return form.form if isinstance(form, Composed) else form
 
 
-def _finite(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _finite(model: Model, at: _TestPoint) -> list[Check]:
     values = {
         "F": model.F(at.moment),
         "B(u)": model.B(at.u, at.moment),
         "A(u)": model.A(at.u, at.moment, at.q).matrix.data,
     }
     return [
-        CheckLine.at_most(
+        Check.at_most(
             f"{name} finite (failures)",
             int((~np.isfinite(value)).sum()),
             0,
@@ -178,7 +178,7 @@ def _finite(model: Model, at: _TestPoint) -> list[CheckLine]:
     ]
 
 
-def _linear(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _linear(model: Model, at: _TestPoint) -> list[Check]:
     lines = []
     in_v = "write each term as a factor times v or grad(v); a term without v belongs nowhere."
     in_q = "it seemed linear at moderate values; rescale q, or write its law without thresholds."
@@ -202,7 +202,7 @@ def _linear(model: Model, at: _TestPoint) -> list[CheckLine]:
         error = max(largest(both - 2 * fa + 3 * fb), largest(zero))
         size = largest(fa) + largest(fb)
         lines.append(
-            CheckLine.at_most(
+            Check.at_most(
                 f"{name} linear in {slot}",
                 error / size if size else error,
                 LINEARITY,
@@ -212,7 +212,7 @@ def _linear(model: Model, at: _TestPoint) -> list[CheckLine]:
     return lines
 
 
-def _agreement(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _agreement(model: Model, at: _TestPoint) -> list[Check]:
     """Compare assembled matrices and shortcuts for affine forms with plain quadrature."""
     remedy = (
         "as assembled is not what its integrand gives: it is not linear in v or q, or it looks "
@@ -227,7 +227,7 @@ def _agreement(model: Model, at: _TestPoint) -> list[CheckLine]:
         size = float(np.abs(density).sum())
         error = abs(float(value - density.sum()))
         lines.append(
-            CheckLine.at_most(
+            Check.at_most(
                 f"{name} assembled = quadrature",
                 error / size if size else error,
                 LINEARITY,
@@ -237,20 +237,20 @@ def _agreement(model: Model, at: _TestPoint) -> list[CheckLine]:
     return lines
 
 
-def _adjoint(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _adjoint(model: Model, at: _TestPoint) -> list[Check]:
     A = model.A(at.u, at.moment, at.q)
     transpose = model.form_A.matrix("q", "v", at.moment, u=at.u, q=at.q)
     star = A.adjoint(at.r)
     size = model.Q.norm(star) * model.Q.norm(at.dq)
     error = abs(model.Q.inner(star, at.dq) - A(at.dq) @ at.r)
     return [
-        CheckLine.at_most(
+        Check.at_most(
             "A(u)^T = transpose of A(u)",
             relative(transpose - A.matrix.T, A.matrix),
             ROUNDING,
             "A must be linear in v.",
         ),
-        CheckLine.at_most(
+        Check.at_most(
             "(A(u)* r, xi)_Q = <A(u) xi, r>",
             float(error / size if size else error),
             ROUNDING,
@@ -260,7 +260,7 @@ def _adjoint(model: Model, at: _TestPoint) -> list[CheckLine]:
     ]
 
 
-def _derivatives(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _derivatives(model: Model, at: _TestPoint) -> list[Check]:
     A, B, moment = model.form_A, model.form_B, at.moment
     given = "dA" if any(_plain(A).derivatives) else ""
 
@@ -326,7 +326,7 @@ def _taylor(
     slope: Array,
     at: Array,
     along: Array,
-) -> CheckLine:
+) -> Check:
     """Return the rate of the Taylor remainder, or its size if it is at rounding level."""
     remedy = (
         f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
@@ -345,17 +345,17 @@ def _taylor(
     size = largest(start) + largest(slope)
     if remainders[0] <= FLOOR * size:
         relative_size = remainders[0] / size if size else remainders[0]
-        return CheckLine.at_most(f"{name}: affine, remainder", relative_size, FLOOR, remedy)
+        return Check.at_most(f"{name}: affine, remainder", relative_size, FLOOR, remedy)
     small = np.array(remainders[1:])
     above = small > FLOOR * size
     rates = np.log2(small[:-1] / np.maximum(small[1:], 1e-300))[above[:-1] & above[1:]]
     # The smallest steps decide: an error of size s in the derivative dominates the remainder only
     # for steps below s.
     rate = float(np.median(rates[-3:])) if len(rates) else np.inf
-    return CheckLine.at_least(f"{name}: rate of the Taylor remainder", rate, SLOWEST, remedy)
+    return Check.at_least(f"{name}: rate of the Taylor remainder", rate, SLOWEST, remedy)
 
 
-def _mass(model: Model) -> list[CheckLine]:
+def _mass(model: Model) -> list[Check]:
     """Check the mass matrix on the components with a mass term."""
     M, space = model.mass, model.X
     if len(model.algebraic):
@@ -363,14 +363,14 @@ def _mass(model: Model) -> list[CheckLine]:
         space = HilbertSpace(sp.csr_array(M[rest][:, rest]), "X")
     line = definite(space)
     return [
-        CheckLine.at_most(
+        Check.at_most(
             "M = M^T", relative(M - M.T, M), ROUNDING, "M(u, v, x) must be symmetric in u and v."
         ),
-        CheckLine.at_most("M positive definite (failures)", line.value, 0, line.remedy),
+        Check.at_most("M positive definite (failures)", line.value, 0, line.remedy),
     ]
 
 
-def _algebraic(model: Model, at: _TestPoint) -> list[CheckLine]:
+def _algebraic(model: Model, at: _TestPoint) -> list[Check]:
     """Check that the equations of components without a mass term determine them (index 1)."""
     rows = model.algebraic
     if not len(rows):
@@ -387,7 +387,7 @@ def _algebraic(model: Model, at: _TestPoint) -> list[CheckLine]:
     except LinearAlgebraError:
         condition = np.inf
     return [
-        CheckLine.at_most(
+        Check.at_most(
             "algebraic components: size of their inverse",
             condition if np.isfinite(condition) else np.inf,
             LARGEST_INVERSE,

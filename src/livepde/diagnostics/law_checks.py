@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from livepde import checkpoint
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.identifier import Identifier
@@ -132,12 +132,12 @@ def _step(identifier: Identifier, item: Sample) -> Estimate:
     return identifier.step(item.t, item.z, item.inputs)
 
 
-def _count(name: str, count: Callable[[], int], remedy: str) -> CheckLine:
+def _count(name: str, count: Callable[[], int], remedy: str) -> Check:
     """Return a line that holds if the count is zero; an exception of the law fails it."""
     try:
-        return CheckLine.at_most(name, count(), 0, remedy)
+        return Check.at_most(name, count(), 0, remedy)
     except Exception as error:  # noqa: BLE001  the report says it, and goes on to the next line
-        return CheckLine(name, np.inf, 0, False, f"{type(error).__name__}: {error} ({remedy})")
+        return Check.at_most(name, np.inf, 0, f"{type(error).__name__}: {error} ({remedy})")
 
 
 def _numbers(estimate: Estimate) -> Array:

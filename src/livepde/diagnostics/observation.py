@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.space_checks import largest, relative
 from livepde.errors import ObservationError
 from livepde.fem import Inputs, Latent, Moment
@@ -84,7 +84,7 @@ def check_observation(
     return CheckReport("observation", tuple(lines), ObservationError)
 
 
-def _projections(observed: Observed, rng: np.random.Generator) -> list[CheckLine]:
+def _projections(observed: Observed, rng: np.random.Generator) -> list[Check]:
     everything = np.ones(observed.size, dtype=bool)
     lines = _lines(observed, observed.split(), everything, rng, "")
     if observed.size > 1:
@@ -94,7 +94,7 @@ def _projections(observed: Observed, rng: np.random.Generator) -> list[CheckLine
         lines += _lines(observed, split, present, rng, "one sensor missing: ")
         more = split.R.trace() - observed.split().R.trace()
         lines.append(
-            CheckLine.at_most(
+            Check.at_most(
                 "one sensor missing: growth of rank R",
                 more,
                 ROUNDING * observed.X.dim,
@@ -103,7 +103,7 @@ def _projections(observed: Observed, rng: np.random.Generator) -> list[CheckLine
         )
     nothing = observed.split(np.zeros(observed.size, dtype=bool))
     lines.append(
-        CheckLine.at_most(
+        Check.at_most(
             "all sensors missing: |R|",
             largest(nothing.R),
             0.0,
@@ -113,9 +113,7 @@ def _projections(observed: Observed, rng: np.random.Generator) -> list[CheckLine
     return lines
 
 
-def _taylor(
-    observed: Observed, at: float, moment: Moment, rng: np.random.Generator
-) -> list[CheckLine]:
+def _taylor(observed: Observed, at: float, moment: Moment, rng: np.random.Generator) -> list[Check]:
     """Compare the derivatives with central differences of the readings.
 
     Only sensors with a reading are compared, and at least one must have a reading.
@@ -138,17 +136,17 @@ def _taylor(
         "defined near the state at= of the check."
     )
 
-    def line(name: str, step: tuple[Array, Array], exact: Array) -> CheckLine:
+    def line(name: str, step: tuple[Array, Array], exact: Array) -> Check:
         more, less = (
             observed.predict(u + s * step[0], q + s * step[1], moment) for s in (STEP, -STEP)
         )
         error = ((more - less) / (2.0 * STEP) - exact)[seen]
         # Differences cannot resolve changes far below the magnitude of the readings.
         size = max(largest(exact[seen]), 1e-4 * largest(z), 1e-300)
-        return CheckLine.at_most(name, largest(error) / size, TAYLOR, text)
+        return Check.at_most(name, largest(error) / size, TAYLOR, text)
 
     return [
-        CheckLine.at_most(
+        Check.at_most(
             "sensors without a reading",
             1.0 - float(seen.any()),
             0.0,
@@ -161,7 +159,7 @@ def _taylor(
 
 def _lines(
     observed: Observed, split: Split, present: Array, rng: np.random.Generator, prefix: str
-) -> list[CheckLine]:
+) -> list[Check]:
     X, R, P = observed.X, split.R, split.P
     free = sp.diags_array(X.free)
     G = sp.csr_array(observed.G[np.flatnonzero(present)] @ free)
@@ -181,19 +179,17 @@ def _lines(
         ("G P = 0", relative(G @ free @ P, G), repeated),
         ("G G^+ G = G", relative(G @ R - G, G), repeated),
     ]
-    lines = [
-        CheckLine.at_most(prefix + name, value, ROUNDING, text) for name, value, text in images
-    ]
+    lines = [Check.at_most(prefix + name, value, ROUNDING, text) for name, value, text in images]
     dual = gram @ R
     return [
         *lines,
-        CheckLine.at_most(
+        Check.at_most(
             prefix + "R self-adjoint",
             relative(sp.csr_array(dual - dual.T), sp.csr_array(dual)),
             INVERSE,
             "R must be orthogonal in X, or for a selection of coefficients symmetric.",
         ),
-        CheckLine.at_most(
+        Check.at_most(
             prefix + "reconstruct(G u) = R u",
             relative(rebuilt - R @ u, R @ u),
             INVERSE,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.check_report import CheckLine, CheckReport
+from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.errors import LinearAlgebraError, SpaceError
 from livepde.linalg import Array
 from livepde.spaces import HilbertSpace
@@ -36,7 +36,7 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
     name = f"space {space.name}"
     gram = space.tangent_gram
     lines = [
-        CheckLine.at_most(
+        Check.at_most(
             "G = G^T",
             relative(gram - gram.T, gram),
             ROUNDING,
@@ -54,13 +54,13 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
             "fix boundary values."
         )
         lines += [
-            CheckLine.at_most(
+            Check.at_most(
                 "(riesz(f), x) = f(x)",
                 abs(space.inner(y, x) - float(functional @ x)) / size,
                 ROUNDING,
                 singular,
             ),
-            CheckLine.at_most(
+            Check.at_most(
                 "riesz(dual(x)) = x",
                 space.norm(space.riesz(space.dual(x)) - x) / (space.norm(x) or 1.0),
                 1e-9,
@@ -70,14 +70,14 @@ def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
     return CheckReport(name, tuple(lines), SpaceError)
 
 
-def definite(space: HilbertSpace) -> CheckLine:
+def definite(space: HilbertSpace) -> Check:
     """Return the line on positive definiteness: the Gram matrix can be factorised."""
     remedy = ""
     try:
         _ = space.factor
     except (SpaceError, LinearAlgebraError) as error:
         remedy = str(error)
-    return CheckLine.at_most("G positive definite (failures)", bool(remedy), 0, remedy)
+    return Check.at_most("G positive definite (failures)", bool(remedy), 0, remedy)
 
 
 def relative(difference: sp.csr_array | Array, reference: sp.csr_array | Array) -> float:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.diagnostics.check_report import CheckReport
+from livepde.diagnostics.check_report import CheckReport, Table
 from livepde.diagnostics.constants import Spaces, constants
 from livepde.diagnostics.error_bounds import TwinTracker, bounds, conditions
 from livepde.diagnostics.excitation import Excitation, Spectrum
@@ -33,7 +33,7 @@ from livepde.result import Estimate
 from livepde.samples import Sample, sample_of
 from livepde.streams import Twin
 
-__all__ = ["OnlineTracker", "Sheet", "TheoryReport", "theory_report"]
+__all__ = ["OnlineTracker", "TheoryReport", "theory_report"]
 
 DEFINITIONS = {
     "L_C": ("LipschitzC", "|C(q,u+v+w) - C(q,u)|_X <= L_C (|v|_V~ + |w|_V^)"),
@@ -66,28 +66,9 @@ SNAPSHOTS = 6
 # Number of modes in the table.
 SHOWN = 8
 NORMS = ("X", "VX", "V")
+DIGITS = 4  # of the numbers of the page
 # Number of cached matrices of G_alpha, one for each alpha.
 MATRICES = 16
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """Table of a report: title, columns, rows; numbers are formatted only for display."""
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-    def markdown(self) -> str:
-        """Return the table in Markdown."""
-
-        def cells(row: Iterable[Any]) -> str:
-            shown = (f"{c:.4g}" if isinstance(c, float) else str(c) for c in row)
-            return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
-
-        rule = "|" + "---|" * len(self.columns)
-        body = [cells(self.columns), rule, *map(cells, self.rows)]
-        return "\n".join([f"## {self.title}", "", *body])
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +88,7 @@ class TheoryReport:
         surrogate of T*, infinity if it was not reached.
     """
 
-    tables: tuple[Sheet, ...]
+    tables: tuple[Table, ...]
     reports: tuple[CheckReport, ...] = ()
     notes: tuple[str, ...] = ()
     constants: Constants | None = None
@@ -116,7 +97,7 @@ class TheoryReport:
 
     def markdown(self, title: str = "Theory") -> str:
         """Return the report in Markdown."""
-        parts = [f"# {title}", *(table.markdown() for table in self.tables)]
+        parts = [f"# {title}", *(table.markdown(DIGITS) for table in self.tables)]
         parts += [f"```\n{report}\n```" for report in self.reports]
         parts += [f"> {note}" for note in self.notes]
         return "\n\n".join(parts) + "\n"
@@ -330,7 +311,7 @@ def theory_report(
         tracker.add(estimate, sample)
         if followed is not None and estimate.status.ok:
             followed.add(estimate, sample.z)
-    tables: list[Sheet] = []
+    tables: list[Table] = []
     found = _constants(tracker, tables, notes)
     tables += _residual_tables(tracker, notes)
     stopping = None if found is None else _stopping(tracker, found, tables, notes)
@@ -354,7 +335,7 @@ def _followed(twin: Twin | None, tracker: OnlineTracker, notes: list[str]) -> Tw
         return None
 
 
-def _constants(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> Constants | None:
+def _constants(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> Constants | None:
     try:
         c = tracker.constants()
     except LivepdeError as error:
@@ -365,7 +346,7 @@ def _constants(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) ->
         for name, (label, text) in DEFINITIONS.items()
     ]
     columns = ("constant", "value", "definition", "in the paper", "is")
-    tables.append(Sheet("Constants of the discretised model", columns, rows))
+    tables.append(Table("Constants of the discretised model", columns, rows))
     return c
 
 
@@ -375,7 +356,7 @@ def _how(name: str, c: Constants) -> str:
     return "a bound" if name in ("C_A", "observed_ratio", "hidden_ratio") else "an eigenvalue"
 
 
-def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Sheet]:
+def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Table]:
     if not tracker.moments:
         notes.append("No sample holds a measurement, so there is no residual.")
         return []
@@ -391,7 +372,7 @@ def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Sheet]:
     else:
         notes.append("The law has no damping rule, so there is no theta, no mu and no kappa.")
     columns = ("along the run", "least", "median", "largest", "last")
-    tables = [Sheet("Residual and damping", columns, rows)]
+    tables = [Table("Residual and damping", columns, rows)]
     rows = []
     try:
         quotients = interpolation([item.r for item in tracker.moments])
@@ -411,7 +392,7 @@ def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Sheet]:
         except ConfigurationError as error:
             notes.append(f"Link condition of kappa: {error}")
     if rows:
-        tables.append(Sheet("Conditions on the residual", ("label", "measured", "of"), rows))
+        tables.append(Table("Conditions on the residual", ("label", "measured", "of"), rows))
     return tables
 
 
@@ -421,7 +402,7 @@ def _range(name: str, values: Array) -> tuple[Any, ...]:
 
 
 def _stopping(
-    tracker: OnlineTracker, c: Constants, tables: list[Sheet], notes: list[str]
+    tracker: OnlineTracker, c: Constants, tables: list[Table], notes: list[str]
 ) -> float | None:
     if tracker.noise is None or not tracker.moments:
         notes.append(
@@ -433,7 +414,7 @@ def _stopping(
     d = tracker.moments[-1].d or Norms()
     verdict = f"{state.T:.5g}" if np.isfinite(state.T) else "not reached"
     tables.append(
-        Sheet(
+        Table(
             "Surrogate of T*, the first violation of (cond_d)",
             ("T*", "margin at the end", "||d||_X", "||d||_VX~", "||d||_V~"),
             [(verdict, state.margin, d.X, d.VX, d.V)],
@@ -442,7 +423,7 @@ def _stopping(
     return state.T
 
 
-def _spectrum(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> Spectrum | None:
+def _spectrum(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> Spectrum | None:
     try:
         spectrum = tracker.excitation.spectrum(tracker.excited)
     except LivepdeError as error:
@@ -462,12 +443,12 @@ def _spectrum(tracker: OnlineTracker, tables: list[Sheet], notes: list[str]) -> 
         f"Excitation (asspof), windows of {tracker.window:.4g}: {pinned} of "
         f"{len(spectrum.strength)} modes of q within 1 % of the strongest"
     )
-    tables.append(Sheet(title, ("mode", "strength", "relative", "mostly in"), rows))
+    tables.append(Table(title, ("mode", "strength", "relative", "mostly in"), rows))
     return spectrum
 
 
 def _with_truth(
-    tracker: TwinTracker, c: Constants, law: Any, tables: list[Sheet]
+    tracker: TwinTracker, c: Constants, law: Any, tables: list[Table]
 ) -> list[CheckReport]:
     nu, sigma = getattr(law, "nu", 0.0), getattr(law, "sigma", 0.0)
     nu = float(nu) if isinstance(nu, int | float) else 0.0
@@ -484,7 +465,7 @@ def _with_truth(
     ]
     if noisy:
         rows.append(("T* with truth", "", T))
-    tables.append(Sheet("Errors against the truth", ("norm", "start", "end"), rows))
+    tables.append(Table("Errors against the truth", ("norm", "start", "end"), rows))
     data: Any = "noisy" if noisy else "exact"
     q_true = tracker.q_true
     return [

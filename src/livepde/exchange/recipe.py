@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.cases.code import load_code
+from livepde.cases.equations import load_code
 from livepde.errors import ConfigurationError
 from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
 from livepde.streams import DataTable
@@ -62,7 +62,7 @@ def _of_function(name: str) -> Recipe:
 
 
 def _of_case(case: Case) -> Recipe:
-    spec, folder = case.frame.spec, case.frame.path.parent
+    spec, folder = case.spec, case.path.parent
     files = {CASE: case.text.encode()}
     settings = {}
     if ":" in spec.equation:
@@ -86,7 +86,7 @@ def _of_case(case: Case) -> Recipe:
 
 def _dated(case: Case) -> tuple[datetime | None, DataTimes | None]:
     """Return the date of t = 0, and the times of the case's data, if it has any."""
-    data = case.frame.spec.data
+    data = case.spec.data
     if case.live or (data.file is None and data.reader is None):
         return None, None
     prepared = case.read()

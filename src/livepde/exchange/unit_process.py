@@ -223,13 +223,13 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         The date of t = 0, if the times of the case's data are dates.
     """
     ports = {}
-    for name, channel in case.frame.spec.channels.items():
-        unit = channel.unit or case.frame.unit(name)
+    for name, channel in case.spec.channels.items():
+        unit = channel.unit or case.unit(name)
         column = replace(case.columns[name], names=(name,))
         columns = " and ".join(channel.sources)
         text = f"Channel of role {channel.role}, as column {columns} of the data."
         ports[name] = Port(name, unit, text, column)
-    withheld = case.frame.roles("withheld")
+    withheld = case.roles("withheld")
     return UnitProcess(
         case.name,
         case.title,
@@ -238,7 +238,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         tuple(ports[name] for name in (*case.sensors, *withheld)),
         lambda first: case.begin(first, origin).identifier,
         case.clock.second,
-        frozenset(case.frame.spec.data.missing),
+        frozenset(case.spec.data.missing),
         _has_covariance(case.law),
     )
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from livepde.fem.branches import absolute, maximum, minimum, positive
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
@@ -20,7 +19,7 @@ from livepde.fem.fields import (
     interval,
     line,
 )
-from livepde.fem.forms import Form
+from livepde.fem.forms import Form, ignores
 from livepde.fem.latent import Composed, Latent, LatentPart, compose
 from livepde.fem.meshes import (
     box,
@@ -33,13 +32,25 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
+from livepde.fem.notation import (
+    absolute,
+    ddot,
+    div,
+    dot,
+    grad,
+    hess,
+    maximum,
+    minimum,
+    mul,
+    positive,
+    trace,
+    transpose,
+    upwind,
+)
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
-from livepde.fem.reading import reads
-from livepde.fem.shapes import ddot, div, dot, grad, hess, mul, trace, transpose
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
-from livepde.fem.upwind import upwind
 
 __all__ = [
     "START",
@@ -85,6 +96,7 @@ __all__ = [
     "grid",
     "hermite",
     "hess",
+    "ignores",
     "interval",
     "line",
     "linear",
@@ -94,7 +106,6 @@ __all__ = [
     "positive",
     "quadratic",
     "read_mesh",
-    "reads",
     "rectangle",
     "smooth",
     "trace",

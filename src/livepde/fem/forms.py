@@ -23,6 +23,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from inspect import signature
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -33,12 +34,11 @@ from livepde.fem.elementwise import ElementProducts, ElementTensor
 from livepde.fem.fields import Integrand, On
 from livepde.fem.measure import Measure
 from livepde.fem.place import START, Inputs, Moment, Place
-from livepde.fem.reading import reads
 from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern
 
-__all__ = ["Form", "FormMatrices", "Tensor"]
+__all__ = ["Form", "FormMatrices", "Tensor", "ignores"]
 
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
@@ -90,6 +90,21 @@ class _Term:
         place = self.measure.place(moment)
         jets = [self.spaces[name].jets(array) for name, array in values.items()]
         return self.integrand(*jets, place), place
+
+
+def ignores(function: Any, position: int) -> bool:
+    """Return whether a function declares by the name `_` that it ignores an argument.
+
+    Probing could not tell: a term may use an argument only at some times.
+
+    >>> ignores(lambda u, v, x: -x.t * v, 0), ignores(lambda _, v, x: -x.t * v, 0)
+    (False, True)
+    """
+    try:
+        names = [*signature(function).parameters]
+    except (TypeError, ValueError):  # of a function that is not written in Python
+        return False
+    return position < len(names) and names[position] == "_"
 
 
 class FormMatrices(ABC):
@@ -211,7 +226,7 @@ class Form(FormMatrices):
         for term in self.terms:
             read = set().union(*(self._read(piece, rng) for piece in term.samples()))
             used |= read
-            self._moving.append(bool(read) and self._mentions_state(term.integrand))
+            self._moving.append(bool(read) and self._involves_state(term.integrand))
         return frozenset(used)
 
     def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
@@ -244,11 +259,11 @@ class Form(FormMatrices):
         """True if the form reads neither time nor inputs."""
         return not self.uses
 
-    def _mentions_state(self, integrand: Integrand) -> bool:
-        """Return False if the code of an integrand never uses its nonlinear argument."""
+    def _involves_state(self, integrand: Integrand) -> bool:
+        """Return False if an integrand ignores its nonlinear argument."""
         if self.nonlinear is None:
             return False
-        return reads(integrand, list(self.spaces).index(self.nonlinear))
+        return not ignores(integrand, list(self.spaces).index(self.nonlinear))
 
     @property
     def steady(self) -> bool:

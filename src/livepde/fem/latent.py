@@ -17,8 +17,8 @@ from livepde.errors import SpaceError
 from livepde.fem.evolution import Evolution
 from livepde.fem.forms import Form, FormMatrices
 from livepde.fem.place import START, Moment
+from livepde.fem.priors import Identity, Transform
 from livepde.fem.space import FunctionSpace
-from livepde.fem.transforms import Identity, Transform
 from livepde.linalg import Array, IntArray, Pattern, sandwich
 
 __all__ = ["Composed", "Latent", "LatentPart", "compose"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import wraps
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
 from livepde.errors import MissingInputError
 from livepde.linalg import Array
@@ -14,30 +13,24 @@ from livepde.linalg import Array
 __all__ = ["START", "Moment", "Place", "with_constants"]
 
 
-class Inputs(Mapping[str, float]):
-    """Values of the input channels at one moment; a missing name raises a clear error."""
+class Inputs(dict[str, float]):
+    """Values of the input channels at one moment, unchangeable; a missing name raises an error."""
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        if isinstance(values, Inputs):  # they never change
-            self._values: Mapping[str, float] = values._values
-        else:
-            self._values = MappingProxyType(dict(values))
+    def __missing__(self, name: str) -> float:
+        known = ", ".join(sorted(self)) or "none"
+        raise MissingInputError(
+            f"Input channel '{name}' has no value; channels with one: {known}. "
+            "Name it in inputs= of the model and send it with every sample."
+        )
 
-    def __getitem__(self, name: str) -> float:
-        try:
-            return self._values[name]
-        except KeyError:
-            known = ", ".join(sorted(self._values)) or "none"
-            raise MissingInputError(
-                f"Input channel '{name}' has no value; channels with one: {known}. "
-                "Name it in inputs= of the model and send it with every sample."
-            ) from None
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError("Inputs of a moment never change: several states share them.")
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = setdefault = pop = popitem = clear = _refuse
 
-    def __len__(self) -> int:
-        return len(self._values)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Inputs, (dict(self),)  # a copy would set item by item
 
 
 NO_INPUTS = Inputs({})

@@ -12,7 +12,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
 
 from livepde.errors import SpaceError
-from livepde.fem.shapes import ddot, dot, grad, hess
+from livepde.fem.notation import ddot, dot, grad, hess
 from livepde.linalg import Array, Pattern, analyse
 
 __all__ = ["Sobolev"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.fleet.fleet import Fleet
-from livepde.fleet.kept import FleetRecords
+from livepde.fleet.fleet_records import FleetRecords
 from livepde.fleet.shard import Shard
 from livepde.fleet.shard_estimates import ShardEstimates
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
-from livepde.fleet.steppers import Beliefs
+from livepde.fleet.engines import Beliefs
 from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask

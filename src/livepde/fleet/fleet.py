@@ -21,10 +21,8 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.fleet.engines import BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
-from livepde.fleet.separately import Separately
-from livepde.fleet.steppers import FleetEngine
-from livepde.fleet.together import Together
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
 from livepde.linalg import Array, IntArray
@@ -138,13 +136,13 @@ class Fleet:
         """Return the engine that steps members as blocks if the law can, else one by one."""
         if not self.note:
             readings = [self._one.initial_readings(one) for one in made_of]
-            return Together(self.law, self._work, readings, u0s)
+            return BlockEngine(self.law, self._work, readings, u0s)
         if any(one.keys() != made_of[0].keys() for one in made_of):
             raise ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
-        return Separately(self.law, self._work, self.problem)
+        return SeparateEngine(self.law, self._work, self.problem)
 
     def _each(self, what: str, value: Any) -> list[Any]:
         """Return a value for each member: a list has one for each."""

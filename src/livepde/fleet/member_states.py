@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from livepde import checkpoint
+from livepde.fleet.engines import State
 from livepde.fleet.fleet import Fleet
-from livepde.fleet.steppers import State
 from livepde.linalg import Array, IntArray
 
 __all__ = ["JoinedStates", "MemberStates", "OwnStates", "states_of"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, ScoredSample
 
-__all__ = ["OK", "Assimilation", "MemberReports", "assimilate", "assimilate_at_once"]
+__all__ = ["OK", "Assimilation", "MemberReports", "absorb", "assimilate"]
 
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
@@ -54,13 +54,12 @@ class MemberReports:
 
     def member(self, k: int) -> Report:
         """Return the report of one member."""
-        steps = int(self.steps[k])
-        found = cache(lambda: self.diagnostics.member(k))
-        return Report(self.statuses[k], self.predicted[k], steps, found)
+        found = lambda: self.diagnostics.member(k)  # noqa: E731
+        return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), found)
 
     def updated(self, more: Diagnostics[Array]) -> MemberReports:
         """Return the reports with all that other diagnostics know among their own."""
-        return replace(self, diagnose=cache(lambda: self.diagnostics.updated(more)))
+        return replace(self, diagnose=lambda: self.diagnostics.updated(more))
 
     def with_members(self, reports: Mapping[int, Report]) -> MemberReports:
         """Return the reports with those of some members exchanged."""
@@ -74,11 +73,10 @@ class MemberReports:
             each = (reports.get(k, self.member(k)) for k in range(len(statuses)))
             return stacked([one.diagnostics for one in each])
 
-        return MemberReports(tuple(statuses), predicted, steps, cache(diagnosed))
+        return MemberReports(tuple(statuses), predicted, steps, diagnosed)
 
 
-@dataclass(frozen=True, eq=False)
-class Assimilation:
+class Assimilation(NamedTuple):
     """Outcome of the assimilation of a sample.
 
     Attributes
@@ -93,8 +91,8 @@ class Assimilation:
         Members whose numbers are finite, shape (members,).
     refused
         Values that the gate refused, shape (members,).
-    largest
-        Largest innovation in units of the noise, shape (members,); 0 without.
+    worst
+        Largest innovation of all members in units of the noise; 0 without.
     """
 
     predicted: Array
@@ -102,7 +100,7 @@ class Assimilation:
     status: Status
     finite: Mask
     refused: Array
-    largest: Array
+    worst: float
 
 
 @dataclass(frozen=True)
@@ -129,77 +127,79 @@ def assimilate(
 ) -> tuple[FilterState, Assimilation]:
     """Predict over a span and update at its end, linear about the linearisation points."""
     end, steps, failure = filter_.predict(x, span)
-    if failure is not None:
-        predicted, _ = filter_.sensors.observe(x, span.end)
-        zero = np.zeros(len(x))
-        return x, Assimilation(predicted, steps, Status.of(failure), zero > 0.0, zero, zero)
-    return _absorbed(filter_, end, span, options, steps)
+    if failure is None:
+        return absorb(filter_, end, span, options, steps)
+    predicted, _ = filter_.sensors.observe(x, span.end)
+    none = np.zeros(len(x))
+    return x, Assimilation(predicted, steps, Status.of(failure), none > 0.0, none, 0.0)
 
 
-def assimilate_at_once(
-    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions
-) -> FilterState:
-    """Update a state that belongs to the end of a span by the measurements there."""
-    return _absorbed(filter_, x, span, options, 0)[0]
-
-
-def _absorbed(
-    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int
+def absorb(
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int = 0
 ) -> tuple[FilterState, Assimilation]:
-    """Return the predicted filter after the measurements: gate, verdict, update, statistics."""
+    """Update a state that belongs to the end of a span by the measurements there.
+
+    Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
+    """
     predicted, Y = filter_.sensors.observe(x, span.end)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
-    whole = bool(used.all())
-    measured = None if whole else np.asarray(used.any(axis=1))
-    if measured is not None and not measured.any():
-        zero = np.zeros(len(x))
-        finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
-        return x, Assimilation(predicted, steps, OK, finite, zero, zero)
+    whole, measured = np.count_nonzero(used) == used.size, None
+    if not whole:
+        measured = np.asarray(used.any(axis=1))
+        if not measured.any():
+            none = np.zeros(len(d))
+            finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
+            return x, Assimilation(predicted, steps, OK, finite, none, 0.0)
     noise = filter_.noise_of(span)
     if options.adaptive or x.level[0] != 1.0:
         noise = np.sqrt(x.level)[:, None] * noise
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
-    largest = np.fmax.reduce(np.abs(d), axis=1, initial=0.0)
+    sizes = np.abs(d)
+    worst = float(np.fmax.reduce(sizes, axis=None, initial=0.0))
     variance = 1.0 + (Y * Y).sum(axis=1)
     e = d / np.sqrt(variance)
-    shadows = filter_.shadows
-    off = None if shadows is None else shadows.seen(x, span.end)
+    shadows, off = filter_.shadows, None
     expected, told = e, d
-    if shadows is not None and off is not None:
+    if shadows is not None:
+        off = shadows.seen(x, span.end)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         known = off[:, shadows.counted].sum(axis=1) / noise
         expected, told = d / np.sqrt(variance + known * known), d + known
-    gate = _gated(x, e, expected, used, options)
-    if gate.newest is not None:
-        used, whole = gate.used, bool(gate.used.all())
-        e = np.where(used, e, np.nan)
+    dropped, newest = np.zeros(len(d)), None
+    parts: dict[str, Any] = {}
+    # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
+    near = np.abs(expected) <= options.gate
+    if np.count_nonzero(near) < near.size or np.count_nonzero(x.refused):
+        used, parts["refused"], dropped, newest = _gated(x, e, expected, used, options)
+        if newest is not None:
+            whole = bool(used.all())
+            e = np.where(used, e, np.nan)
     if not whole:  # missing values take part as zeros, which carry no information
-        Y, d, told = (
-            np.where(used[:, None], Y, 0.0),
-            np.where(used, d, 0.0),
-            np.where(used, told, 0.0),
-        )
+        Y = np.where(used[:, None], Y, 0.0)
+        d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
         if off is not None:
             off = np.where(used[:, None], off, 0.0)
     if filter_.judge is not None:
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
-    new, made = filter_.update(x, Y, d)
-    parts: dict[str, Any] = {
-        "innovations": x.innovations.add(e, measured, gate.newest),
-        "refused": gate.refused,
-    }
+    parts["innovations"] = x.innovations.add(e, measured, newest)
+    new, made = filter_.update(x, Y, d, **parts)
     if options.adaptive:
-        parts |= _learned(x, used, d, noise, made)
+        new = changed(new, **_learned(x, used, d, noise, made))
     if shadows is not None and off is not None:
-        parts["shadows"] = shadows.updated(x, new, made.left, used / noise, off, span.t1)
+        followed = shadows.updated(x, new, made.left, used / noise, off, span.t1)
+        new = changed(new, shadows=followed)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
-    # square overflows would leave statistics that are not finite.
-    sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
-    finite = np.isfinite(sums + largest * largest)
-    return changed(new, **parts), Assimilation(predicted, steps, OK, finite, gate.dropped, largest)
+    # square overflows would leave statistics that are not finite. The squares of all members tell
+    # at once that nothing of this has happened.
+    finite = x.member >= 0  # all of them
+    squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
+    if not squares + worst * worst < math.inf:
+        sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
+        finite = np.isfinite(sums + np.fmax.reduce(sizes, axis=1, initial=0.0) ** 2)
+    return new, Assimilation(predicted, steps, OK, finite, dropped, worst)
 
 
 def _judged(
@@ -231,11 +231,16 @@ def _judged(
     return changed(x, causes=causes, ledger=ledger)
 
 
-class Gated(NamedTuple):
-    """Outcome of the gate for a sample.
+def _gated(
+    x: FilterState, e: Array, expected: Array, used: Mask, options: UpdateOptions
+) -> tuple[Mask, IntArray, Array, Array | None]:
+    """Return which values pass: normalised innovations e, and those by the wider `expected`.
 
-    Attributes
-    ----------
+    The gate is as much wider as the innovations are usually larger than expected, so that a noise
+    that is stated too small does not close it.
+
+    Returns
+    -------
     used, refused
         Values that are used, and how many in a row of each sensor were refused, (members, sensors).
     dropped
@@ -243,31 +248,15 @@ class Gated(NamedTuple):
     newest
         Normalised innovations for the test for jumps, (members, sensors); None: all of them.
     """
-
-    used: Mask
-    refused: IntArray
-    dropped: Array
-    newest: Array | None
-
-
-def _gated(x: FilterState, e: Array, expected: Array, used: Mask, options: UpdateOptions) -> Gated:
-    """Return which values pass: normalised innovations e, and those by the wider `expected`.
-
-    The gate is as much wider as the innovations are usually larger than expected, so that a noise
-    that is stated too small does not close it.
-    """
-    passed = Gated(used, x.refused, np.zeros(len(x)), None)
-    if options.gate == math.inf:
-        return passed
     limit = options.gate * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
     far = used & ~(np.abs(expected) <= limit[:, None])
-    if not (far.any() or x.refused.any()):
-        return passed
+    if options.gate == math.inf or not (far.any() or x.refused.any()):
+        return used, x.refused, np.zeros(len(e)), None
     refused = np.where(far, x.refused + 1, np.where(used, 0, x.refused))
     kept = used & ~(far & (refused <= options.patience))
     dropped = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
     # One value alone is no change of the process; a second one in a row may be.
-    return Gated(kept, refused, dropped, np.where(kept | (refused > 1), e, np.nan))
+    return kept, refused, dropped, np.where(kept | (refused > 1), e, np.nan)
 
 
 def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -36,13 +36,14 @@ from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report
 from livepde.laws.member_arrays import changed, join, take
 from livepde.laws.replay import Replay
-from livepde.laws.sensitivity import SensitivityLaw, without_factors
+from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.sensitivity_state import (
     NEVER,
     SensitivityState,
     SensitivityWork,
     new_window,
     restarted,
+    without_factors,
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
@@ -124,7 +125,7 @@ class AutoLaw(Law[Bank, AutoState]):
             raise LawError(f"AutoLaw: replay must be a Replay; got {self.replay!r}.")
         _ = self.member
 
-    @property
+    @cached_property
     def member(self) -> SensitivityLaw:
         """The law of each member, and by itself the one to take if nothing needs tuning."""
         return SensitivityLaw(
@@ -287,15 +288,16 @@ class AutoLaw(Law[Bank, AutoState]):
         """
         if state.count == before.count:
             return state, 0
-        at = state.at(state.leader)
-        innovations = state.members.now.innovations.newest[[at]]
+        leader = state.leader
+        at = state.at(leader)
+        innovations = state.members.now.innovations.newest[at : at + 1]
         watch, alarms = JUMPS.add(state.watch, innovations)
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
         onset = JUMPS.onset(before.watch, innovations) if alarm else 0
-        stayed, stays = (work.candidates[s.leader].drift == 0.0 for s in (before, state))
+        stayed = work.candidates[before.leader].drift == 0.0
         # A member that drifts takes the lead from one that does not: the process has changed, and
         # those that sleep are to be compared again soon.
-        if stayed and not stays and state.count >= 2 * TRIAL:
+        if stayed and work.candidates[leader].drift != 0.0 and state.count >= 2 * TRIAL:
             soon = min(state.due, state.count + TRIAL)
             state = changed(state, due=soon, pause=TRIAL)
         if alarm or state.count >= state.due:
@@ -406,7 +408,7 @@ class AutoLaw(Law[Bank, AutoState]):
                 awake=float(len(awake)),
             )
 
-        return Report(OK, predicted, leading.steps, cache(diagnosed))
+        return Report(OK, predicted, leading.steps, diagnosed)
 
     def settled(self, work: Bank, state: AutoState) -> AutoState:
         noise = state.noise if state.known else np.ones_like(state.noise)

@@ -11,7 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 from livepde.laws.jumps import Watch
 from livepde.laws.replay import ReplayState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask, Memo
 
 __all__ = [
     "CANDIDATES",
@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 STAYS, WIDE = 0, 1  # the first two candidates
+MOST_FILTERS = 16  # times between samples for which the filters are kept: usually one
 SAME = 0.01  # divergence per coordinate, in nats, of members that say the same
 
 
@@ -78,6 +79,9 @@ class Bank:
     work: SensitivityWork
     replays: Mask
     stated: bool
+    _filters: Memo[tuple[float, bytes], SensitivityWork] = field(
+        default_factory=lambda: Memo(MOST_FILTERS)
+    )
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -101,8 +105,12 @@ class Bank:
 
     def filters(self, tick: float, noise: Array) -> SensitivityWork:
         """Return the filter of all members, for samples a time `tick` apart."""
-        drift = self.drifts / tick if tick else 0.0 * self.drifts
-        return replace(self.work, filter=replace(self.work.filter, drift=drift, noise=noise))
+
+        def made() -> SensitivityWork:
+            drift = self.drifts / tick if tick else 0.0 * self.drifts
+            return replace(self.work, filter=replace(self.work.filter, drift=drift, noise=noise))
+
+        return self._filters.get((tick, noise.tobytes()), made)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +160,7 @@ class AutoState:
     @property
     def leader(self) -> int:
         """The member with the largest weight."""
-        return int(np.argmax(self.weights))
+        return int(self.weights.argmax())
 
     @property
     def awake(self) -> list[int]:
@@ -162,7 +170,7 @@ class AutoState:
 
     def at(self, number: int) -> int:
         """Return the position of a member that is awake among `members`."""
-        return int(np.flatnonzero(self.members.now.member == number)[0])
+        return int((self.members.now.member == number).nonzero()[0][0])
 
 
 def normalised(weights: Array) -> Array:

@@ -17,8 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -148,6 +147,15 @@ class Filter:
 
         Their process noise stands in new rows of the square root, in the same order for every h.
         """
+        end = self.unknowns_after(x, h)
+        grown = end.C.shape[1] - x.C.shape[1]
+        if not grown:
+            return end
+        U, past, causes = (_extended(part, grown) for part in (x.U, x.past, x.causes))
+        return changed(end, U=U, past=past, causes=causes)
+
+    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
+        """Return q, da, C and the shifts by shadows after a time h; all else is that of before."""
         if not self.moves or h == 0.0:
             return x
         drifts = self.drifts(x.member)
@@ -157,21 +165,16 @@ class Filter:
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
         # A coordinate that gains in one member has a row in all of them: members share one array.
-        grows = np.flatnonzero((gained > 0.0).any(axis=0))
-        members, _, k = x.C.shape
-        new = np.zeros((members, len(grows), k))
-        new[:, np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
-        return changed(
-            x,
-            q=self.reduction.predict(x.q, h),
-            da=x.da @ F.T,
-            U=_extended(x.U, len(grows)),
-            C=np.concatenate([x.C @ F.T, new], axis=1),
-            past=_extended(x.past, len(grows)),
-            causes=_extended(x.causes, len(grows)),
-            age=x.age + h,
-            shadows=changed(x.shadows, a=x.shadows.a @ F.T),
-        )
+        (grows,) = (gained > 0.0).any(axis=0).nonzero()
+        members, r, k = x.C.shape
+        C = np.zeros((members, r + len(grows), k))
+        C[:, :r] = x.C @ F.T
+        C[:, r + np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
+        shadows = x.shadows
+        if shadows.a.shape[1]:
+            shadows = changed(shadows, a=shadows.a @ F.T)
+        q, da = self.reduction.predict(x.q, h), x.da @ F.T
+        return changed(x, q=q, da=da, C=C, age=x.age + h, shadows=shadows)
 
     def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
@@ -185,35 +188,34 @@ class Filter:
             return x, taken, failure
         if self.shadows is not None:
             end = self.shadows.predicted(x, end, span)
-        return self._faded(end, span), taken, None
+        if self.fading < math.inf:  # exponential decay of the cross-covariance
+            end = changed(end, U=np.exp(-(span.t1 - span.start) / self.fading) * end.U)
+        return end, taken, None
 
     def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
-        length = span.t1 - span.start
+        first, taken = span.start, 0
+        length = span.t1 - first
         # The process noise of moving unknowns has to act on u within the span, not at its end
         # alone, so that these take each substep by itself.
         count = self.problem.control.count(length) if self.moves else 1
-        at = [span.start + k / count * length for k in range(count)] + [span.t1]
-        taken = 0
-        for start, stop in pairwise(at):
-            x, steps, failure = self._advanced(x, span, start, stop)
+        for k in range(count):
+            stop = span.t1 if k + 1 == count else first + (k + 1) / count * length
+            x, steps, failure = self._advanced(x, span, first + k / count * length, stop)
             taken += steps
             if failure is not None:
                 return x, taken, failure
         return x, taken, None
 
-    def _faded(self, x: FilterState, span: Span) -> FilterState:
-        """Return the state after the exponential decay of U over a span."""
-        if math.isinf(self.fading):
-            return x
-        return changed(x, U=np.exp(-(span.t1 - span.start) / self.fading) * x.U)
-
     def _advanced(
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept, deviates = self.predict_unknowns(x, stop - start), x.kept, not x.centred
-        off = x.off_centre if deviates else np.zeros(len(x), dtype=bool)
+        end, kept = self.predict_unknowns(x, stop - start), x.kept
+        deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
+        off = np.zeros(len(x.member), dtype=bool)
+        if deviates:
+            off = x.da.any(axis=1) | x.du.any(axis=1)
         shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
@@ -235,7 +237,7 @@ class Filter:
             # An inner stage sees the unknowns at its own time: those of the end would reduce the
             # order of the time scheme.
             if self.moves and t != stop:
-                now = self.predict_unknowns(x, t - start)
+                now = self.unknowns_after(x, t - start)
                 q, along = now.q, directions(now)
             same = factors if q is end.q else {}
             work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
@@ -251,14 +253,14 @@ class Filter:
             return x, steps, failure
         rows = end.U.shape[1]
         U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[1 + rows] if deviates else end.du
-        new = changed(end, u=columns[0], U=U, du=du, kept=kept)
+        parts: dict[str, Any] = {"u": columns[0], "U": U, "du": du, "kept": kept}
         if shadows:
-            u = columns[-shadows:].transpose(1, 0, 2)
-            new = changed(new, shadows=changed(end.shadows, u=u))
+            parts["shadows"] = changed(end.shadows, u=columns[-shadows:].transpose(1, 0, 2))
+        new = changed(end, **parts)
         return self._compressed(new) if rows > self.rank else new, steps, None
 
     @staticmethod
-    def update(x: FilterState, Y: Array, d: Array) -> tuple[FilterState, Update]:
+    def update(x: FilterState, Y: Array, d: Array, **parts: Any) -> tuple[FilterState, Update]:
         """Return the state after a sample, and the matrices of the update.
 
         Parameters
@@ -266,19 +268,21 @@ class Filter:
         Y, d
             Observed square root, (members, r, sensors), and innovations, (members, sensors), in
             units of the noise; zero where no value is.
+        parts
+            Other fields to exchange.
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
         U, C = Wt @ x.U, Wt @ x.C
-        new = changed(x, da=x.da + (row @ C)[:, 0], du=x.du + (row @ U)[:, 0], U=U, C=C)
         # Past values and causes are coordinates on the rows of the square root, and so have to be
         # multiplied by the same matrix as U and C.
         if x.past.shape[2]:
-            past = Wt @ x.past
-            new = changed(new, past=past, dpast=x.dpast + (row @ past)[:, 0])
+            parts["past"] = past = Wt @ x.past
+            parts["dpast"] = x.dpast + (row @ past)[:, 0]
         if x.causes.shape[2]:
-            new = changed(new, causes=Wt @ x.causes)
-        return new, Update(W, Y, half, misfit)
+            parts["causes"] = Wt @ x.causes
+        da, du = x.da + (row @ C)[:, 0], x.du + (row @ U)[:, 0]
+        return changed(x, da=da, du=du, U=U, C=C, **parts), Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
         """Return the state that follows the values of a of now also from now on."""
@@ -291,7 +295,7 @@ class Filter:
     def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
 
-        Members in `kept`, shape (members,), keep their linearisation point.
+        Members in `kept`, shape (members,), keep their linearisation point; None: no member does.
 
         Bounds (`Reduction.ends`) hold for linearisation points and for reported estimates, not for
         the linear filter: an excess beyond them stays in da and du, so that no information of the
@@ -374,7 +378,10 @@ class Filter:
 
 def _extended(rows: Array, count: int) -> Array:
     """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
-    return np.concatenate([rows, np.zeros((len(rows), count, rows.shape[2]))], axis=1)
+    members, r, size = rows.shape
+    longer = np.zeros((members, r + count, size))
+    longer[:, :r] = rows
+    return longer
 
 
 def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:

@@ -9,11 +9,11 @@ import numpy as np
 from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import changed
 from livepde.laws.shadow_state import ShadowState
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied", "without_ledger"]
+__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied"]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -81,16 +81,6 @@ class FilterState:
     def __len__(self) -> int:
         return len(self.member)
 
-    @property
-    def centred(self) -> bool:
-        """True if the estimate of every member is its linearisation point."""
-        return not (self.da.any() or self.du.any())
-
-    @property
-    def off_centre(self) -> Mask:
-        """Members whose estimate is not the linearisation point, shape (members,)."""
-        return np.asarray(self.da.any(axis=1) | self.du.any(axis=1))
-
 
 def along(x: FilterState, k: int, shift: Array) -> Array:
     """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
@@ -102,11 +92,8 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     return moved
 
 
-def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter state without the data that only its verdict needs."""
-    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
-
-
 def unaccompanied(x: FilterState) -> FilterState:
     """Return a filter state without its ledger and without the errors of the discretisation."""
-    return changed(without_ledger(x), shadows=ShadowState.none(len(x), x.u.shape[1], x.C.shape[2]))
+    members, k = x.da.shape
+    causes, shadows = np.zeros((*x.causes.shape[:2], 0)), ShadowState.none(members, x.u.shape[1], k)
+    return changed(x, causes=causes, ledger=NO_LEDGER, shadows=shadows)

@@ -9,7 +9,7 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.linalg import Array, Mask
 
-__all__ = ["Guards", "Scale"]
+__all__ = ["Guards"]
 
 
 @dataclass(frozen=True)
@@ -69,46 +69,3 @@ class Guards:
         """
         near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
         return near
-
-
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """Range of the values of each sensor so far, and its first innovation.
-
-    Attributes
-    ----------
-    low, high, first
-        Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
-        before.
-    """
-
-    low: Array
-    high: Array
-    first: Array
-
-    @classmethod
-    def start(cls, sensors: int, members: int = 1) -> Scale:
-        """Return the value before any sample."""
-        never = np.full((members, sensors), np.nan)
-        return cls(never, never, never)
-
-    def add(self, z: Array, d: Array) -> Scale:
-        """Return the value after a sample z with innovations d, NaN where missing."""
-        first = np.where(np.isnan(self.first), np.abs(d), self.first)
-        # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
-        return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
-
-    def beyond(self, d: Array, noise: Array) -> Array:
-        """Return the largest innovation as a multiple of the largest range so far, or of the noise.
-
-        All ranges and innovations are in units of the noise of their sensor. The range is that of
-        the sensor that has varied most: the range of a sensor that a wave has not reached yet says
-        nothing about the size of the wave. Shape (members,).
-        """
-        # A sensor that has shown one value has no range yet: its first innovation stands in for it.
-        ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
-        unseen = np.isnan(self.first) | np.isnan(self.low)
-        missed = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
-        largest = np.where(unseen, 0.0, ranges).max(axis=1)
-        # Without any reading there is nothing to miss, and a runaway must not be claimed.
-        return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))

@@ -58,7 +58,8 @@ def added(log: Array, span: Span, taken: Mask) -> Array:
     row[:, 1 : 1 + sensors] = span.z1
     row[:, 1 + sensors : 1 + 2 * sensors] = np.nan if span.noise is None else span.noise
     row[:, 1 + 2 * sensors :] = span.inputs1[:, : log.shape[2] - 1 - 2 * sensors]
-    row[~taken] = np.nan
+    if np.count_nonzero(taken) < len(taken):
+        row[~taken] = np.nan
     return longer
 
 

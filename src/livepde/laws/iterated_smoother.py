@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import eigh
 
-from livepde.laws.assimilation import assimilate, assimilate_at_once
+from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
@@ -24,7 +24,7 @@ from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed, put, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.stepping import Interval
 
 __all__ = ["expecting", "iterate_starts", "missed", "moved"]
@@ -65,12 +65,9 @@ class _Pass:
 
 
 def iterate_starts(
-    work: SensitivityWork, state: SensitivityState
+    work: SensitivityWork, state: SensitivityState, due: Mask
 ) -> tuple[SensitivityState, Diagnostics[Array] | None]:
     """Return all members after the iteration of those that are due, and diagnostics if one was."""
-    due = state.assimilated >= state.start_due
-    if not due.any():
-        return state, None
     moved = np.full(len(state), np.nan)
     for k in np.flatnonzero(due).tolist():
         one, moved[k] = _iterated(work, take(state, k))
@@ -244,7 +241,7 @@ class _Samples:
         x, misfit = self._placed(q), 0.0
         if self.state.opening[0]:
             misfit += missed(filter_, x, self.opening)
-            x = assimilate_at_once(filter_, x, filter_.span(self.opening), self.work.options)
+            x, _ = absorb(filter_, x, filter_.span(self.opening), self.work.options)
         x = self._remembered(x)
         # The prior of the start is a ~ N(0, I): minus twice its logarithm is |a|^2.
         followed = [reduction.reduced(x.q[0] - prior)]

@@ -150,15 +150,22 @@ class Jumps:
         lengths = self._lengths
         sums = np.cumsum(new.squares, axis=1)[:, lengths]
         freedom = np.cumsum(new.counts, axis=1)[:, lengths]
-        scatter = watch.usual.scatter[:, None]
-        # Survival function of the chi-square distribution: the chance of so large a sum.
-        with np.errstate(invalid="ignore"):  # no freedom, no chance
-            chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums / scatter**2)
-        chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
-        # The least chance of several tests: by Bonferroni's factor all of them together raise false
-        # alarms at the stated rate.
-        unlikely = chance * len(lengths) < self.probability
-        alarm: Mask = ~early & (new.counts[:, 0] > 0.0) & unlikely
+
+        def unlikely(sums: Array) -> Mask:
+            # Survival function of the chi-square distribution: the chance of so large a sum.
+            with np.errstate(invalid="ignore"):  # no freedom, no chance
+                chance = scipy.special.gammaincc(0.5 * freedom, 0.5 * sums)
+            chance = np.where(freedom > 0.0, chance, 1.0).min(axis=1)
+            # The least chance of several tests: by Bonferroni's factor all of them together raise
+            # false alarms at the stated rate.
+            return np.asarray(chance * len(lengths) < self.probability)
+
+        # The usual scatter, which takes longer to find, is at least 1: what is likely without it is
+        # with it, too.
+        alarm = unlikely(sums)
+        if alarm.any():
+            alarm = unlikely(sums / watch.usual.scatter[:, None] ** 2)
+            alarm &= ~early & (new.counts[:, 0] > 0.0)
         if alarm.any():
             clear = alarm[:, None]
             new = replace(

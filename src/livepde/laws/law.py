@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -279,12 +279,15 @@ class Report:
 
     def updated(self, more: Diagnostics[float]) -> Report:
         """Return the report with all that other diagnostics know among its own."""
-        return replace(self, diagnose=cache(lambda: self.diagnostics.updated(more)))
+        return replace(self, diagnose=lambda: self.diagnostics.updated(more))
 
 
 def finite(*arrays: Array | None) -> bool:
     """Return whether products of the squares of some arrays are finite; None counts as empty."""
-    return all(float(np.vdot(a, a)) <= LARGEST for a in arrays if a is not None)
+    total = 0.0  # NaN with any of its terms, which a maximum need not be
+    for a in arrays:
+        total += 0.0 if a is None else np.vdot(a, a)
+    return bool(total <= LARGEST)
 
 
 def numerical(error: Exception) -> Status | None:

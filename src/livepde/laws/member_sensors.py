@@ -41,7 +41,7 @@ class MemberSensors:
         Linear about the linearisation point.
         """
         if self.fixed:
-            return (self._G @ (x.u + x.du).T).T, self._rows(x.U)
+            return (self._G @ (x.u + x.du).T).T, self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
@@ -58,13 +58,10 @@ class MemberSensors:
     def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
         if self.fixed:
-            return self._rows(U)
+            members, r, n = U.shape
+            return np.asarray((self._G @ U.reshape(-1, n).T).T.reshape(members, r, -1))
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
-
-    def _rows(self, U: Array) -> Array:
-        members, r, n = U.shape
-        return np.asarray((self._G @ U.reshape(-1, n).T).T.reshape(members, r, -1))
 
     def _of_one(
         self, u: Array, q: Array, U: Array, C: Array, at: Moments, k: int

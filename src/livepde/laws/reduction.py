@@ -181,9 +181,9 @@ class Reduction:
         drift
             Prior variances gained per unit of time by unknowns that stay, shape (members,).
         """
-        gained = np.broadcast_to(_growth(self.evolutions, h), variance.shape)
+        gained = _growth(self.evolutions, h)
         if not drift.any():
-            return gained
+            return np.broadcast_to(gained, variance.shape)
         # V' = drift (1 - V), whatever the length of the step.
         more = -np.expm1(-drift * h)[:, None] * np.maximum(1.0 - variance, 0.0)
         return np.where(self.still, more, gained)
@@ -256,7 +256,7 @@ class Reduction:
         """Return latent parameters within their `ends`, shape (..., m): q itself if they are."""
         lower, upper = self.ends
         inside = (q >= lower) & (q <= upper)
-        return q if inside.all() else np.minimum(np.maximum(q, lower), upper)
+        return q if np.count_nonzero(inside) == q.size else np.minimum(np.maximum(q, lower), upper)
 
     def held(self, q: Array) -> Array:
         """Return how many latent parameters would lie too far from the prior, (...) for (..., m).

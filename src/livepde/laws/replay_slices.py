@@ -8,7 +8,7 @@ from itertools import chain
 
 import numpy as np
 
-from livepde.laws.assimilation import assimilate, assimilate_at_once
+from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.history import first_interval, following, span_between
@@ -30,7 +30,10 @@ def replay_slice(
     replay = work.replay
     if replay is None:
         return state, None
-    due = (state.assimilated >= state.due) & ~state.replay.active
+    active = state.replay.active
+    due = (state.assimilated >= state.due) & ~active
+    if not np.count_nonzero(active | due):
+        return state, None
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
     return _advanced(work, state, replay.slice)
@@ -104,7 +107,7 @@ def _again(work: SensitivityWork, state: SensitivityState, now: FilterState) -> 
     x = placed(filter_, window, q)
     if state.opening[0]:
         first = first_interval(state.log[:, int(state.window[0]) :], filter_.problem.channels)
-        x = assimilate_at_once(filter_, x, filter_.span(first), work.options)
+        x, _ = absorb(filter_, x, filter_.span(first), work.options)
     rounds = state.replay.rounds - 1
     return changed(state.replay, x=x, row=state.window, rounds=rounds, reference=q[None])
 

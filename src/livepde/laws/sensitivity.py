@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,14 +14,14 @@ from livepde.laws.assimilation import (
     Assimilation,
     MemberReports,
     UpdateOptions,
+    absorb,
     assimilate,
-    assimilate_at_once,
 )
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import NO_LEDGER, FilterState, without_ledger
+from livepde.laws.filter_state import NO_LEDGER, FilterState
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
-from livepde.laws.guards import Guards, Scale
+from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
@@ -36,11 +36,14 @@ from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
+    Scale,
     SensitivityState,
     SensitivityWork,
     reports_of,
     shortened,
     stored,
+    without_factors,
+    without_ledger,
 )
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
@@ -57,7 +60,7 @@ from livepde.stepping import (
 )
 from livepde.verdict import Verdict
 
-__all__ = ["SensitivityLaw", "without_factors"]
+__all__ = ["SensitivityLaw"]
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
@@ -330,7 +333,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if self.guards is not None and not replays:
             iterates = iterates or not problem.observed.linear
         for _ in range(FIRST):
-            now = assimilate_at_once(filter_, x, span, work.options)
+            now, _ = absorb(filter_, x, span, work.options)
             if not np.isfinite(now.da).all():
                 return state
             initial = bool(state.initial[0])
@@ -386,37 +389,90 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         They step as arrays; whoever meets something out of the ordinary, a safeguard, an alarm, a
         failure, or is late, steps alone.
         """
-        new, reports = self._after(work, state, span)
-        taken = np.array([status.ok for status in reports.statuses])
-        if not taken.any():
-            return new, reports
-        new, replayed = replay_slice(work, new)
-        new, started = iterate_starts(work, new)
-        if replayed is not None:
-            reports = reports.updated(replayed)
-        if started is not None:
-            reports = reports.updated(started.each(lambda number: np.where(taken, number, np.nan)))
-        return shortened(work, new), reports
-
-    def _after(
-        self, work: SensitivityWork, state: SensitivityState, span: Span
-    ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports of all members after a sample of each."""
         # A window goes back to the time and inputs of its first row, which a run without a sample
         # at the initial time does not have yet.
-        before = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
-        new, told, usual = self._together(work, before, span)
+        begun = state if state.log.shape[1] else changed(state, log=opened(state.log, span))
+        new, told, usual = self._together(work, begun, span)
         reports = reports_of(work, new.now, told)
-        if usual.all():
-            return new, reports
+        if np.count_nonzero(usual) < usual.size:
+            new, reports = self._apart(work, begun, new, reports, usual, span)
+            usual = np.array([status.ok for status in reports.statuses])
+            if not usual.any():
+                return (new if len(state) > 1 else state), reports
+        if work.replay is not None:
+            new, replayed = replay_slice(work, new)
+            if replayed is not None:
+                reports = reports.updated(replayed)
+        due = new.assimilated >= new.start_due
+        if np.count_nonzero(due):
+            new, started = iterate_starts(work, new, due)
+            if started is not None:
+                taken = usual
+                reports = reports.updated(
+                    started.each(lambda number: np.where(taken, number, np.nan))
+                )
+        return shortened(work, new), reports
+
+    def _together(
+        self, work: SensitivityWork, state: SensitivityState, span: Span
+    ) -> tuple[SensitivityState, Assimilation, Mask]:
+        """Return all members after a sample, and which of them needed no special treatment."""
+        filter_, before = work.filter, state.now
+        x, told = assimilate(filter_, before, span, work.options)
+        usual = told.finite
+        if told.status.code != "ok":
+            return state, told, usual
+        if len(span.t0) > 1:
+            usual = usual & span.together
+        replays: Mask | None = None
+        if work.replay is not None:
+            # A full store begins a new window, which relinearises: such a member steps alone.
+            full = state.log.shape[1] + 1 - state.window > work.most
+            replays = state.replays
+            usual = usual & ~(replays & full & ~state.replay.active)
+        parts: dict[str, Any] = {}
+        if (guards := self.guards) is not None:
+            far = np.abs(x.da - before.da) > guards.reach
+            if np.count_nonzero(far):
+                near = ~far.any(axis=1)
+                usual = usual & (near if replays is None else replays | near)
+            parts["scale"] = scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            # Ranges are at least as large as the noise, so that smaller innovations cannot run
+            # away: most samples are spared the exact test.
+            if told.worst > guards.runaway:
+                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
+                beyond = scale.beyond(span.z1 - told.predicted, noise)
+                usual = usual & ~(beyond > guards.runaway)
+        if (jumps := self.jumps) is not None and (present := span.present).any():
+            seen, alarm = jumps.add(state.watch, x.innovations.newest)
+            # Without a reading `newest` is that of an earlier sample, which has been counted.
+            parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
+            usual = usual & ~(alarm & present)
+        if replays is None or not replays.all():
+            x = filter_.relinearised(x, replays)
+        if np.count_nonzero(usual) < usual.size:
+            if not usual.any():
+                return state, told, usual
+            x = where(usual, x, before)
+            parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
+        return stored(work, state, x, span, usual, **parts), told, usual
+
+    def _apart(
+        self,
+        work: SensitivityWork,
+        state: SensitivityState,
+        new: SensitivityState,
+        reports: MemberReports,
+        usual: Mask,
+        span: Span,
+    ) -> tuple[SensitivityState, MemberReports]:
+        """Return state and reports after those members that are not `usual` have stepped alone."""
         alone: dict[int, Report] = {}
         parts: list[SensitivityState] = []
         for k in np.flatnonzero(~usual).tolist():
-            one, alone[k] = step_alone(work, take(before, k), span.member(k))
-            if not alone[k].status.ok and len(state) == 1:
-                return state, reports.with_members(alone)
+            one, alone[k] = step_alone(work, take(state, k), span.member(k))
             # The members share the rows of one log: whoever failed has an empty row there.
-            while work.keeps_log and one.log.shape[1] <= before.log.shape[1]:
+            while work.keeps_log and one.log.shape[1] <= state.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
             parts.append(one)
         if usual.any():
@@ -425,47 +481,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         else:
             new = join(*parts) if len(parts) > 1 else parts[0]
         return new, reports.with_members(alone)
-
-    def _together(
-        self, work: SensitivityWork, state: SensitivityState, span: Span
-    ) -> tuple[SensitivityState, Assimilation, Mask]:
-        """Return all members after a sample, and which of them needed no special treatment."""
-        filter_, before = work.filter, state.now
-        x, told = assimilate(filter_, before, span, work.options)
-        if not told.status.ok:
-            return state, told, told.finite
-        usual, replays, present = told.finite, state.replays, span.present
-        if len(span) > 1:
-            usual = usual & span.together
-        if self.replay is not None:
-            # A full store begins a new window, which relinearises: such a member steps alone.
-            full = state.log.shape[1] + 1 - state.window > work.most
-            usual = usual & ~(replays & full & ~state.replay.active)
-        scale, watch = state.scale, state.watch
-        if (guards := self.guards) is not None:
-            usual = usual & (replays | guards.within_reach(x.da - before.da))
-            d = span.z1 - told.predicted
-            scale = scale.add(span.z1, d)
-            # Ranges are at least as large as the noise, so that smaller innovations cannot run
-            # away: most samples are spared the exact test.
-            if told.largest.max() > guards.runaway:
-                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
-                usual = usual & ~(scale.beyond(d, noise) > guards.runaway)
-        if (jumps := self.jumps) is not None and present.any():
-            e = x.innovations.newest
-            seen, alarm = jumps.add(watch, e)
-            # Without a reading `newest` is that of an earlier sample, which has been counted.
-            watch = where(np.broadcast_to(present, alarm.shape), seen, watch)
-            usual = usual & ~(alarm & present)
-        if not replays.all():
-            x = filter_.relinearised(x, replays)
-        if not usual.all():
-            if not usual.any():
-                return state, told, usual
-            x = where(usual, x, before)
-            scale, watch = where(usual, scale, state.scale), where(usual, watch, state.watch)
-        new = stored(work, state, x, span, usual, scale=scale, watch=watch)
-        return new, told, usual
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         return finish_replays(work, state)
@@ -530,8 +545,3 @@ def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> 
     """Return one member at the start with another filter."""
     start = work.kept_start(x)
     return changed(state, start=start, now=x, older=x, newer=x, replay=ReplayState.none(start))
-
-
-def without_factors(x: FilterState) -> FilterState:
-    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
-    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,8 @@ import numpy as np
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
 from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.guards import Guards, Scale
+from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
+from livepde.laws.guards import Guards
 from livepde.laws.history import added, trimmed
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import InitialReading
@@ -25,6 +25,7 @@ from livepde.stepping import Span
 
 __all__ = [
     "NEVER",
+    "Scale",
     "SensitivityState",
     "SensitivityWork",
     "new_window",
@@ -32,6 +33,8 @@ __all__ = [
     "restarted",
     "shortened",
     "stored",
+    "without_factors",
+    "without_ledger",
     "without_past",
 ]
 
@@ -157,6 +160,51 @@ class SensitivityState:
         return replays
 
 
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """Range of the values of each sensor so far, and its first innovation.
+
+    Attributes
+    ----------
+    low, high, first
+        Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
+        before.
+    """
+
+    low: Array
+    high: Array
+    first: Array
+
+    @classmethod
+    def start(cls, sensors: int, members: int = 1) -> Scale:
+        """Return the value before any sample."""
+        never = np.full((members, sensors), np.nan)
+        return cls(never, never, never)
+
+    def add(self, z: Array, d: Array) -> Scale:
+        """Return the value after a sample z with innovations d, NaN where missing."""
+        first, unseen = self.first, np.isnan(self.first)
+        if np.count_nonzero(unseen):
+            first = np.where(unseen, np.abs(d), first)
+        # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
+        return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
+
+    def beyond(self, d: Array, noise: Array) -> Array:
+        """Return the largest innovation as a multiple of the largest range so far, or of the noise.
+
+        All ranges and innovations are in units of the noise of their sensor. The range is that of
+        the sensor that has varied most: the range of a sensor that a wave has not reached yet says
+        nothing about the size of the wave. Shape (members,).
+        """
+        # A sensor that has shown one value has no range yet: its first innovation stands in for it.
+        ranges = np.fmax(np.fmax(self.high - self.low, self.first), noise) / noise
+        unseen = np.isnan(self.first) | np.isnan(self.low)
+        missed = np.fmax.reduce(np.where(unseen, np.nan, np.abs(d) / noise), axis=1)
+        largest = np.where(unseen, 0.0, ranges).max(axis=1)
+        # Without any reading there is nothing to miss, and a runaway must not be claimed.
+        return np.where(np.isnan(missed), 0.0, missed / np.where(largest > 0.0, largest, np.inf))
+
+
 def stored(
     work: SensitivityWork,
     state: SensitivityState,
@@ -171,10 +219,9 @@ def stored(
     """
     if not work.keeps_log:
         return changed(state, now=now, **parts)
-    log = added(state.log, span, taken)
-    assimilated = state.assimilated
+    parts["log"] = log = added(state.log, span, taken)
     if work.replay or work.start_window:
-        assimilated = assimilated + (taken & span.present)
+        parts["assimilated"] = state.assimilated + (taken & span.present)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
@@ -187,7 +234,7 @@ def stored(
                 "since_older": np.where(due, state.since_newer, state.since_older),
                 "since_newer": np.where(due, last, state.since_newer),
             }
-    return changed(state, now=now, log=log, assimilated=assimilated, **parts)
+    return changed(state, now=now, **parts)
 
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
@@ -197,6 +244,8 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
         return state
     # The first row that any member may still go back to; the numbers of rows move with it.
     older = state.since_older if work.back else np.full(len(state), rows - 1)
+    if older.min() < least:
+        return state
     stays = state.replays | (state.start_due != NEVER)
     first = int(np.where(stays, np.minimum(older, state.window), older).min())
     if first < least:
@@ -218,9 +267,9 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
 def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> MemberReports:
     """Return the reports of the members after a sample."""
     # Not all of the filter is kept for what may never be read.
-    members, innovations, level, q, da = len(now), now.innovations, now.level, now.q, now.da
+    members, innovations, level, q, da = len(now.q), now.innovations, now.level, now.q, now.da
     reduction, shadows = work.filter.reduction, work.filter.shadows
-    if shadows is not None:
+    if now.kept.q.shape[1]:
         now = changed(now, kept=now.kept.forgotten())
 
     def diagnosed() -> Diagnostics[Array]:
@@ -240,8 +289,22 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, cache(diagnosed))
+    steps = told.steps + np.zeros(members, dtype=np.int64)
+    return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
+
+
+def without_factors(x: FilterState) -> FilterState:
+    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
+    if not (x.kept.q.shape[1] or x.shadows.u.shape[1]):
+        return x
+    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())
+
+
+def without_ledger(x: FilterState) -> FilterState:
+    """Return a filter state without the data that only its verdict needs."""
+    if x.ledger is NO_LEDGER:
+        return x
+    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
 
 
 def new_window(

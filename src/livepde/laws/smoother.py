@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.laws.assimilation import assimilate_at_once
+from livepde.laws.assimilation import absorb
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.iterated_smoother import expecting, missed, moved
@@ -217,7 +217,7 @@ class _FixedInterval:
             x, P = self._predicted(x, number - 1)
             if P is None:
                 return None
-            x = assimilate_at_once(filter_, x, filter_.span(interval), self.work.options)
+            x, _ = absorb(filter_, x, filter_.span(interval), self.work.options)
             if not np.isfinite((x.u + x.du).sum() + x.da.sum() + x.C.sum()):
                 return None
             points.append(self._kept(x, number, _forgotten(P)))
@@ -242,7 +242,7 @@ class _FixedInterval:
         span = filter_.span(filter_.problem.unread(opening))
         if filter_.sensors.observe(x, span.end)[1].any():  # as the law begins
             misfit += missed(filter_, x, opening)
-            x = assimilate_at_once(filter_, x, span, self.work.options)
+            x, _ = absorb(filter_, x, span, self.work.options)
         return x, misfit
 
     def _gained(self, variance: Array, number: int, h: float) -> Array:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -17,22 +17,27 @@ __all__ = ["BandedBlocks", "BlockFactor"]
 NONE = np.zeros(0, dtype=np.intp)
 
 
-@dataclass(frozen=True, eq=False)
-class BlockFactor:
+class BlockFactor(NamedTuple):
     """Factors of the diagonal blocks of a block-diagonal matrix.
 
     Attributes
     ----------
-    triangles
-        Triangular solves with the factors of the whole matrix, in the order of the band; they
-        overwrite their argument.
+    solver
+        Order of the band and its width.
     bad
         Numbers of the blocks that could not be factorised.
+    lu, pivots
+        LAPACK's LU factors of the whole matrix, in the order of the band; None if `symmetric` are
+        there.
+    symmetric
+        Main diagonal of D and lower diagonal of L of L D L^T.
     """
 
     solver: BandedSolver
-    triangles: Callable[[Array], Array]
     bad: IntArray
+    lu: Array | None
+    pivots: IntArray | None
+    symmetric: tuple[Array, Array] | None = None
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b for each block, of shape (columns, blocks, n); overwrites b.
@@ -49,7 +54,12 @@ class BlockFactor:
             # blocks are solved with zeros and marked afterwards.
             b[:, bad] = 0.0
         x = b if self.solver.natural else np.take(b, self.solver.order, axis=2)
-        x = self.triangles(x.reshape(columns, count * n).T).T.reshape(b.shape)
+        x = x.reshape(columns, count * n).T
+        if self.symmetric is not None:
+            x = lapack.dpttrs(*self.symmetric, x, overwrite_b=1)[0]
+        else:
+            x = lapack.dgbtrs(self.lu, *self.solver.band, x, self.pivots, overwrite_b=1)[0]
+        x = x.T.reshape(b.shape)
         if not self.solver.natural:
             x = np.take(x, self.solver.inverse, axis=2)
         if len(bad):
@@ -80,7 +90,7 @@ class BandedBlocks:
         (n, height), blocks = self.solver.storage[0], len(storage)
         lower, upper = self.solver.band
         middle, bad = lower + upper, NONE
-        if not math.isfinite(storage.sum()):
+        if not math.isfinite(np.vdot(storage, storage)):  # one of its squares may overflow, too
             bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
             # A block that is not finite is replaced by the identity, so that the others can be
             # factorised.
@@ -88,23 +98,13 @@ class BandedBlocks:
             storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
         banded = storage.reshape(blocks * n, height).T
         # Rows of the storage: fill-in, upper, main, lower diagonal. Symmetric if rows 1, 3 agree.
-        if lower == upper == 1 and (banded[1, 1:] == banded[3, :-1]).all():
+        if lower == upper == 1 and not np.count_nonzero(banded[1, 1:] != banded[3, :-1]):
             diagonal, side, info = lapack.dpttrf(banded[2], banded[3, :-1])
             if info == 0:
-
-                def symmetric(b: Array) -> Array:
-                    x: Array = lapack.dpttrs(diagonal, side, b, overwrite_b=1)[0]
-                    return x
-
-                return BlockFactor(self.solver, symmetric, bad)
+                return BlockFactor(self.solver, bad, None, None, (diagonal, side))
         lu, pivots, info = lapack.dgbtrf(banded, lower, upper, overwrite_ab=1)
         if info > 0:  # a pivot is zero: mark its block, and go on without dividing by it
             zero = lu[middle] == 0.0
             lu[middle, zero] = 1.0
             bad = np.union1d(bad, np.flatnonzero(zero) // n)
-
-        def general(b: Array) -> Array:
-            x: Array = lapack.dgbtrs(lu, lower, upper, b, pivots, overwrite_b=1)[0]
-            return x
-
-        return BlockFactor(self.solver, general, bad)
+        return BlockFactor(self.solver, bad, lu, pivots)

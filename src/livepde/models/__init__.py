@@ -5,7 +5,7 @@ from __future__ import annotations
 from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
 from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
 from livepde.models.battery import BATTERY_PARTICLE, battery_particle
-from livepde.models.borehole import GROUTED_BOREHOLE, grouted_borehole
+from livepde.models.borehole import BOREHOLE, GROUTED_BOREHOLE, borehole, fluid, grouted_borehole
 from livepde.models.boundary_conditions import Exchange, Flux, Source, with_conditions
 from livepde.models.burgers import BURGERS, burgers
 from livepde.models.description import Equation, Fluxes, Option, Quantity, Variable
@@ -14,7 +14,6 @@ from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_
 from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
 from livepde.models.kdv import KDV, kdv
 from livepde.models.kuramoto_sivashinsky import KURAMOTO_SIVASHINSKY, kuramoto_sivashinsky
-from livepde.models.radial import BOREHOLE, borehole, fluid
 from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
 from livepde.models.transport import (
     ADVECTION_DISPERSION,

@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.errors import ModelError
 from livepde.fem import Field, Unknown, absolute, dot, grad, linear
-from livepde.fem.upwind import upwind
+from livepde.fem.notation import upwind
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
 
@@ -58,7 +58,7 @@ def advection_diffusion(
         Ratio of velocity to flux: for heat the volumetric heat capacity of water over that of the
         saturated bed (about 1.5), for a solute 1/porosity.
     stabilise
-        True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
+        True: add the artificial diffusion of `livepde.fem.notation`, for flows with a cell Peclet
         number |w| h/(2 kappa) above 1.
     element
         Element of the state; default of first order.

@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
-from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, by_name
 
 __all__ = ["ALLEN_CAHN", "allen_cahn"]
@@ -41,13 +41,11 @@ def allen_cahn(
         Element of the state; default cubic Hermite on a line, else first order.
     """
     u = state(mesh, element or hermite(mesh), dirichlet)
-    c = Coefficients({"D": D, "r": r})
-    begun, initial = beginning(u0, u)
-    return Model(
+    return autonomous(
         u,
-        {**c.unknown, **begun},
-        A=lambda q, u, v, x: c(q, "D") * dot(grad(u), grad(v)) + c(q, "r") * (u**3 - u) * v,
-        initial=initial,
+        {"D": D, "r": r},
+        u0,
+        lambda c, u, v: c.D * dot(grad(u), grad(v)) + c.r * (u**3 - u) * v,
     )
 
 

@@ -148,7 +148,7 @@ class _Terms:
         # A term in u that reads an input would make the matrix of a stage depend on time, and
         # prevent the reuse of its factor.
         self._add(boundary, lambda q, u, v, x: h(q, x) * u * v, given[0])
-        self._add(boundary, lambda q, u, v, x: -h(q, x) * ambient(q, x) * v, *given)
+        self._add(boundary, lambda q, _, v, x: -h(q, x) * ambient(q, x) * v, *given)
 
     def gained(
         self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
@@ -156,7 +156,7 @@ class _Terms:
         """Add a flux or a source."""
         amount = self._amount(value)
         # In M u_t + A(u) q + B(u) = f the terms stand on the left side, hence the sign.
-        self._add(where, lambda q, u, v, x: -amount(q, x) * inside(x) * v, value)
+        self._add(where, lambda q, _, v, x: -amount(q, x) * inside(x) * v, value)
 
     def _add(self, where: str | None, term: Callable[..., Any], *amounts: Amount) -> None:
         def known(u: Any, v: Any, x: Place) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 
 from livepde.fem import Unknown, dot, grad, hermite
 from livepde.model import Model
-from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, by_name
 
 __all__ = ["BURGERS", "burgers"]
@@ -41,15 +41,11 @@ def burgers(
         Element of the state; default cubic Hermite.
     """
     u = state(mesh, element or hermite(mesh), dirichlet)
-    c = Coefficients({"advection": advection, "nu": nu})
-    begun, initial = beginning(u0, u)
-    return Model(
+    return autonomous(
         u,
-        {**c.unknown, **begun},
-        A=lambda q, u, v, x: (
-            c(q, "advection") * u * grad(u)[0] * v + c(q, "nu") * dot(grad(u), grad(v))
-        ),
-        initial=initial,
+        {"advection": advection, "nu": nu},
+        u0,
+        lambda c, u, v: c.advection * u * grad(u)[0] * v + c.nu * dot(grad(u), grad(v)),
     )
 
 

@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, TypeAlias
 
 from livepde.fem import Field, Integrand, Unknown
+from livepde.model import Model
 from livepde.models.description import Variable
 
-__all__ = ["INITIAL", "Coefficients", "Number", "beginning", "state"]
+__all__ = ["INITIAL", "Number", "autonomous", "state"]
 
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
 
 INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
 SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
-
-
-@dataclass(frozen=True)
-class Coefficients:
-    """Coefficients of an equation by name, known or unknown."""
-
-    given: Mapping[str, Number]
-
-    @property
-    def unknown(self) -> dict[str, Unknown]:
-        """The unknown coefficients."""
-        return {k: v for k, v in self.given.items() if not isinstance(v, int | float)}
-
-    def __call__(self, q: Any, name: str) -> Any:
-        """Return the value of a coefficient within a form."""
-        value = self.given[name]
-        return float(value) if isinstance(value, int | float) else getattr(q, name)
 
 
 def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
@@ -43,7 +28,24 @@ def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: st
     return Field(mesh, element, periodic=pairs, unit=unit)
 
 
-def beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
+def autonomous(
+    u: Field,
+    coefficients: Mapping[str, Number],
+    u0: Unknown | None,
+    form: Callable[[Any, Any, Any], Any],
+) -> Model:
+    """Return u_t + A(u) = 0 with A by a form (c, u, v) of its coefficients c, known or unknown."""
+    known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
+    unknown: dict[str, Any] = {k: v for k, v in coefficients.items() if k not in known}
+    begun, initial = _beginning(u0, u)
+
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return form(SimpleNamespace(**known, **{k: getattr(q, k) for k in unknown}), u, v)
+
+    return Model(u, {**unknown, **begun}, A=A, initial=initial)
+
+
+def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
     """Return an unknown initial state by name, and the form `initial` of a model.
 
     A field inherits the boundaries of the state: periodic, or zero where the state is fixed at

@@ -146,7 +146,7 @@ def _model(
     if "transfer" in given:
         terms += _transfer(name, mesh, held)
     if "source" in given:
-        terms.append(lambda q, u, v, x: -q.source * v)
+        terms.append(lambda q, _, v, x: -q.source * v)
     return Model(
         Field(mesh, element or linear(mesh), dirichlet=held, unit=unit),
         given,
@@ -162,7 +162,7 @@ def _exchange(coefficient: str) -> list[Any]:
     """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
     return [
         lambda q, u, v, x: getattr(q, coefficient) * u * v,
-        lambda q, u, v, x: -getattr(q, coefficient) * x.inputs[AMBIENT] * v,
+        lambda q, _, v, x: -getattr(q, coefficient) * x.inputs[AMBIENT] * v,
     ]
 
 

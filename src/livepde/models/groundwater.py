@@ -54,7 +54,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         {"k": k, "Ss": Ss},
         A=[
             lambda q, u, v, x: q.k / q.Ss * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, u, v, x: -x.inputs["Q"] / (2 * pi * b * q.Ss) * v),
+            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b * q.Ss) * v),
         ],
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
@@ -129,7 +129,7 @@ def groundwater(
             term = term - q.T / q.S**2 * dot(grad(u), grad(q.S)) * v
         return term
 
-    def taken(q: Any, u: Any, v: Any, x: Place) -> Any:
+    def taken(q: Any, _: Any, v: Any, x: Place) -> Any:
         rate: Any = -recharge
         for name, at in sources.items():
             rate = rate + x.inputs[name] * well(x, at, radius)

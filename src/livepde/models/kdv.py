@@ -6,7 +6,7 @@ from typing import Any
 
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
-from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, closed
 
 __all__ = ["KDV", "kdv"]
@@ -28,17 +28,15 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
         Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     """
     u = state(mesh, smooth(mesh), None)
-    c = Coefficients({"advection": advection, "dispersion": dispersion})
-    begun, initial = beginning(u0, u)
     # Integration by parts is applied once to the third derivative, so that second derivatives of u
     # remain: hence C^1 elements.
-    return Model(
+    return autonomous(
         u,
-        {**c.unknown, **begun},
-        A=lambda q, u, v, x: (
-            c(q, "advection") * u * grad(u)[0] * v - c(q, "dispersion") * hess(u)[0, 0] * grad(v)[0]
+        {"advection": advection, "dispersion": dispersion},
+        u0,
+        lambda c, u, v: (
+            c.advection * u * grad(u)[0] * v - c.dispersion * hess(u)[0, 0] * grad(v)[0]
         ),
-        initial=initial,
     )
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from livepde.fem import Unknown, grad, hess, smooth
 from livepde.model import Model
-from livepde.models.common import INITIAL, Coefficients, Number, beginning, state
+from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, closed
 
 __all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
@@ -34,17 +34,15 @@ def kuramoto_sivashinsky(
         Unknown initial state; None: given to the `Identifier`.
     """
     u = state(mesh, smooth(mesh), None)
-    c = Coefficients({"advection": advection, "instability": instability, "damping": damping})
-    begun, initial = beginning(u0, u)
-    return Model(
+    return autonomous(
         u,
-        {**c.unknown, **begun},
-        A=lambda q, u, v, x: (
-            c(q, "advection") * u * grad(u)[0] * v
-            - c(q, "instability") * grad(u)[0] * grad(v)[0]
-            + c(q, "damping") * hess(u)[0, 0] * hess(v)[0, 0]
+        {"advection": advection, "instability": instability, "damping": damping},
+        u0,
+        lambda c, u, v: (
+            c.advection * u * grad(u)[0] * v
+            - c.instability * grad(u)[0] * grad(v)[0]
+            + c.damping * hess(u)[0, 0] * hess(v)[0, 0]
         ),
-        initial=initial,
     )
 
 

@@ -11,12 +11,7 @@ from livepde.fem import Channel, Field, On, Unknown, grad, linear
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, closed
 
-__all__ = [
-    "ADVECTION_DISPERSION",
-    "MOBILE_IMMOBILE",
-    "advection_dispersion",
-    "mobile_immobile",
-]
+__all__ = ["ADVECTION_DISPERSION", "MOBILE_IMMOBILE", "advection_dispersion", "mobile_immobile"]
 
 INLETS = ("flux", "fixed")
 
@@ -157,7 +152,7 @@ def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
     """Return the boundary terms of inflow on the left and outflow on the right."""
     # With c_x = 0 the total flux on the right is v c; that on the left is v c_in.
     out = On("right", lambda q, u, w, x: velocity(q) * solute(u) * solute(w))
-    into = On("left", lambda q, u, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
+    into = On("left", lambda q, _, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
     return [out, into] if inlet == "flux" else [out]
 
 

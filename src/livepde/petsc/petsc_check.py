@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from livepde.diagnostics import CheckLine, CheckReport
+from livepde.diagnostics import Check, CheckReport
 from livepde.errors import ModelError
 from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.vectors import free_mask, random_vector, zeros
@@ -55,7 +55,7 @@ def check_petsc_model(
         twice = model.residual(u, q + dq * 2.0, t, w) - model.residual(u, q + dq, t, w)
         remedy = "The paper's law needs F affine in q: use PetscFilter."
         found.append(("F affine in q", _apart(once, twice), ROUNDING, remedy))
-    lines = tuple(CheckLine.at_most(*line) for line in found)
+    lines = tuple(Check.at_most(*line) for line in found)
     return CheckReport("PETSc model", lines, ModelError)
 
 

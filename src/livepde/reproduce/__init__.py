@@ -1,4 +1,4 @@
-"""Published and stated experiments, each with its expected numbers.
+"""Published experiments, each with its expected numbers.
 
 There is one file for each experiment, with its expected numbers at the end. The command `livepde
 reproduce NAME` and the tests run them.
@@ -7,28 +7,11 @@ reproduce NAME` and the tests run them.
 from __future__ import annotations
 
 from livepde.reproduce.boiger2016 import BOIGER2016
-from livepde.reproduce.degenerate import DEGENERATE
-from livepde.reproduce.dimensions import DIMENSIONS
-from livepde.reproduce.exact import EXACT
 from livepde.reproduce.experiment import Experiment
-from livepde.reproduce.noisy import SEED_EXCITED_NOISE
-from livepde.reproduce.relatives import RELATIVES
 from livepde.reproduce.seed import SEED
 from livepde.reproduce.seed_excited import SEED_EXCITED
 
 __all__ = ["EXPERIMENTS", "Experiment"]
 
-EXPERIMENTS: dict[str, Experiment] = {
-    item.name: item
-    for item in (
-        SEED,
-        SEED_EXCITED,
-        SEED_EXCITED_NOISE,
-        DEGENERATE,
-        DIMENSIONS,
-        BOIGER2016,
-        RELATIVES,
-        EXACT,
-    )
-}
+EXPERIMENTS: dict[str, Experiment] = {item.name: item for item in (SEED, SEED_EXCITED, BOIGER2016)}
 """Name -> experiment."""

@@ -497,7 +497,7 @@ def _words(runs: dict[float, Track], alone: dict[float, float]) -> list[str]:
         "q behind the truncation error of the time step (`livepde reproduce seed`).",
         f"nu: {drawn}. P u^ is drawn to zero and not to P u*; all of q* moves u by 0.06 % only. At "
         "nu > 0 a step can have several solutions, all with residuals at rounding level; taken is "
-        "the one that continues the step before, here and in reference.py.",
+        "the one that continues the step before, here and in experiments/reference.py.",
         "On the paper's example semiconvergence does not show at 1, 5 and 10 %, because q* moves "
         "u by 0.06 % at most, less than any of these noises. Either the pull mu/||r||_V~ is so "
         "stiff that q^ stays near 0 (mu = 10: error 1.0, 1.1 and 1.2), or q^ follows the noise: "
@@ -573,8 +573,8 @@ BOIGER2016 = Experiment(
 )
 
 # Expected results. First figure: for each nu the relative errors of q and of u at t = 60. The dense
-# implementation in reference.py gives the same, Setting(..., gain=100, c1=1, nu=nu) with the space
-# of `seed`.
+# implementation in experiments/reference.py gives the same, Setting(..., gain=100, c1=1, nu=nu)
+# with the space of `seed`.
 FIGURE1 = {0.0: (0.1333, 2.45e-4), 0.01: (0.534, 6.54e-3), 0.1: (3.08, 0.0463)}
 EARLIER = 5.0  # how much earlier the least error comes at the next noise level, mean of five seeds
 FALLEN = 0.3  # 1 %: the error at the end over that at the start

@@ -277,11 +277,11 @@ SEED = Experiment(
 )
 
 # Expected results: for each (gain, c1) the relative L2 error of q at t = 60 with discrete truth,
-# measured with the dense implementation in reference.py: `run(Setting(..., state_ends="clamped",
-# parameter_ends="clamped", omega=(0.3, 0.87)))`, and the same with "zero". The laws agree with it
-# in all these digits. They are those of the paper's splitting, by integrals over omega; with R and
-# P that select coefficients the second table is 0.80, 0.06, 0.12, 0.04, 0.04, which is no method of
-# the paper.
+# measured with the dense implementation in experiments/reference.py: `run(Setting(...,
+# state_ends="clamped", parameter_ends="clamped", omega=(0.3, 0.87)))`, and the same with "zero".
+# The laws agree with it in all these digits. They are those of the paper's splitting, by integrals
+# over omega; with R and P that select coefficients the second table is 0.80, 0.06, 0.12, 0.04,
+# 0.04, which is no method of the paper.
 EXPECTED = {
     (1.0, 0.1): 0.8424,
     (100.0, 0.1): 0.1239,

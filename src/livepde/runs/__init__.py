@@ -14,10 +14,16 @@ from livepde.runs.directory import (
 from livepde.runs.directory import open_run as open
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
-from livepde.runs.judgement import doubts, severities, unexplained, verdict, verdict_table
 from livepde.runs.live_loop import Backlog, Live, Retention, Sink
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.runs.run_findings import input_findings
+from livepde.runs.run_verdict import (
+    doubts,
+    input_findings,
+    severities,
+    unexplained,
+    verdict,
+    verdict_table,
+)
 from livepde.runs.summary import Jump, arrivals, checks_of, jumps, measures, tables
 
 __all__ = [

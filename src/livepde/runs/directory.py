@@ -32,8 +32,8 @@ from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.judgement import verdict, verdict_table
 from livepde.runs.outcome import Check, FigureFactory, Table, attempted
+from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
 
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
 __all__ = [
     "Run",
     "RunWriter",
-    "bound_text",
     "free_path",
     "markdown",
     "open_run",
@@ -456,40 +455,22 @@ def markdown(
 ) -> str:
     """Return a report in Markdown."""
     parts = [f"# {title}"]
-    parts += [_markdown_table(table) for table in shown]
+    parts += [table.markdown() for table in shown]
     rows = [
         (
             check.name,
             f"{check.value:.5g}",
             check.sense,
-            bound_text(check),
+            check.bound_text,
             "ok" if check.ok else "FAILED",
         )
         for check in checks
     ]
     if rows:
-        parts.append(_markdown_table(Table("Checks", ("number", "value", "", "bound", ""), rows)))
+        parts.append(Table("Checks", ("number", "value", "", "bound", ""), rows).markdown())
     parts += [f"> {note}" for note in notes]
     parts += [f"![{name.removesuffix('.png')}]({name})" for name in figures]
     return MARKUP.sub("&lt;", "\n\n".join(parts)) + "\n"
-
-
-def bound_text(check: Check) -> str:
-    """Return the bound of a check as text."""
-    if isinstance(check.bound, tuple):
-        return f"[{check.bound[0]:g}, {check.bound[1]:g}]"
-    return f"{check.bound:g}"
-
-
-def _markdown_table(table: Table) -> str:
-    def line(cells: Iterable[Any]) -> str:
-        shown = (f"{c:.5g}" if isinstance(c, float) else str(c) for c in cells)
-        return "| " + " | ".join(cell.replace("|", "\\|") for cell in shown) + " |"
-
-    if not table.rows:
-        return f"## {table.title}"
-    rule = "|" + "---|" * len(table.columns)
-    return "\n".join([f"## {table.title}", "", line(table.columns), rule, *map(line, table.rows)])
 
 
 def plain(value: Any) -> Any:

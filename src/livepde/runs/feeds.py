@@ -29,7 +29,11 @@ def shifted(position: str) -> tuple[float, str]:
 
 
 class Feed(Protocol):
-    """Brings samples in time order, complete and checked."""
+    """Brings samples in time order, complete and checked.
+
+    Other methods than `done` and `poll` are those of a feed that is never silent, refuses no row
+    and has nothing to go back to, acknowledge or close.
+    """
 
     @property
     def done(self) -> bool:
@@ -40,6 +44,7 @@ class Feed(Protocol):
 
     def heard(self) -> bool:
         """Return whether any row has come since the last call, usable or not."""
+        return True
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return the counts of remarks since the last call.
@@ -47,21 +52,26 @@ class Feed(Protocol):
         Only remarks on rows before `position(waiting)`: later rows are read again after a crash,
         and their remarks would be counted twice.
         """
+        return ()
 
     def position(self, waiting: Sequence[Ready]) -> str:
         """Return the position of the source before these samples, which are still to be taken."""
+        return ""
 
     def acknowledge(self, ready: Ready) -> None:
         """Acknowledge a sample that has been kept for good, or dropped."""
+        return
 
     def withdraw(self, last: float) -> None:
         """Accept samples later than this time again: those taken since then were withdrawn."""
+        return
 
     def close(self) -> None:
         """Close the source and release its resources."""
+        return
 
 
-class Gathered:
+class Gathered(Feed):
     """Samples from the rows of a source, as an `Intake` puts them in order.
 
     Parameters
@@ -167,7 +177,7 @@ def _given(tokens: Iterable[Any]) -> list[Any]:
     return [token for _, token in tokens]
 
 
-class SampleFeed:
+class SampleFeed(Feed):
     """Feed of samples that are in order already: a table, or any iterable of samples.
 
     Parameters
@@ -204,29 +214,8 @@ class SampleFeed:
     def _values(self, sample: Sample) -> dict[str, float]:
         return {**by_name(sample.z, self._names), **(sample.inputs or {})}
 
-    def heard(self) -> bool:
-        """Return True: a table or iterable is never silent."""
-        return True
 
-    def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
-        """Return no remarks: invalid samples raise `DataError` instead."""
-        return ()
-
-    def position(self, waiting: Sequence[Ready]) -> str:
-        """Return an empty position: resuming needs only the time of the last sample."""
-        return ""
-
-    def acknowledge(self, ready: Ready) -> None:
-        """Do nothing: there is no source to acknowledge to."""
-
-    def withdraw(self, last: float) -> None:
-        """Do nothing: the next sample is later anyway."""
-
-    def close(self) -> None:
-        """Do nothing: there are no resources to release."""
-
-
-class Paced:
+class Paced(Feed):
     """Samples of the past, replayed at the pace of their times.
 
     Parameters

@@ -54,7 +54,6 @@ from livepde.runs.database import (
     told,
     writer,
 )
-from livepde.runs.packing import layout_from, packed, unpacked
 from livepde.samples import noise_channel
 
 if TYPE_CHECKING:
@@ -146,7 +145,7 @@ class Journal:
         meta = self._meta()
         with sound(path):
             self.channels = tuple(map(str, json.loads(meta["channels"])))
-            self.layout = layout_from(meta["layout"])
+            self.layout = Layout.from_json(meta["layout"])
         self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._thinned = 0
@@ -155,14 +154,11 @@ class Journal:
 
     def _stand(self) -> None:
         """Read the numbers of the last estimate and sample; raise `RunError` if some are lost."""
-        self._last = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
-        self._current = self._last
+        self._last = self._current = self._highest("estimates")
         self._newest = max(self.accepted, *self._withdrawn(), 0)
         # A checkpoint is written after its estimate, so one without an estimate is damage.
-        kept = int(self._one("SELECT COALESCE(MAX(id), 0) FROM checkpoints"))
-        if kept > self._last:
-            text = f"the estimates after {self._last} are gone"
-            raise RunError(damaged(self.path, text))
+        if self._highest("checkpoints") > self._last:
+            raise RunError(damaged(self.path, f"the estimates after {self._last} are gone"))
 
     # --- opening -------------------------------------------------------------------------------
 
@@ -278,6 +274,10 @@ class Journal:
     def _one(self, command: str, *values: Any) -> Any:
         return self._read(command, *values)[0][0]
 
+    def _highest(self, table: str) -> int:
+        """Return the largest number of a record in a table, 0 without records."""
+        return int(self._one(f"SELECT COALESCE(MAX(id), 0) FROM {table}"))
+
     # --- writing -------------------------------------------------------------------------------
 
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
@@ -368,20 +368,16 @@ class Journal:
             conflict="ON CONFLICT (id) DO NOTHING",
         )
         if record.snapshot is not None:
-            self._keep(record.snapshot)
+            self.keep(record.snapshot, self._current)
         self._last = self._current
 
-    def keep(self, snapshot: Snapshot) -> None:
-        """Keep the fields of the last sample until `rewind` deletes them."""
-        self._keep(snapshot, last=True)
-
-    def _keep(self, snapshot: Snapshot, last: bool = False) -> None:
+    def keep(self, snapshot: Snapshot, number: int | None = None) -> None:
+        """Keep the fields of a sample; those of the last one (None) until `rewind` deletes them."""
+        last, number = number is None, self._last if number is None else number
         # Fields that are kept for good must not become temporary because they are the last, too.
-        number = self._last if last else self._current
-        stays = "WHERE last > excluded.last"
         conflict = "ON CONFLICT (id) DO UPDATE SET last = excluded.last, "
-        conflict += f"content = excluded.content, crc = excluded.crc {stays}"
-        self._insert("fields", number, int(last), packed(snapshot), conflict=conflict)
+        conflict += "content = excluded.content, crc = excluded.crc WHERE last > excluded.last"
+        self._insert("fields", number, int(last), snapshot.to_bytes(), conflict=conflict)
 
     def checkpoint(self, state: bytes) -> None:
         """Keep the identifier's state after the last estimated sample, and commit."""
@@ -404,8 +400,7 @@ class Journal:
         """
         if position is not None:
             # With the number of the sample, since the position of any later sample supersedes it.
-            stands = json.dumps([self.accepted, position])
-            self._say("position", stands)
+            self._say("position", json.dumps([self.accepted, position]))
         self._write(self._db.commit)
 
     def _say(self, key: str, value: str) -> None:
@@ -510,7 +505,7 @@ class Journal:
     @property
     def accepted(self) -> int:
         """Number of the last accepted sample, 0 before any."""
-        return int(self._one("SELECT COALESCE(MAX(id), 0) FROM samples"))
+        return self._highest("samples")
 
     @property
     def estimated(self) -> int:
@@ -566,7 +561,7 @@ class Journal:
         for (number,) in later:
             self._forget(int(number))
         self._write(self._db.commit)
-        self._last = self._current = int(self._one("SELECT COALESCE(MAX(id), 0) FROM estimates"))
+        self._last = self._current = self._highest("estimates")
 
     @property
     def position(self) -> str:
@@ -681,7 +676,7 @@ class Journal:
         layout = self.layout
         sizes = [len(layout.numbers), len(layout.sensors), len(layout.withheld or ())]
         values = np.frombuffer(numbers)
-        snapshot = None if content is None else unpacked(content)
+        snapshot = None if content is None else Snapshot.from_bytes(content)
         lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
         if len(values) != sum(sizes) or lengths - {self._vertices}:
             raise ValueError(f"the estimate at t = {t} has not the size of the others")

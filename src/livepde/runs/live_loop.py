@@ -46,6 +46,7 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Release its resources."""
+        return
 
 
 @dataclass(frozen=True)

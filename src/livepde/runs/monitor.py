@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from livepde.errors import RunError
 from livepde.result import Estimate
+from livepde.runs.live_loop import Sink
 from livepde.runs.web import Address, Server
 from livepde.verdict import LEVELS
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Metrics", "Monitor"]
 
 
-class Metrics:
+class Metrics(Sink):
     """Estimates as Prometheus metrics; a sink of a run.
 
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
@@ -67,9 +68,6 @@ class Metrics:
         self._samples.inc()
         if not estimate.status.ok:
             self._failed.inc()
-
-    def close(self) -> None:
-        """Nothing is held."""
 
 
 class _Health:

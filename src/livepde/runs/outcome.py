@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from livepde.errors import ConfigurationError
+from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -15,85 +15,8 @@ __all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table", "atte
 
 T = TypeVar("T")
 
-Sense: TypeAlias = Literal["<=", ">=", "in"]
-Bound: TypeAlias = float | tuple[float, float]
 FigureFactory: TypeAlias = Callable[[], Any]
 """Returns a matplotlib Figure; called only when somebody wants to see it."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """A number and the bound that it must satisfy.
-
-    Attributes
-    ----------
-    name
-        The measured quantity.
-    value
-        The number; NaN never satisfies anything.
-    bound
-        One number for "<=" and ">=", a pair (low, high) for "in".
-    sense
-        "<=", ">=" or "in".
-
-    Examples
-    --------
-    >>> Check("error of q", 0.04, 0.05, "<=").ok
-    True
-    >>> Check("k", 2.5, (2.6, 3.1), "in").ok
-    False
-    """
-
-    name: str
-    value: float
-    bound: Bound
-    sense: Sense
-
-    def __post_init__(self) -> None:
-        if self.sense not in ("<=", ">=", "in"):
-            raise ConfigurationError(
-                f"check '{self.name}': got sense {self.sense!r}; expected '<=', '>=' or 'in'."
-            )
-        if isinstance(self.bound, tuple) != (self.sense == "in"):
-            raise ConfigurationError(
-                f"check '{self.name}': got bound {self.bound!r}; '{self.sense}' needs "
-                + ("a pair (low, high)." if self.sense == "in" else "one number.")
-            )
-
-    @property
-    def ok(self) -> bool:
-        """True if the number satisfies the bound."""
-        if isinstance(self.bound, tuple):
-            return self.bound[0] <= self.value <= self.bound[1]
-        return self.value <= self.bound if self.sense == "<=" else self.value >= self.bound
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object: name, value, bound, sense, ok."""
-        bound = list(self.bound) if isinstance(self.bound, tuple) else self.bound
-        return {
-            "name": self.name,
-            "value": self.value,
-            "bound": bound,
-            "sense": self.sense,
-            "ok": self.ok,
-        }
-
-
-@dataclass(frozen=True)
-class Table:
-    """Rows to print; numbers stay numbers until they are shown."""
-
-    title: str
-    columns: Sequence[str]
-    rows: Sequence[Sequence[Any]]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the JSON object."""
-        return {
-            "title": self.title,
-            "columns": list(self.columns),
-            "rows": [list(row) for row in self.rows],
-        }
 
 
 @dataclass(frozen=True, eq=False)

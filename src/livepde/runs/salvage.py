@@ -49,7 +49,7 @@ class Salvage(Journal):
     def _top(self, table: str) -> int:
         """Return the largest number of a record in a table, as far as that can be read."""
         try:
-            return int(self._one(f"SELECT COALESCE(MAX(id), 0) FROM {table}"))
+            return self._highest(table)
         except RunError:
             pass
         # Where the last page is damaged, the records before it can still be read one by one.

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import logging
 import re
 import secrets
 import socket
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from livepde.errors import RunError
-from livepde.runs.pending_connections import LONGEST_BODY, LONGEST_HEADER, ROOM, PendingConnections
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["Address", "Server"]
 
 COOKIE = "livepde_token"
-THREADS = 16  # so many visitors may be slow at a time
-TIMEOUT = 5  # seconds that a visitor may be silent within a request
 SHORTEST_TOKEN = 16  # characters, where anyone may try
 NOT_HERE = "this page is for this machine only: ask for localhost"
 NO_TOKEN = "add ?token=... as it was printed where this was started"
@@ -119,57 +116,29 @@ class Server:
 
     def __init__(self, application: WSGIApplication, address: Address) -> None:
         try:
-            from cheroot.wsgi import Server as Cheroot
+            from livepde.runs.visitors import listener
         except ImportError:
-            raise RunError("Serving needs cheroot: pip install 'livepde[service]'.") from None
-        place = (address.host, address.port)
-        server: Callable[..., Any] = Cheroot
-        # cheroot lets five callers wait for its accept(); a sixth would try again after a second.
-        self._server = server(
-            place, _headed(application, address), numthreads=THREADS, request_queue_size=ROOM
-        )
-        self._pending = PendingConnections(
-            self._server.process_conn, lambda e: _why_not(e, address), TIMEOUT
-        )
-        self._server.process_conn = self._receive
-        self._server.timeout = TIMEOUT
-        self._server.max_request_header_size = LONGEST_HEADER
-        self._server.max_request_body_size = LONGEST_BODY
-        prepared: Future[None] = Future()
-        # What a daemon starts is one: no thread that serves keeps a program from its end.
-        self._thread = threading.Thread(target=self._serve, args=(place, prepared), daemon=True)
-        self._thread.start()
+            raise RunError("Serving needs waitress: pip install 'livepde[service]'.") from None
+        host, port = address.host, address.port
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
-            prepared.result()
+            place = socket.create_server((host, port), family=family)
         except OSError as error:
             reason = error.strerror or error
             raise RunError(
-                f"Cannot listen on {address.host}:{address.port}: {reason}; choose another port."
+                f"Cannot listen on {host}:{port}: {reason}; choose another port."
             ) from error
-        self.port = int(self._server.bind_addr[1])
-        host = f"[{address.host}]" if ":" in address.host else address.host
-        plain = f"http://{host}:{self.port}/"
+        # It warns of each request that waits for one of the threads.
+        logging.getLogger("waitress.queue").setLevel(logging.ERROR)
+        self._server = listener(_headed(application, address), place)
+        # What a daemon starts is one: no thread that serves keeps a program from its end.
+        self._thread = threading.Thread(target=self._server.run, daemon=True)
+        self._thread.start()
+        self.port = int(place.getsockname()[1])
+        named = f"[{host}]" if ":" in host else host
+        plain = f"http://{named}:{self.port}/"
         self.url = f"{plain}?token={address.token}" if address.token else plain
         self.shown = self.url if address.made else plain
-
-    def _serve(self, place: tuple[str, int], prepared: Future[None]) -> None:
-        try:
-            family = socket.AF_INET6 if ":" in place[0] else socket.AF_INET
-            # cheroot leaves a socket open if it cannot listen
-            socket.create_server(place, family=family).close()
-            self._server.prepare()
-        except Exception as error:  # noqa: BLE001  it is raised where the server is made
-            prepared.set_exception(error)
-            return
-        prepared.set_result(None)
-        self._server.serve()
-
-    def _receive(self, connection: Any) -> None:
-        """Hold a connection until its request is complete; close it on pipelined requests."""
-        if connection.rfile.has_data():
-            connection.close()
-        else:
-            self._pending.admit(connection)
 
     def wait(self) -> None:
         """Serve until it is closed."""
@@ -177,17 +146,18 @@ class Server:
 
     def close(self) -> None:
         """Stop listening."""
-        self._pending.close()
-        self._server.stop()
-        self._thread.join()
+        if self._thread.is_alive():
+            self._server.stop()
+            self._thread.join()
+            self._server.task_dispatcher.shutdown()
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
     """Return an application with our headers, and a cookie for visitors with the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
-        if why := _why_not(environ, address):  # should the header have been read otherwise before
-            begin("403 Forbidden", [("Content-Type", "text/plain"), ("Connection", "close")])
+        if why := _why_not(environ, address):
+            begin("403 Forbidden", [("Content-Type", "text/plain")])
             return [f"{why}\n".encode()]
         given = _given(environ)
         known = bool(address.token) and _same(given, address.token)

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
+from livepde.stepping.banded_stage import BandedStage, member_stage
 from livepde.stepping.corrections import Kept
-from livepde.stepping.interval import Advance, Interval, advance, own_noise
-from livepde.stepping.member_stage import (
-    BandedStage,
-    KeptFactors,
-    MemberStage,
-    StageOfMembers,
-    member_stage,
-)
+from livepde.stepping.interval import Interval, Moments, Span, own_noise
+from livepde.stepping.member_stage import KeptFactors, MemberStage, StageOfMembers
 from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
-from livepde.stepping.schemes import Alexander2, ImplicitEuler, Scheme, Stage
+from livepde.stepping.schemes import Advance, Alexander2, ImplicitEuler, Scheme, Stage, advance
 from livepde.stepping.simulation import simulate
-from livepde.stepping.span import Moments, Span
 from livepde.stepping.state import ForwardStage
 
 __all__ = [

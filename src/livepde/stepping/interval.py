@@ -1,29 +1,21 @@
-"""Sample intervals: linear interpolation of inputs, substeps, and step halving after a failure."""
+"""Sample intervals of one process and of many: times, inputs and measurements at both ends."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array
-from livepde.stepping.newton import StepFailed
-from livepde.stepping.schemes import Scheme, Stage
+from livepde.linalg import Array, Mask
 
-__all__ = ["Advance", "Interval", "advance", "own_noise"]
+__all__ = ["Interval", "Moments", "Span", "own_noise"]
 
-# Beyond this number of halvings a substep would be shorter than the resolution of usual times.
-MOST_HALVINGS = 30
-# With three halvings a tenth is left of the error of the first steps of a solution that goes with
-# the square root of time, for the work of six more substeps.
-MOST_GRADES = 3
+NO_INPUTS = np.zeros((1, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,123 +111,137 @@ def own_noise(noise: ArrayLike) -> Array | None:
     return None if np.isnan(found).all() else found
 
 
-@dataclass(frozen=True)
-class Advance:
-    """Step control: time scheme, substeps, and halving after a failure.
+class Moments(NamedTuple):
+    """One time, with the input channels of each member.
 
-    Parameters
+    Attributes
     ----------
-    scheme
-        Time scheme.
-    dt_max
-        Longest substep; a longer interval is divided evenly.
-    halvings
-        Maximum number of successive halvings of a failed substep; 0: no retry.
-    hold
-        True for zero-order hold: inputs have the value of the later sample over the whole interval,
-        as with an actuator that is set at each sample. False for linear interpolation.
-    parts
-        Number of parts of every substep, to repeat an interval with shorter steps.
-    start
-        Initial time. Substeps h near it are graded: halved, at most three times, where they are
-        longer than half of the time since then, unless `halvings` is 0. Data that do not fit the
-        initial state, as a heat flux that sets in, leave a boundary layer that goes with the
-        square root of time.
+    t
+        The time.
+    channels
+        Names of the channels.
+    inputs
+        Their values, shape (members, channels), or (1, channels) if they are the same for all.
+    interval
+        Interval of a single process that holds the time; None for members of a fleet.
     """
 
-    scheme: Scheme
-    dt_max: float = np.inf
-    halvings: int = 8
-    hold: bool = False
-    parts: int = 1
-    start: float = math.nan
+    t: float
+    channels: tuple[str, ...]
+    inputs: Array
+    interval: Interval | None = None
 
-    def __post_init__(self) -> None:
-        given: Any = self.halvings
-        whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
-        if not (whole and 0 <= given <= MOST_HALVINGS):
-            raise ConfigurationError(
-                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
-            )
-
-    def over(self, interval: Interval) -> Interval:
-        """Return an interval with inputs held or interpolated, as configured."""
-        if not self.hold or interval.inputs0 is interval.inputs1:
-            return interval
-        return replace(interval, inputs0=interval.inputs1)
-
-    def count(self, length: float) -> int:
-        """Return the number of equal substeps of an interval of that length."""
-        ratio = length / self.dt_max
-        # The factor keeps rounding of the length from adding a substep when dt_max divides it.
-        return self.parts * max(1, math.ceil(ratio * (1 - 1e-12)))
-
-    def grade(self, t: float, h: float) -> int:
-        """Return how often a substep h from t is halved because it is near the start."""
-        since = t - self.start
-        if not (self.halvings and since >= 0.0):
-            return 0
-        # The factor keeps rounding of the times from halving a step that is half of `since`.
-        return sum(0.5 * since * (1 + 1e-9) < h / 2**k for k in range(MOST_GRADES))
+    def member(self, k: int) -> Moment:
+        """Return the moment of one member."""
+        if self.interval is not None:
+            return self.interval.at(self.t)
+        row = self.inputs[k if len(self.inputs) > 1 else 0]
+        return Moment(self.t, Inputs(dict(zip(self.channels, row.tolist(), strict=True))))
 
 
-def _width(t: float, stop: float) -> float:
-    """Return stop - t, rounded to the resolution of both times.
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Sample intervals of all members, with a common end.
 
-    Differences of equidistant times differ in their last digits. Rounding makes them identical, so
-    that a matrix factorised for one step length serves all equal steps.
+    Attributes
+    ----------
+    t0, t1
+        Time of the last accepted sample of each member, shape (members,), and of this one.
+    channels
+        Names of the input channels.
+    inputs0, inputs1
+        Their values at both ends, shape (members, channels), or (1, channels) if the same for all.
+    z0, z1
+        Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
+    interval
+        Interval of a single process; None for members of a fleet.
+    noise
+        Standard deviation of each value of z1, of its shape, NaN for the default of the sensor;
+        None if all are defaults.
+    gaps
+        Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
+        shape (members, 2, channels) or (1, 2, channels); None without a gap.
     """
-    # The unit is 16 units in the last place of the larger time. Very short widths are not rounded,
-    # as that would change more than their last digits.
-    unit = math.ldexp(1.0, math.frexp(max(abs(t), abs(stop)))[1] - 49)
-    width = stop - t
-    return round(width / unit) * unit if width > 1e6 * unit else width
 
+    t0: Array
+    t1: float
+    channels: tuple[str, ...]
+    inputs0: Array
+    inputs1: Array
+    z0: Array
+    z1: Array
+    interval: Interval | None = None
+    noise: Array | None = None
+    gaps: Array | None = None
 
-def advance(
-    control: Advance, stage: Stage, y: Array, t0: float, t1: float
-) -> tuple[Array, int, StepFailed | None]:
-    """Advance y from t0 to t1.
+    @classmethod
+    def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
+        """Return the span of one interval, common to all members."""
+        first = last = NO_INPUTS
+        if channels:
+            last = np.array([list(map(interval.inputs1.__getitem__, channels))])
+            first = last
+            if interval.inputs0 is not interval.inputs1:
+                first = np.array([list(map(interval.inputs0.__getitem__, channels))])
+        t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
+        noise = None if interval.noise is None else interval.noise[None]
+        gaps = None
+        if interval.gaps:
+            gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T[None]
+        return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise, gaps)
 
-    Times are computed from integer counts, never accumulated.
+    def __len__(self) -> int:
+        return len(self.t0)
 
-    Returns
-    -------
-    y
-        State at the end of the interval, or after the last successful substep if halving failed.
-    steps
-        Number of substeps taken.
-    failure
-        None, or the failure of the shortest substep.
-    """
-    h = control.parts * (t1 - t0) / control.count(t1 - t0)
-    grades = control.grade(t0, h)
-    # A substep has 2^k ticks, where k is the number of halvings that may be needed.
-    whole = 1 << (control.halvings + grades)  # ticks of a substep
-    finest = control.count(t1 - t0) * whole
-    width = (t1 - t0) / finest
+    @property
+    def start(self) -> float:
+        """Most frequent start time of the members."""
+        first = float(self.t0[0])
+        if len(self.t0) == 1 or (self.t0 == first).all():
+            return first
+        times, counts = np.unique(self.t0, return_counts=True)
+        return float(times[np.argmax(counts)])
 
-    def longest(tick: int) -> int:
-        """Return the ticks of a substep that begins at a tick."""
-        return whole >> control.grade(t0 + tick * width, h) if grades else whole
+    @property
+    def together(self) -> Mask:
+        """Mask of the members that start at `start`, shape (members,)."""
+        most: Mask = self.t0 == self.start
+        return most
 
-    # Time is counted in ticks of the finest halving: all times are integer multiples of one width,
-    # and a stride can grow again at every multiple of its double.
-    tick, stride, steps = 0, longest(0), 0
-    while tick < finest:
-        t = t0 + tick * width
-        stop = t1 if tick + stride == finest else t0 + (tick + stride) * width
-        try:
-            y = control.scheme.advance(stage, y, t, _width(t, stop))
-        except StepFailed as failure:
-            if stride << control.halvings <= longest(tick):
-                return y, steps, failure
-            stride >>= 1
-            continue
-        steps += 1
-        tick += stride
-        # A stride is doubled only at a multiple of its double, so that substeps stay on the grid of
-        # halvings.
-        if 2 * stride <= longest(tick) and tick % (2 * stride) == 0:
-            stride <<= 1
-    return y, steps, None
+    @property
+    def present(self) -> Mask:
+        """Mask of members with a measurement at the end, shape (members,) or (1,)."""
+        given = np.isfinite(self.z1)
+        if np.count_nonzero(given) == given.size:
+            return np.ones(len(given), dtype=bool)
+        return np.asarray(given.any(axis=1))
+
+    def at(self, t: float) -> Moments:
+        """Return time and inputs at t of members with a common start."""
+        mixed = self.inputs1
+        # The same object at both ends says that inputs are held: no interpolation.
+        if t != self.t1 and self.inputs0 is not mixed:
+            s = (t - self.start) / (self.t1 - self.start)
+            mixed = (1 - s) * self.inputs0 + s * mixed
+        return Moments(t, self.channels, mixed, self.interval)
+
+    @property
+    def end(self) -> Moments:
+        """Time and inputs at the end."""
+        return Moments(self.t1, self.channels, self.inputs1, self.interval)
+
+    def member(self, k: int) -> Interval:
+        """Return the interval of one member."""
+        if self.interval is not None:
+            return self.interval
+        first, last = (
+            Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
+            for inputs in (self.inputs0, self.inputs1)
+        )
+        noise = None if self.noise is None else self.noise[k]
+        gaps = {}
+        if self.gaps is not None:
+            each = zip(self.channels, *self.gaps[k].tolist(), strict=True)
+            gaps = {name: (held, again > 0.0) for name, held, again in each if held or again}
+        z0, z1 = self.z0[k], self.z1[k]
+        return Interval(float(self.t0[k]), self.t1, first, last, z0, z1, noise, gaps)

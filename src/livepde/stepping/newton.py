@@ -134,7 +134,7 @@ class Newton:
         Accepted fraction of the residual of a prediction. 0: always solve to `tolerance`.
     ceiling
         Bound on the relative residual with `share`. The default keeps q and u within 1e-3 of those
-        of strict solves (`livepde reproduce exact`): the next stage corrects the remaining error.
+        of strict solves (study `exact` in experiments): the next stage corrects what remains.
         Large coupled stages, solved by blocks, raise it to 5e-3.
     iterations
         Maximum number of updates.

@@ -1,4 +1,4 @@
-"""Time schemes as sequences of implicit Euler stages.
+"""Time schemes as sequences of implicit Euler stages, and the substeps they take over an interval.
 
 A *stage* solves M (y - c)/h + R(t, y) = 0 for y; every scheme here is a recipe of such stages, so a
 law writes its implicit equations once.
@@ -6,16 +6,26 @@ law writes its implicit equations once.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
+from livepde.errors import ConfigurationError
 from livepde.linalg import Array
+from livepde.stepping.interval import Interval
+from livepde.stepping.newton import StepFailed
 
-__all__ = ["Alexander2", "ImplicitEuler", "Scheme", "Stage"]
+__all__ = ["Advance", "Alexander2", "ImplicitEuler", "Scheme", "Stage", "advance"]
+
+# Beyond this number of halvings a substep would be shorter than the resolution of usual times.
+MOST_HALVINGS = 30
+# With three halvings a tenth is left of the error of the first steps of a solution that goes with
+# the square root of time, for the work of six more substeps.
+MOST_GRADES = 3
 
 Stage: TypeAlias = Callable[[Array, float, float], Array]
 """(c, t, h) -> y with M (y - c)/h + R(t, y) = 0."""
@@ -57,3 +67,118 @@ class Alexander2(Scheme):
         first = stage(y, t + g * h, g * h)
         # The second stage begins at y + (1 - gamma) h k_1, where h k_1 = (first - y)/gamma.
         return stage(y + (1 - g) / g * (first - y), t + h, g * h)
+
+
+@dataclass(frozen=True)
+class Advance:
+    """Step control: time scheme, substeps, and halving after a failure.
+
+    Parameters
+    ----------
+    scheme
+        Time scheme.
+    dt_max
+        Longest substep; a longer interval is divided evenly.
+    halvings
+        Maximum number of successive halvings of a failed substep; 0: no retry.
+    hold
+        True for zero-order hold: inputs have the value of the later sample over the whole interval,
+        as with an actuator that is set at each sample. False for linear interpolation.
+    parts
+        Number of parts of every substep, to repeat an interval with shorter steps.
+    start
+        Initial time. Substeps h near it are graded: halved, at most three times, where they are
+        longer than half of the time since then, unless `halvings` is 0. Data that do not fit the
+        initial state, as a heat flux that sets in, leave a boundary layer that goes with the
+        square root of time.
+    """
+
+    scheme: Scheme
+    dt_max: float = np.inf
+    halvings: int = 8
+    hold: bool = False
+    parts: int = 1
+    start: float = math.nan
+
+    def __post_init__(self) -> None:
+        given: Any = self.halvings
+        whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+        if not (whole and 0 <= given <= MOST_HALVINGS):
+            raise ConfigurationError(
+                f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
+            )
+
+    def over(self, interval: Interval) -> Interval:
+        """Return an interval with inputs held or interpolated, as configured."""
+        if not self.hold or interval.inputs0 is interval.inputs1:
+            return interval
+        return replace(interval, inputs0=interval.inputs1)
+
+    def count(self, length: float) -> int:
+        """Return the number of equal substeps of an interval of that length."""
+        if length <= self.dt_max:
+            return self.parts
+        # The factor keeps rounding of the length from adding a substep when dt_max divides it.
+        return self.parts * math.ceil(length / self.dt_max * (1 - 1e-12))
+
+    def grade(self, t: float, h: float) -> int:
+        """Return how often a substep h from t is halved because it is near the start."""
+        since = t - self.start
+        # The factor keeps rounding of the times from halving a step that is half of `since`.
+        longest = 0.5 * since * (1 + 1e-9)
+        if not self.halvings or longest >= h or not since >= 0.0:
+            return 0
+        return sum(longest < h / 2**k for k in range(MOST_GRADES))
+
+
+def advance(
+    control: Advance, stage: Stage, y: Array, t0: float, t1: float
+) -> tuple[Array, int, StepFailed | None]:
+    """Advance y from t0 to t1.
+
+    Times are computed from integer counts, never accumulated.
+
+    Returns
+    -------
+    y
+        State at the end of the interval, or after the last successful substep if halving failed.
+    steps
+        Number of substeps taken.
+    failure
+        None, or the failure of the shortest substep.
+    """
+    count = control.count(t1 - t0)
+    h = control.parts * (t1 - t0) / count
+    grades = control.grade(t0, h)
+    # A substep has 2^k ticks, where k is the number of halvings that may be needed.
+    whole = 1 << (control.halvings + grades)
+    finest = count * whole
+    width = (t1 - t0) / finest
+    # Time is counted in ticks of the finest halving: all times are integer multiples of one width,
+    # and a stride can grow again at every multiple of its double.
+    tick, steps = 0, 0
+    stride = longest = whole >> grades
+    while tick < finest:
+        t = t0 + tick * width
+        stop = t1 if tick + stride == finest else t0 + (tick + stride) * width
+        # Differences of equidistant times differ in their last digits. Rounded to 16 units in the
+        # last place of the larger time they are identical, so that a matrix factorised for one step
+        # length serves all equal steps. For very short steps that would change more than digits.
+        unit, length = 16.0 * math.ulp(max(stop, -t)), stop - t
+        length = round(length / unit) * unit if length > 1e6 * unit else length
+        try:
+            y = control.scheme.advance(stage, y, t, length)
+        except StepFailed as failure:
+            if stride << control.halvings <= longest:
+                return y, steps, failure
+            stride >>= 1
+            continue
+        steps += 1
+        tick += stride
+        # The longest substep that may begin here; away from the initial time it is not graded.
+        longest = whole >> control.grade(t0 + tick * width, h) if grades else whole
+        # A stride is doubled only at a multiple of its double, so that substeps stay on the grid of
+        # halvings.
+        if 2 * stride <= longest and tick % (2 * stride) == 0:
+            stride <<= 1
+    return y, steps, None

@@ -11,7 +11,8 @@ import numpy as np
 from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.stepping.interval import Advance, Interval, advance
+from livepde.stepping.interval import Interval
+from livepde.stepping.schemes import Advance, advance
 from livepde.stepping.state import ForwardStage
 
 __all__ = ["simulate"]

@@ -23,8 +23,17 @@ from livepde.streams.clock import (
     number_of,
     read_times,
 )
-from livepde.streams.names import check_columns, is_data, no_file
-from livepde.streams.table import MISSING, Column, DataTable, cell_number, decimal_marks, to_table
+from livepde.streams.table import (
+    MISSING,
+    Column,
+    DataTable,
+    cell_number,
+    check_columns,
+    decimal_marks,
+    is_data,
+    no_file,
+    to_table,
+)
 
 __all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from livepde.errors import DataError
 from livepde.result import Estimate
-from livepde.streams.sources import LONGEST, Row, drained, json_row
+from livepde.streams.sources import LONGEST, Row, RowSource, drained, json_row
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -217,7 +217,7 @@ def _check_overlap(one: str, other: str) -> None:
     )
 
 
-class MqttSource(_Peer):
+class MqttSource(_Peer, RowSource):
     """Rows from topics; unacknowledged messages are delivered again, also after a restart.
 
     A message is a row (a JSON object, column -> value), or for a topic with a column of its own a
@@ -383,10 +383,6 @@ class MqttSource(_Peer):
                     "before the first is acknowledged: make the intake's wait shorter, or send "
                     "rows with several channels."
                 )
-
-    def position(self, waiting: Iterable[Any]) -> str:
-        """Return an empty position: the broker keeps unacknowledged messages itself."""
-        return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
         """Acknowledge messages to the broker; while it is offline, after the reconnect."""

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import queue
 import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as OutOfTime
 from contextlib import suppress
@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from livepde.errors import DataError
-from livepde.streams.sources import Row, drained
+from livepde.streams.sources import Row, RowSource, drained
 
 __all__ = ["OpcuaSource"]
 
@@ -27,7 +27,7 @@ QUEUED = 10  # values of a node that the server keeps between two messages
 log = logging.getLogger("livepde.opcua")
 
 
-class OpcuaSource:
+class OpcuaSource(RowSource):
     """Rows from nodes of a server, one for each change of a value.
 
     A row has the time at which the server's source saw the change, as a date. A value whose status
@@ -192,13 +192,6 @@ class OpcuaSource:
         if broken and not rows:
             raise DataError(f"OPC UA: {self._url}: the connection has broken down, see the log.")
         return rows
-
-    def position(self, waiting: Iterable[Any]) -> str:
-        """Return an empty position: the server does not repeat values."""
-        return ""
-
-    def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Do nothing: the server does not wait for acknowledgements."""
 
     def close(self) -> None:
         """Disconnect from the server."""

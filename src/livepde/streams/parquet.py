@@ -9,8 +9,14 @@ from typing import Any
 from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
 from livepde.streams.clock import Clock
-from livepde.streams.names import check_columns, no_file
-from livepde.streams.table import Column, DataTable, decimal_marks, tabulated
+from livepde.streams.table import (
+    Column,
+    DataTable,
+    check_columns,
+    decimal_marks,
+    no_file,
+    tabulated,
+)
 
 __all__ = ["read_parquet"]
 

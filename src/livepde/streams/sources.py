@@ -18,8 +18,7 @@ from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
 from livepde.streams.csvfile import UTF_8, too_wide
-from livepde.streams.names import no_file
-from livepde.streams.table import JSON_LINES
+from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = ["Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
 
@@ -51,7 +50,10 @@ class Row:
 
 
 class RowSource(Protocol):
-    """A source of rows as they arrive; used from one thread."""
+    """A source of rows as they arrive; used from one thread.
+
+    A subclass without a position, acknowledgements or resources takes the methods as they are here.
+    """
 
     @property
     def done(self) -> bool:
@@ -66,12 +68,15 @@ class RowSource(Protocol):
         A source created with it delivers those rows and all later ones; '' if the source itself
         remembers, or cannot go back.
         """
+        return ""
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
         """Acknowledge rows that have been kept for good, by their tokens."""
+        return
 
     def close(self) -> None:
         """Release its resources."""
+        return
 
 
 def json_row(text: str | bytes, token: Any = None) -> Row:
@@ -111,7 +116,7 @@ def _names(cells: list[str]) -> list[str]:
     return [name if cells.count(name) == 1 else "" for name in cells]
 
 
-class Follow:
+class Follow(RowSource):
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
     A line is read once its end has been written. A file that is replaced by another (rotated logs)
@@ -188,9 +193,6 @@ class Follow:
         here = (start for number, start in waiting if number == self._number)
         start = min(here, default=self._offset)
         return f"{start} {zlib.crc32(self._head[:start])}"
-
-    def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """A file does not need to hear it."""
 
     def close(self) -> None:
         """Close the file."""
@@ -286,7 +288,7 @@ class Follow:
         return [cell.strip() for cell in next(found, [])]
 
 
-class Lines:
+class Lines(RowSource):
     """JSON lines from standard input, or whatever gives lines; read in a thread of its own."""
 
     def __init__(self, lines: Iterable[str]) -> None:
@@ -319,18 +321,8 @@ class Lines:
         self._ended = None in lines
         return [json_row(line) for line in lines if line is not None]
 
-    def position(self, waiting: Iterable[Any]) -> str:
-        """Nothing can be asked for again."""
-        return ""
 
-    def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Nothing waits to hear it."""
-
-    def close(self) -> None:
-        """The thread ends with its lines."""
-
-
-class Rows:
+class Rows(RowSource):
     """Rows from a Python iterator of mappings, column -> value."""
 
     def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
@@ -348,13 +340,3 @@ class Rows:
             return [Row(values)]
         self._ended = True
         return []
-
-    def position(self, waiting: Iterable[Any]) -> str:
-        """Nothing can be asked for again."""
-        return ""
-
-    def acknowledge(self, tokens: Iterable[Any]) -> None:
-        """Nothing waits to hear it."""
-
-    def close(self) -> None:
-        """Nothing is held."""

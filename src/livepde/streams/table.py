@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 from collections import Counter
@@ -26,7 +27,6 @@ from livepde.streams.clock import (
     origin_at,
     read_times,
 )
-from livepde.streams.names import check_columns, hint, no_file
 
 __all__ = [
     "JSON_LINES",
@@ -35,7 +35,11 @@ __all__ = [
     "JsonLines",
     "cell_number",
     "channel_value",
+    "check_columns",
     "decimal_marks",
+    "hint",
+    "is_data",
+    "no_file",
     "read_json_lines",
     "row_time",
     "tabulated",
@@ -45,6 +49,8 @@ __all__ = [
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 STREAM = "standard input"
+MOST = 12  # names that are listed
+SHOWN = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".log", ".jsonl", ".ndjson", ".parquet")
 MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--", "---", "#n/a", "#nv"})
 
 
@@ -433,3 +439,39 @@ def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
     if set_back:
         remedy = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30+01:00."
     return TimeOrderError(f"{where}: the time is {how}; {remedy}")
+
+
+def check_columns(
+    where: str, needed: Iterable[str], known: list[str], *, told: bool = True
+) -> None:
+    """Raise `SampleError` if a column is not there; with `told` the error names those there are."""
+    for name in needed:
+        if name not in known:
+            ending = hint(name, known) if told else "."
+            raise SampleError(f"{where}: there is no column '{name}'{ending}")
+
+
+def is_data(path: Path) -> bool:
+    """Return whether a file is data by its name: a case may name any other file as its data."""
+    return path.suffix.lower() in SHOWN
+
+
+def hint(name: str, known: list[str]) -> str:
+    """Return the end of a sentence: the closest name, or all known names."""
+    close = difflib.get_close_matches(name, known, n=1)
+    if close:
+        return f"; did you mean '{close[0]}'?"
+    if not known:
+        return "."
+    return f"; there are {', '.join(known[:MOST])}{', ...' if len(known) > MOST else ''}."
+
+
+def no_file(path: Path) -> DataError:
+    """Return an error about a file that is not there, with those of its kind that are."""
+    if not path.parent.is_dir():
+        return DataError(f"there is no file '{path}': there is no folder '{path.parent}'.")
+    below = sorted(path.parent.glob(f"*/{path.name}"))
+    if below:
+        return DataError(f"there is no file '{path}'; did you mean '{below[0]}'?")
+    known = sorted(item.name for item in path.parent.glob(f"*{path.suffix}") if item.is_file())
+    return DataError(f"there is no file '{path}'{hint(path.name, known)}")

@@ -132,7 +132,8 @@ class Dictionary:
         # Offsets and drifts, in units of the noise, are the same at each sample.
         self._constant = np.zeros((observed.size, len(self)))
         for kind, size in (("offset", OFFSET), ("drift", OFFSET / DRIFT)):
-            self._constant[:, self.parts.get(kind, slice(0, 0))] = size * np.eye(observed.size)
+            if kind in self.parts:  # many sensors leave out kinds
+                self._constant[:, self.parts[kind]] = size * np.eye(observed.size)
         changing = [self._places(kind) for kind in self.kinds if kind not in ("offset", "drift")]
         self._changing: IntArray = np.concatenate([*changing, np.zeros(0, dtype=np.int64)])
 

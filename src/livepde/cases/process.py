@@ -1,19 +1,18 @@
-"""The process of a case: mesh, unknowns, boundary values, model."""
+"""Process of a case: equation with conditions and sources, unknowns, inputs, model."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_frame import Frame
-from livepde.cases.conditions import held
-from livepde.cases.instruments import unknowns_of
-from livepde.cases.limits import check_cells
+from livepde.cases.geometry import inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean
-from livepde.cases.regions import inside, sides_of, subdomain
-from livepde.cases.schema import EvolutionSpec, UnknownSpec
+from livepde.cases.schema import BoundarySpec, EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem import (
@@ -30,128 +29,13 @@ from livepde.fem import (
     RandomWalk,
     Scalar,
     Sobolev,
-    grid,
-    interval,
-    line,
     linear,
-    read_mesh,
-    rectangle,
 )
-from livepde.linalg import Array
 from livepde.model import Model
-from livepde.models import Option
+from livepde.models import Exchange, Flux, Fluxes, Option, Source, Variable, with_conditions
+from livepde.models.boundary_conditions import Amount
 
-__all__ = ["constants_of", "drive_notes", "mesh_of", "model_of", "options_of", "process_notes"]
-
-
-def mesh_of(frame: Frame) -> Any:
-    """Return the mesh of a case: from a file, or a line or rectangle of nodes or cells."""
-    spec, unit = frame.spec.mesh, frame.equation.length_unit
-    if spec.file is not None:
-        scale = conversion(spec.unit or unit, unit, frame.where("mesh.unit")).factor
-        with frame.located("mesh.file", SpaceError):
-            return read_mesh(frame.path.parent / spec.file, scale)
-    if spec.nodes is not None:
-        nodes = [frame.convert(node, unit, "mesh.nodes") for node in spec.nodes]
-        with frame.located("mesh.nodes", SpaceError):
-            return line(nodes)
-    if spec.x is not None and spec.y is not None:
-        return _rectangle(frame, spec.x, spec.y)
-    return _interval(frame)
-
-
-def _rectangle(frame: Frame, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
-    """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
-    spec, unit = frame.spec.mesh, frame.equation.length_unit
-    sides = (
-        [frame.convert(node, unit, "mesh.x") for node in x],
-        [frame.convert(node, unit, "mesh.y") for node in y],
-    )
-    if not isinstance(spec.cells, tuple):
-        check_cells(float(len(sides[0])) * len(sides[1]), frame.where("mesh"))
-        with frame.located("mesh", SpaceError):
-            return grid(*sides)
-    check_cells(float(spec.cells[0]) * spec.cells[1], frame.where("mesh.cells"))
-    with frame.located("mesh", SpaceError):
-        if isinstance(spec.spacing, tuple):
-            return _graded(frame, sides, spec.cells, [one == "geometric" for one in spec.spacing])
-        (x0, x1), (y0, y1) = sides
-        return rectangle((x0, x1), (y0, y1), spec.cells)
-
-
-def _interval(frame: Frame) -> Any:
-    """Return an interval of cells, with nodes at the ends of layers."""
-    spec, unit = frame.spec.mesh, frame.equation.length_unit
-    cells: Any = spec.cells  # the schema allows only a number here
-    check_cells(cells, frame.where("mesh.cells"))
-    start = frame.convert(spec.start, unit, "mesh.from")
-    stop = frame.convert(spec.stop, unit, "mesh.to")
-    if not start < stop:
-        raise frame.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
-    geometric = spec.spacing == "geometric"
-    _check_graded(frame, start, geometric)
-    # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
-    # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
-    plain = interval(start, stop, cells, geometric=geometric)
-    edges = [edge for _, edge in layer_edges(frame)]
-    through = _fitted(plain.p[0], edges)
-    mesh = interval(start, stop, cells, geometric=geometric, through=through)
-    own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
-    return line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
-
-
-def _graded(
-    frame: Frame, sides: Iterable[Sequence[float]], cells: Iterable[int], graded: Iterable[bool]
-) -> Any:
-    """Return a rectangle with geometric or uniform spacing along each side."""
-    nodes = []
-    for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
-        _check_graded(frame, start, geometric)
-        nodes.append(interval(start, stop, number, geometric=geometric).p[0])
-    return grid(*nodes)
-
-
-def _check_graded(frame: Frame, start: float, geometric: bool) -> None:
-    if geometric and not start > 0:
-        raise frame.error("mesh.spacing", "'geometric' needs from > 0.")
-
-
-def layer_edges(frame: Frame) -> list[tuple[str, float]]:
-    """Return the ends of layers of an interval, of unknowns and of sources, each with its name."""
-    given: list[tuple[str, str, Any]] = [
-        (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
-        for name, unknown in frame.spec.unknowns.items()
-        for layer, item in (unknown.regions or {}).items()
-    ]
-    given += [
-        (f"source '{name}'", f"sources.{name}.over", item.over)
-        for name, item in frame.spec.sources.items()
-    ]
-    unit = frame.equation.length_unit
-    return [
-        (what, edge)
-        for what, key, over in given
-        if isinstance(over, tuple) and len(over) == 2
-        for edge in frame.pair(over, unit, key)
-    ]
-
-
-def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
-    """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
-    # The ends of the mesh stay where they are.
-    inner = nodes[1:-1]
-    found: dict[int, float] = {}
-    for edge in edges:
-        if len(inner) and _inside(nodes, edge):
-            found.setdefault(int(np.abs(inner - edge).argmin()), edge)
-    return list(found.values())
-
-
-def _inside(nodes: Array, edge: float) -> bool:
-    """Return whether an edge lies between the ends of a mesh, and not on them."""
-    # Conversion of units rounds, so that an end of the mesh may seem to lie just inside of it.
-    slack = 1e-6 * float(np.ptp(nodes))
-    return bool(nodes.min() + slack < edge < nodes.max() - slack)
+__all__ = ["conditioned", "drive_notes", "held", "model_of", "options_of", "process_notes"]
 
 
 def options_of(frame: Frame) -> dict[str, Any]:
@@ -178,8 +62,8 @@ def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
     if not isinstance(value, option.kind):
         kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
         raise frame.error(key, f"got {value!r}; expected {kind}.")
-    if option.choices and value not in option.choices:
-        raise frame.error(key, f"got '{value}'; {did_you_mean(str(value), option.choices)}")
+    if option.choices:
+        frame.require(str(value), option.choices, key, f"got '{value}'")
     return value
 
 
@@ -187,7 +71,7 @@ def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
     """Return the model of a case; raises `CaseError` on missing or superfluous parts."""
     inputs = frame.roles("input")
     frame.only(inputs, frame.equation.inputs, "channels (role input)")
-    constants = constants_of(frame)
+    constants = frame.constants
     given = {*inputs, *constants}
     for name, variable in frame.equation.inputs.items():
         if name not in given and not variable.optional:
@@ -222,19 +106,6 @@ def _check_inputs(frame: Frame, model: Model, given: set[str], constants: Iterab
             raise frame.error(f"inputs.{name}", text)
 
 
-def constants_of(frame: Frame) -> dict[str, float]:
-    """Return the inputs of the equation that are constants, in its units."""
-    known, given = frame.equation.inputs, frame.spec.inputs
-    frame.only(given, known, "inputs")
-    for name in given:
-        if name in frame.spec.channels:
-            raise frame.error(f"inputs.{name}", f"there is a channel '{name}', too; keep one.")
-    return {
-        name: frame.convert(value, known[name].unit, f"inputs.{name}")
-        for name, value in given.items()
-    }
-
-
 def _without_input(frame: Frame, name: str, what: str) -> CaseError:
     text = f"{what}, with role = 'input'; or a constant, inputs.{name}."
     return frame.missing(f"channels.{name}", text)
@@ -245,13 +116,11 @@ def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
     known = [*(mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
     for name, value in held(frame).items():
-        if name not in known:
-            raise frame.error("boundary", f"no boundary '{name}'; {did_you_mean(name, known)}")
+        frame.require(name, known, "boundary", f"no boundary '{name}'")
         values[name] = value
     for name, channel in frame.roles("boundary").items():
         key, at = f"channels.{name}.at", str(channel.at)
-        if at not in known:
-            raise frame.error(key, f"no boundary '{at}'; {did_you_mean(at, known)}")
+        frame.require(at, known, key, f"no boundary '{at}'")
         if at in values:
             raise frame.error(key, f"the boundary '{at}' has a value already; keep one.")
         values[at] = Channel(name)
@@ -271,24 +140,21 @@ def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
 def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
     """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
     key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
-    options = _options_of(frame, spec, unit, key)
-    if spec.field:
-        with frame.located(key, SpaceError):
-            return _field(frame, mesh, spec, name, options)
-    if spec.regions is None:
-        with frame.located(key, SpaceError):
-            return Scalar(**options)
-    places = {region: item.over for region, item in spec.regions.items()}
-    regions = _regions(frame, mesh, places, f"{key}.regions")
-    # A region may state a prior of its own; the others share that of the unknown.
-    own = {}
-    for region, item in spec.regions.items():
-        if (there := spec.at(item)) is not None:
-            where = f"{key}.regions.{region}"
-            given = _options_of(frame, there, unit, where)
-            with frame.located(where, SpaceError):
-                own[region] = Scalar(**given)
     with frame.located(key, SpaceError):
+        options = _options_of(frame, spec, unit, key)
+        if spec.field:
+            return _field(frame, mesh, spec, name, options)
+        if spec.regions is None:
+            return Scalar(**options)
+        places = {region: item.over for region, item in spec.regions.items()}
+        regions = _regions(frame, mesh, places, f"{key}.regions")
+        # A region may state a prior of its own; the others share that of the unknown.
+        own = {}
+        for region, item in spec.regions.items():
+            if (there := spec.at(item)) is not None:
+                where = f"{key}.regions.{region}"
+                with frame.located(where, SpaceError):
+                    own[region] = Scalar(**_options_of(frame, there, unit, where))
         return Piecewise(regions, **options, own=own)
 
 
@@ -329,8 +195,7 @@ def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
             raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
-        with frame.located(key, SpaceError):
-            return Normal(prior, std, (low, high))
+        return Normal(prior, std, (low, high))
     return _transformed(frame, spec.transform, prior, std, (low, high), key)
 
 
@@ -348,9 +213,7 @@ def _transformed(
     if not low < median < high:
         text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
         raise frame.error(key, text + "inside of the bounds.")
-    distribution = LogNormal if transform == "log" else LogitNormal
-    with frame.located(key, SpaceError):
-        return distribution(median, std, (low, high))
+    return (LogNormal if transform == "log" else LogitNormal)(median, std, (low, high))
 
 
 def _evolution(
@@ -372,10 +235,8 @@ def _field(
     frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
 ) -> Field:
     # Default correlation length: a third of the extent along x.
-    length = float(np.ptp(mesh.p[0])) / 3
-    if spec.length is not None:
-        unit = frame.equation.length_unit
-        length = frame.positive(spec.length, unit, f"unknowns.{name}.length")
+    third, key = float(np.ptp(mesh.p[0])) / 3, f"unknowns.{name}.length"
+    length = frame.positive(spec.length, frame.equation.length_unit, key, third)
 
     # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
     # pointwise variance of H^1 would be infinite, so that it takes H^2.
@@ -470,19 +331,127 @@ def process_notes(frame: Frame, mesh: Any) -> list[str]:
             "The mesh is uniform, with cells too large at the left end, where "
             f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
         )
-    if len(mesh.p) == 1 and spec.file is None and (crossed := _off_nodes(frame, mesh.p[0])):
+    if len(mesh.p) == 1 and spec.file is None and (crossed := off_nodes(frame, mesh.p[0])):
         remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
         found.append(f"{names[0].upper()}{names[1:]} {end} inside of a cell: {remedy}.")
     return found
 
 
-def _off_nodes(frame: Frame, nodes: Array) -> list[str]:
-    """Return the names of layers and sources with an end inside of a cell."""
-    within = 1e-6 * np.ptp(nodes)
-    crossed = dict.fromkeys(
-        what
-        for what, edge in layer_edges(frame)
-        if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
-    )
-    return list(crossed)
+def held(frame: Frame) -> dict[str, Any]:
+    """Return boundary -> fixed value of the state."""
+    found, unit = {}, frame.equation.state.unit
+    for name, given in frame.spec.boundary.items():
+        if given.value is not None:
+            found[name] = frame.convert(given.value, unit, f"boundary.{name}")
+    return found
+
+
+def conditioned(frame: Frame) -> Frame:
+    """Return the frame whose equation has the fluxes and sources of the case, and their names."""
+    spec, equation = frame.spec, frame.equation
+    given = {name: item for name, item in spec.boundary.items() if item.passes}
+    if not (given or spec.sources):
+        return frame
+    units = equation.fluxes
+    if units is None:
+        key = f"boundary.{next(iter(given))}" if given else f"sources.{next(iter(spec.sources))}"
+        text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
+        raise frame.error(key, text + "'livepde equations' tells which ones do.")
+    names = _Names(frame)
+    boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
+    sources = {
+        name: (names.amount(item.value, units.source, f"sources.{name}.value"), item.over)
+        for name, item in spec.sources.items()
+    }
+    base = equation.build
+
+    def build(
+        mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
+    ) -> Model:
+        # The equation gets its own unknowns; those that fluxes and sources name are added
+        # afterwards.
+        own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
+        more = {name: item for name, item in unknowns.items() if name in names.unknowns}
+        for name in boundary:
+            frame.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
+        placed = {
+            name: Source(amount, None if over is None else _place(frame, mesh, over, name))
+            for name, (amount, over) in sources.items()
+        }
+        model = base(mesh, own, dirichlet, **options)
+        with frame.located("boundary", ModelError):
+            return with_conditions(model, boundary, placed, more)
+
+    unknowns = {**equation.unknowns, **names.unknowns}
+    inputs = {**equation.inputs, **names.inputs}
+    changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
+    return replace(frame, equation=changed)
+
+
+def _passing(names: _Names, units: Fluxes, name: str, given: BoundarySpec) -> list[Flux | Exchange]:
+    """Return the flux through a boundary."""
+    found: list[Flux | Exchange] = []
+    key = f"boundary.{name}"
+    if given.flux is not None:
+        found.append(Flux(names.amount(given.flux, units.flux, f"{key}.flux")))
+    if given.transfer is not None and given.ambient is not None:
+        # Robin condition: D u_n = h (ambient - u).
+        h = names.amount(given.transfer, units.transfer, f"{key}.transfer")
+        unit = names.frame.equation.state.unit
+        found.append(Exchange(h, names.amount(given.ambient, unit, f"{key}.ambient")))
+    return found
+
+
+@dataclass
+class _Names:
+    """Unknowns and channels that the conditions of a case name, with their units."""
+
+    frame: Frame
+    unknowns: dict[str, Variable] = field(default_factory=dict)
+    inputs: dict[str, Variable] = field(default_factory=dict)
+
+    def amount(self, value: float | str, unit: str, key: str) -> Amount:
+        """Return a number in the model's unit, a channel, or the name of an unknown."""
+        spec = self.frame.spec
+        if isinstance(value, str) and value in spec.unknowns:
+            self._named(self.unknowns, self.frame.equation.unknowns, value, unit, key)
+            return value
+        if isinstance(value, str) and value in spec.channels:
+            if spec.channels[value].role != "input":
+                raise self.frame.error(key, f"the channel '{value}' has to be of role 'input'.")
+            self._named(self.inputs, self.frame.equation.inputs, value, unit, key)
+            return Channel(value)
+        # Text without a digit is no quantity: a name was meant.
+        if isinstance(value, str) and not any(letter.isdigit() for letter in value):
+            text = f"there is no unknown and no channel '{value}'; "
+            text += did_you_mean(value, [*spec.unknowns, *spec.channels])
+            raise self.frame.error(key, text)
+        return self.frame.convert(value, unit, key)
+
+    def _named(
+        self,
+        found: dict[str, Variable],
+        taken: Mapping[str, Variable],
+        name: str,
+        unit: str,
+        key: str,
+    ) -> None:
+        # Several conditions may share a name, if it has the same unit in all of them.
+        before, own = found.get(name) or taken.get(name), name in taken
+        clash = own and found is self.unknowns
+        if before is not None and (clash or before.unit != unit):
+            text = f"'{name}' is the {before.text} [{before.unit}] already; take another name."
+            raise self.frame.error(key, text)
+        found.setdefault(name, Variable(unit, key.removeprefix("boundary.").replace(".", ", ")))
+
+
+def _place(frame: Frame, mesh: Any, over: Any, name: str) -> Any:
+    """Return the region of a source: the name of a subdomain, or a predicate on x."""
+    key = f"sources.{name}.over"
+    if isinstance(over, str):
+        return subdomain(frame, mesh, over, key)
+    place = inside(frame, over, len(mesh.p), key)
+    if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
+        raise frame.error(key, "holds no cell of the mesh.")
+    return place

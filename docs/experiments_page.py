@@ -1,9 +1,10 @@
-"""Make docs/gallery/experiments.md, with: python docs/experiments.py [NAME ...].
+"""Make docs/gallery/experiments.md, with: python docs/experiments_page.py [NAME ...].
 
-Runs what `livepde reproduce` knows, `python -m benchmarks control`, the scripts of experiments/ and
-the programs of examples/, each by the name of its experiment or file; without names all of them,
-which takes hours. What they print and draw is kept in docs/gallery/experiments/, and the page is
-made of all that is there. `--draw` runs nothing. The data of the cases are read from $LIVEPDE_DATA.
+Runs what `livepde reproduce` knows, the studies and scripts of experiments/, `python -m benchmarks
+control`, and the programs of examples/, each by the name of its experiment or file; without names
+all of them, which takes hours. What they print and draw is kept in docs/gallery/experiments/, and
+the page is made of all that is there. `--draw` runs nothing. The data of the cases are read from
+$LIVEPDE_DATA.
 """
 
 from __future__ import annotations
@@ -41,13 +42,21 @@ HEAD = """\
 
 What the paper shows, what follows from it, and what needs the truth or hindsight, which the library
 must never see. Each with its figure, its table and its command. Written by `python
-docs/experiments.py`. The cases on data of others have [a page of their own](gallery.md).
+docs/experiments_page.py`. The cases on data of others have [a page of their own](gallery.md).
 """
-BENCHES = ("control",)  # benchmarks that draw
+COMMANDS = {  # what draws, and checks its numbers -> how it is run
+    **dict.fromkeys(EXPERIMENTS, "livepde reproduce"),
+    **dict.fromkeys(
+        ("seed-excited-noise", "degenerate", "dimensions", "relatives", "exact"),
+        "python -m experiments",
+    ),
+    "control": "python -m benchmarks",
+}
 PARTS = {
-    "reproduce": "Published and stated experiments; commands and tests check their bounds.",
+    "reproduce": "Published experiments; commands and tests check their bounds.",
+    "studies": "What follows from the paper; commands and tests check their bounds.",
     "benchmarks": "What is held against others; the page of the benchmark has more.",
-    "experiments": "Scripts that use the truth or hindsight. A dot is a number of the table below.",
+    "scripts": "They use the truth or hindsight. A dot is a number of the table below.",
     "examples": "Programs to start from.",
 }
 
@@ -160,21 +169,21 @@ def _rows(sketch: Sketch, text: str) -> Iterator[dict[str, str]]:
 def run(name: str) -> None:
     """Run one experiment, script or example, and keep what it printed and drew."""
     sys.stderr.write(f"runs: {name}\n")
-    if name in EXPERIMENTS:
+    if name == "control":
         with tempfile.TemporaryDirectory() as folder:
-            out = Path(folder) / "run"
-            command = [sys.executable, "-m", "livepde", "reproduce", name, "--out", str(out)]
-            subprocess.run(command, check=False)  # a bound that is missed is said in the report
-            keep(name, out, (out / "report.md").read_text(encoding="utf-8"))
-        return
-    if name in BENCHES:
-        with tempfile.TemporaryDirectory() as folder:
-            content = printed([name, *OPTIONS.get(name, ()), "--draw", folder, "--json"])
+            content = printed([name, *OPTIONS[name], "--draw", folder, "--json"])
             keep(name, Path(folder), report(content["command"], content))
         return
-    script = scripts()[name]
-    command = [sys.executable, str(script), *OPTIONS.get(name, ())]
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    if name in COMMANDS:
+        with tempfile.TemporaryDirectory() as folder:
+            out = Path(folder) / "run"
+            words = [*COMMANDS[name].removeprefix("python -m ").split(), name, "--out", str(out)]
+            # A bound that is missed is said in the report.
+            subprocess.run([sys.executable, "-m", *words], cwd=PROJECT, check=False)
+            keep(name, out, (out / "report.md").read_text(encoding="utf-8"))
+        return
+    command = [sys.executable, *_script_command(scripts()[name])]
+    done = subprocess.run(command, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=True)
     (KEPT / f"{name}.txt").write_text(done.stdout, encoding="utf-8")
 
 
@@ -200,8 +209,16 @@ def scripts() -> dict[str, Path]:
     return {
         path.stem: path
         for folder in ("experiments", "examples")
-        for path in sorted((PROJECT / folder).glob("*.py"))
+        for path in sorted((PROJECT / folder).glob("[!_]*.py"))
+        if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
     }
+
+
+def _script_command(path: Path) -> list[str]:
+    """Return the arguments of Python that run a script or an example."""
+    module = ["-m", f"experiments.{path.stem}"]
+    where = module if path.parent.name == "experiments" else [f"examples/{path.name}"]
+    return [*where, *OPTIONS.get(path.stem, ())]
 
 
 def page() -> str:
@@ -209,12 +226,19 @@ def page() -> str:
     files = scripts()
     parts = [HEAD]
     for title, words in PARTS.items():
-        names = [name for name, path in files.items() if path.parent.name == title]
-        names = {"reproduce": [*EXPERIMENTS], "benchmarks": [*BENCHES]}.get(title, names)
+        names = [name for name in (*COMMANDS, *files) if _part(name, files) == title]
         kept = [name for name in names if _kept(name).exists()]
         parts += [f"## {title.capitalize()}\n\n{words}\n"] if kept else []
         parts += [_script(files[name]) if name in files else _report(name) for name in kept]
     return "\n".join(parts)
+
+
+def _part(name: str, files: dict[str, Path]) -> str:
+    """Return the part of the page that an experiment, script or example stands in."""
+    folder = files[name].parent.name if name in files else COMMANDS[name].split()[-1]
+    if folder != "experiments":
+        return folder
+    return "scripts" if name in files else "studies"
 
 
 def _kept(name: str) -> Path:
@@ -229,8 +253,7 @@ def _report(name: str) -> str:
     rest = re.sub(r"^!\[.*\]\(.*\)$\n?", "", rest, flags=re.MULTILINE)
     shown = [f"![{Path(one).stem}](experiments/{one})" for one in pictures]
     rest = re.sub(r"^## (.*)$", r"**\1**", rest, flags=re.MULTILINE)
-    kind = "python -m benchmarks" if name in BENCHES else "livepde reproduce"
-    command = " ".join([kind, name, *OPTIONS.get(name, ())])
+    command = " ".join([COMMANDS[name], name, *OPTIONS.get(name, ())])
     lines = [f"### {name}", f"`{command}`", *shown, rest.strip()]
     if title != command:
         lines.insert(1, title)
@@ -242,8 +265,7 @@ def _script(path: Path) -> str:
     about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     printed = _kept(path.stem).read_text(encoding="utf-8")
     lines = [f"### {path.stem}", about.split("\n\n")[0]]
-    command = ["python", f"{path.parent.name}/{path.name}", *OPTIONS.get(path.stem, ())]
-    lines.append(f"`{' '.join(command)}`")
+    lines.append(f"`{' '.join(['python', *_script_command(path)])}`")
     if (picture := drawn(path.stem, printed)) is not None:
         target = KEPT / f"{path.stem}.png"
         picture.savefig(target, dpi=120)
@@ -256,7 +278,7 @@ def _script(path: Path) -> str:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run what is named, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    known = [*EXPERIMENTS, *BENCHES, *scripts()]
+    known = [*COMMANDS, *scripts()]
     parser.add_argument("names", nargs="*", choices=[[], *known], metavar="NAME")
     parser.add_argument("--draw", action="store_true", help="run nothing")
     chosen = parser.parse_args(arguments)

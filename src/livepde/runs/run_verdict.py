@@ -1,7 +1,8 @@
-"""Findings from the dataset and the journal of a run, beside those of the law."""
+"""Verdict of a run: findings from its dataset and its journal, beside those of its law."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -9,16 +10,37 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.dates import when
+from livepde.linalg import Array
 from livepde.plots.dataset import field_names, note, prior_left, scalars
-from livepde.runs.summary import digits, jumps
-from livepde.verdict import FLAT, REFINE, Finding, Severity, Shifts, at_bound, discretised, flat
+from livepde.runs.outcome import Table
+from livepde.runs.summary import digits, jumps, shown
+from livepde.verdict import (
+    FLAT,
+    MOST,
+    REFINE,
+    Finding,
+    Severity,
+    Shifts,
+    Verdict,
+    at_bound,
+    discretised,
+    flat,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.runs.journal import Journal
 
-__all__ = ["findings_of", "input_findings"]
+__all__ = [
+    "doubts",
+    "findings_of",
+    "input_findings",
+    "severities",
+    "unexplained",
+    "verdict",
+    "verdict_table",
+]
 
 MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
 LEFT = 1.0  # standard deviations between estimate and reference after the last replay
@@ -101,10 +123,9 @@ def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Findi
 
 def _model_error(data: xr.Dataset) -> list[Finding]:
     """Return whether innovations are too large, for runs whose law has not judged them itself."""
-    ratios = note(data, "innovation_ratio")
-    if ratios is None or not len(ratios) or ratios[-1] <= MODEL_ERROR:
+    ratio = _last(data, "innovation_ratio")
+    if not ratio > MODEL_ERROR:
         return []
-    ratio = float(ratios[-1])
     text = (
         "The model does not explain the data: the sensors miss what is expected of them by "
         f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
@@ -115,14 +136,11 @@ def _model_error(data: xr.Dataset) -> list[Finding]:
 
 
 def _replays(data: xr.Dataset) -> list[str]:
-    left = note(data, "replay_left")
-    if left is None:
-        return []
-    left = left[np.isfinite(left)]
-    if not len(left) or left[-1] <= LEFT:
+    left = _last_known(data, "replay_left")
+    if not left > LEFT:
         return []
     return [
-        f"The last replay has not converged: estimate and reference are {left[-1]:.1f} standard "
+        f"The last replay has not converged: estimate and reference are {left:.1f} standard "
         "deviations apart, so that the intervals do not hold. Give law.replay more iterations, let "
         "it begin later (first), or start from a better prior."
     ]
@@ -158,15 +176,14 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
 
 def _held(data: xr.Dataset) -> list[str]:
     """Return whether latent values were held at `within` prior standard deviations."""
-    counts = note(data, "bounded")
-    if counts is None or not (counts > 0.0).any():
+    at = _times(data, "bounded")
+    if not len(at):
         return []
-    at = np.flatnonzero(counts > 0.0)
-    last = when(data, float(data["time"][at[-1]]))
     return [
-        f"In {len(at)} samples, last at {last}, the data asked for unknowns farther from the prior "
-        "than its standard deviation allows (within, by default 10 of them), and they were held "
-        "there: the prior is much too narrow, or a unit, a sensor or the model is wrong."
+        f"In {len(at)} samples, last at {when(data, at[-1])}, the data asked for unknowns farther "
+        "from the prior than its standard deviation allows (within, by default 10 of them), and "
+        "they were held there: the prior is much too narrow, or a unit, a sensor or the model "
+        "is wrong."
     ]
 
 
@@ -200,17 +217,16 @@ def _jumps(data: xr.Dataset) -> list[str]:
             f"{label} from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
             for label, (before, after, std) in jump.moved.items()
         ]
-        if went:
-            found.append(
-                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
-                f"allowed to move; since then {', '.join(went)}."
+        since = f"; since then {', '.join(went)}."
+        if not went:
+            since = (
+                ", but no number has changed for good: a passing disturbance, or a change that the "
+                "model does not know."
             )
-        else:
-            found.append(
-                f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
-                "allowed to move, but no number has changed for good: a passing disturbance, or "
-                "a change that the model does not know."
-            )
+        found.append(
+            f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
+            f"allowed to move{since}"
+        )
     if len(alarms) > MOST_JUMPS:
         found.append(
             f"{len(alarms) - MOST_JUMPS} more jumps: the unknowns may rather move all the time "
@@ -220,12 +236,8 @@ def _jumps(data: xr.Dataset) -> list[str]:
 
 
 def _guards(data: xr.Dataset) -> list[str]:
-    def times(name: str) -> Any:
-        values = note(data, name)
-        return data["time"].values[[] if values is None else values == 1.0]
-
-    tempered, held = times("tempered"), times("held")
-    restarted, runaway = times("restarted"), times("runaway")
+    tempered, held = _times(data, "tempered"), _times(data, "held")
+    restarted, runaway = _times(data, "restarted"), _times(data, "runaway")
     found = []
     if len(tempered) or len(held):
         found.append(
@@ -251,64 +263,52 @@ def _guards(data: xr.Dataset) -> list[str]:
 
 def _rests(data: xr.Dataset) -> list[str]:
     """Return when the gradient law held the unknowns because nothing excited them."""
-    noted = note(data, "at_rest")
-    if noted is None:
+    times, at, nothing = data["time"].values, _times(data, "at_rest"), "Nothing but noise excited"
+    if not len(at):
         return []
-    held = noted == 1.0
+    if at[-1] < times[-1]:
+        last = when(data, at[-1])
+        return [
+            f"{nothing} the unknowns in {len(at)} samples, last at {last}: they were held then."
+        ]
     # The first sample of each period in which the unknowns were held.
-    begin = np.flatnonzero(held & ~np.append(False, held[:-1]))
-    if held[-1]:
-        at = when(data, float(data["time"][begin[-1]]))
-        found = f"Nothing but noise excited the unknowns from {at} on: they were held"
-        earlier = len(begin) - 1
-        return [f"{found}, as {earlier} times before." if earlier else f"{found}."]
-    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
-    return [
-        f"Nothing but noise excited the unknowns in {held.sum()} samples, last at {last}: they "
-        "were held then."
-    ]
+    held = np.isin(times, at)
+    begin = times[held & ~np.append(False, held[:-1])]
+    found = f"{nothing} the unknowns from {when(data, begin[-1])} on: they were held"
+    return [f"{found}, as {len(begin) - 1} times before." if len(begin) > 1 else f"{found}."]
 
 
 def _lost(data: xr.Dataset) -> list[str]:
     """Return where a gradient law could not learn from a sample, because no step converged."""
-    noted = note(data, "held")
-    if noted is None:
+    at = _times(data, "held")
+    if not len(at):
         return []
-    held = noted == 1.0
-    last = when(data, float(data["time"][np.flatnonzero(held)[-1]]))
     return [
-        f"In {held.sum()} samples, last at {last}, no step converged with the unknowns: they were "
-        "held, and the state went on. Look at sensors and noise level then."
+        f"In {len(at)} samples, last at {when(data, at[-1])}, no step converged with the "
+        "unknowns: they were held, and the state went on. Look at sensors and noise level then."
     ]
 
 
 def _drifts(data: xr.Dataset) -> list[str]:
     """Return whether the members of a bank with drifting unknowns had most weight for long."""
-    weights = note(data, "drifting")
-    if weights is None:
+    at = _times(data, "drifting", BELIEVED)
+    if not len(at) > DRIFTING * data.sizes["time"]:
         return []
-    drifting = weights > BELIEVED
-    if not drifting.mean() > DRIFTING:
-        return []
-    last = when(data, float(data["time"][np.flatnonzero(drifting)[-1]]))
     return [
-        f"In {drifting.sum()} samples, last at {last}, the data spoke for unknowns that drift, "
-        "which also a model with errors looks like. If they cannot, do not trust these estimates: "
-        "take kind = 'sensitivity' with replay = true, or mend the model; if they can, give them "
-        "an evolution."
+        f"In {len(at)} samples, last at {when(data, at[-1])}, the data spoke for unknowns that "
+        "drift, which also a model with errors looks like. If they cannot, do not trust these "
+        "estimates: take kind = 'sensitivity' with replay = true, or mend the model; if they "
+        "can, give them an evolution."
     ]
 
 
 def _departure(data: xr.Dataset) -> list[str]:
     """Return whether estimates have left the prior, for laws that do not judge innovations."""
-    ratios = note(data, "departure")
-    if ratios is None:
-        return []
-    ratios = ratios[np.isfinite(ratios)]
-    if not len(ratios) or ratios[-1] <= LEAVES:
+    ratio = _last_known(data, "departure")
+    if not ratio > LEAVES:
         return []
     return [
-        f"The unknowns have left their prior: they are {math.sqrt(ratios[-1]):.1f} times as far "
+        f"The unknowns have left their prior: they are {math.sqrt(ratio):.1f} times as far "
         "from it as a right model gets in one of a million cases. Do not trust them: the data "
         "disagree with the model by more than their noise, and the unknowns take it up; or the "
         "prior is too narrow. Take kind = 'sensitivity', refine the mesh and the steps, state a "
@@ -330,6 +330,20 @@ def _last(data: xr.Dataset, name: str) -> float:
     """Return the last value of a diagnostic, NaN without."""
     values = note(data, name)
     return math.nan if values is None else float(values[-1])
+
+
+def _last_known(data: xr.Dataset, name: str) -> float:
+    """Return the last finite value of a note, NaN without."""
+    values = note(data, name)
+    known = np.empty(0) if values is None else values[np.isfinite(values)]
+    return float(known[-1]) if len(known) else math.nan
+
+
+def _times(data: xr.Dataset, name: str, more: float = 0.0) -> Array:
+    """Return the times of the samples whose note is larger than a number."""
+    values = note(data, name)
+    found: Array = data["time"].values[[] if values is None else values > more]
+    return found
 
 
 def _gain(data: xr.Dataset) -> list[str]:
@@ -359,3 +373,48 @@ def _wanders(values: np.ndarray[Any, Any]) -> bool:
     scatter = np.sqrt((left**2).sum(axis=1).mean())
     size = np.linalg.norm(late.mean(axis=0))
     return bool(scatter > WANDERS * learned and scatter > RESTS * size)
+
+
+def verdict(data: xr.Dataset) -> Verdict:
+    """Return the verdict of a run: of its law (`Estimate.verdict`), and findings of its dataset.
+
+    The law's verdict is read from the attribute `verdict` of the dataset.
+    """
+    stored = data.attrs.get("verdict")
+    own = Verdict.from_dict(json.loads(stored)) if stored else Verdict.unjudged()
+    if not data.sizes["time"]:
+        return own
+    judged = not any(text.startswith(("innovations", "everything")) for text in own.untested)
+    return own.with_findings(findings_of(data, judged=judged))
+
+
+def verdict_table(found: Verdict) -> Table:
+    """Return a verdict as a table: its level, and a row for each finding."""
+    rows = [
+        (
+            finding.severity,
+            finding.what,
+            finding.subject or "–",
+            shown(finding.evidence, ".2g"),
+            finding.measure,
+            "; ".join(cause.text for cause in finding.causes[:2]) or "–",
+        )
+        for finding in found.findings[:MOST]
+    ]
+    columns = ("severity", "finding", "of", "evidence", "measure", "likely causes")
+    return Table(f"Verdict: {found.level}", columns, rows)
+
+
+def doubts(data: xr.Dataset) -> list[str]:
+    """Return all findings that speak against trusting the estimates, as sentences, each once."""
+    return list(dict.fromkeys(finding.sentence for finding in verdict(data).findings))
+
+
+def severities(data: xr.Dataset) -> dict[str, Severity]:
+    """Return the severity of each sentence of `doubts`."""
+    return {finding.sentence: finding.severity for finding in verdict(data).findings}
+
+
+def unexplained(data: xr.Dataset) -> bool:
+    """Return whether a run says that its model does not explain the data."""
+    return any(finding.what == "misfit" for finding in verdict(data).findings)

@@ -1,13 +1,19 @@
-"""Logs of a live run: as text, or as lines of JSON for those who collect them."""
+"""Standard streams of a live run: its log, and its estimates as lines of JSON."""
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import time
+from contextlib import suppress
+from typing import TextIO
 
 from livepde.errors import RunError
+from livepde.result import Estimate
+from livepde.runs.live_loop import Sink
 
-__all__ = ["configure"]
+__all__ = ["JsonLinesSink", "configure"]
 
 
 def configure(kind: str = "text", level: int = logging.INFO) -> None:
@@ -46,3 +52,32 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     logging.getLogger("livepde").setLevel(level)
     # asyncua logs each lost connection with a traceback; livepde.opcua logs it in one line.
     logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+
+
+class JsonLinesSink(Sink):
+    """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def put(self, estimate: Estimate) -> None:
+        """Write one estimate.
+
+        Raises
+        ------
+        OSError
+            Nobody reads the stream any more, or its disk is full.
+        """
+        line = json.dumps(estimate.to_dict(), allow_nan=False)
+        try:
+            print(line, file=self._stream, flush=True)
+        except OSError:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Redirect the stream to the null device: flushing its buffer at exit would fail again."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        with suppress(OSError):
+            os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)

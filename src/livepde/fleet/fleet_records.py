@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.errors import ConfigurationError
+from livepde.fleet.engines import Beliefs, Factors
 from livepde.fleet.estimate import FleetEstimate
-from livepde.fleet.steppers import Beliefs, Factors
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.records import STATUS_CODES, Record, Snapshot

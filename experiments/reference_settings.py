@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.reproduce.reference import Setting
+from experiments.reference import Setting
 
 __all__ = ["FULL", "PAPER", "SETTINGS", "TWIN", "VARYING", "scaled"]
 

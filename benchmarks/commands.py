@@ -1,0 +1,193 @@
+"""Programs of measurements: each command is a function that returns an outcome."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+import typer
+
+from livepde.cli.experiments import conducted
+from livepde.cli.options import JsonOption
+from livepde.cli.printing import named, report_outcome
+from livepde.runs.outcome import Outcome
+
+__all__ = ["Count", "Program", "Workers", "chosen", "several"]
+
+Measurement: TypeAlias = Callable[..., Outcome]
+
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Keep dataset and figures in a new run directory.", show_default=False),
+]
+Workers = Annotated[
+    int | None, typer.Option(min=1, help="Processes, default one for each processor.")
+]
+
+
+@dataclass(frozen=True)
+class Count:
+    """Declaration of a whole number, as `Annotated[int, Count(...)]`.
+
+    Attributes
+    ----------
+    usual, quick
+        Values if the option is not given: without and with --quick.
+    help
+        Meaning of the number.
+    least
+        Smallest value.
+    """
+
+    usual: int
+    quick: int
+    help: str
+    least: int = 1
+
+    @property
+    def option(self) -> Any:
+        """The option of the command line."""
+        return typer.Option(min=self.least, help=f"{self.help} With --quick {self.quick}.")
+
+
+def several(what: str, *flags: str, **bounds: Any) -> Any:
+    """Return an option that may be repeated, for `Annotated[list[T] | None, ...]`."""
+    return typer.Option(*flags, help=f"{what} Repeat for more.", **bounds)
+
+
+def chosen(
+    names: Sequence[str] | None, known: Collection[str], what: str, default: Collection[str] = ()
+) -> list[str]:
+    """Return the names that are given, or the default if there are none.
+
+    Raises
+    ------
+    ConfigurationError
+        A name is not known.
+    """
+    for name in names or ():
+        named(name, dict.fromkeys(known), what)
+    return list(names or default)
+
+
+class Program:
+    """Command line of several measurements.
+
+    Parameters
+    ----------
+    words
+        Command that starts it, such as "python -m benchmarks".
+    help
+        Description, with an example in its last line.
+    keeps
+        True: every command has an option --out for a run directory.
+    """
+
+    def __init__(self, words: str, help: str, *, keeps: bool = False) -> None:
+        self.words = words
+        self.keeps = keeps
+        self.app = typer.Typer(
+            name=words.split()[-1],
+            help=help,
+            no_args_is_help=True,
+            add_completion=False,
+            pretty_exceptions_enable=False,
+            rich_markup_mode="rich",
+            context_settings={"help_option_names": ["-h", "--help"]},
+        )
+        self.app.callback()(lambda: None)  # so that a program of one command has its name, too
+
+    def command(self, quick: str, name: str | None = None) -> Callable[[Measurement], Measurement]:
+        """Return a decorator that adds a function as a command with --quick and --json.
+
+        Each parameter of the function is an option. A parameter `quick` or `as_json` is passed the
+        value of that option. The docstring is the help.
+
+        Parameters
+        ----------
+        quick
+            Help of --quick: what is left out.
+        name
+            Name of the command; default that of the function.
+        """
+
+        def add(function: Measurement) -> Measurement:
+            parameters = inspect.signature(function, eval_str=True).parameters
+            counts = {key: found for key, item in parameters.items() if (found := _count(item))}
+
+            def run(context: typer.Context, **given: Any) -> None:
+                shared = {key: given.pop(key, None) for key in ("quick", "as_json", "out")}
+                for key, count in counts.items():
+                    if shared["quick"] and not _is_given(context, key):
+                        given[key] = count.quick
+                given |= {key: shared[key] for key in shared if key in parameters}
+                words = self._words(context)
+                title = (inspect.getdoc(function) or "").split("\n")[0].rstrip(".")
+                outcome = conducted(lambda: function(**given), shared["out"], words, title)
+                report_outcome(outcome, words, shared["as_json"])
+
+            shared = {
+                "quick": (Annotated[bool, typer.Option("--quick", help=quick)], False),
+                "as_json": (JsonOption, False),
+                **({"out": (Out, None)} if self.keeps else {}),
+            }
+            _declare(run, parameters, shared, counts)
+            run.__doc__ = function.__doc__
+            self.app.command(name or function.__name__)(run)
+            return function
+
+        return add
+
+    def _words(self, context: typer.Context) -> list[str]:
+        """Return the command in words: with all numbers, those of --quick aside; no paths."""
+        words = [*self.words.split(), context.command.name or ""]
+        for option in context.command.params:
+            name, flag = option.name or "", max(option.opts, key=len)
+            value = context.params.get(name)
+            told = _is_given(context, name) or not context.params["quick"]
+            if name == "as_json" or value is None or isinstance(value, Path) or not told:
+                continue
+            if isinstance(value, bool):
+                words += [flag] if value else []
+                continue
+            for item in value if isinstance(value, list | tuple) else [value]:
+                words += [flag, f"{item:g}" if isinstance(item, float) else str(item)]
+        return words
+
+
+def _count(parameter: inspect.Parameter) -> Count | None:
+    """Return the declaration of a parameter that is a `Count`."""
+    found = getattr(parameter.annotation, "__metadata__", ())
+    return next((item for item in found if isinstance(item, Count)), None)
+
+
+def _declare(
+    run: Callable[..., None],
+    parameters: Mapping[str, inspect.Parameter],
+    shared: Mapping[str, tuple[Any, Any]],
+    counts: Mapping[str, Count],
+) -> None:
+    """Give a command the signature from which Typer reads its options."""
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    found = [inspect.Parameter("context", keyword, annotation=typer.Context)]
+    for name, item in parameters.items():
+        if name in shared:
+            continue
+        if (count := counts.get(name)) is not None:
+            option = Annotated[int, count.option]
+            item = item.replace(annotation=option, default=count.usual)
+        found.append(item.replace(kind=keyword))
+    found += [
+        inspect.Parameter(name, keyword, annotation=option, default=default)
+        for name, (option, default) in shared.items()
+    ]
+    run.__signature__ = inspect.Signature(found)  # type: ignore[attr-defined]
+    run.__annotations__ = {}
+
+
+def _is_given(context: typer.Context, name: str) -> bool:
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"

@@ -1,0 +1,234 @@
+"""Engines of a fleet: all members as the blocks of one array, or one after the other."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from livepde import checkpoint
+from livepde.fem import Moment
+from livepde.laws import AnyLaw, Belief, InitialReading, MemberReports, Problem, Status
+from livepde.laws.member_arrays import join, take
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.linalg import Array, IntArray
+from livepde.stepping import Span
+
+__all__ = ["Beliefs", "BlockEngine", "Factors", "FleetEngine", "SeparateEngine", "State"]
+
+State: TypeAlias = Any
+"""What evolves: the arrays or values of an engine."""
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """Square roots of the covariances of all members; see `livepde.laws.Belief`.
+
+    Attributes
+    ----------
+    q, u, prior
+        Shapes (members, m, r), (members, n, r) and (members, m, k).
+    """
+
+    q: Array
+    u: Array
+    prior: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`.
+
+    Attributes
+    ----------
+    q, u
+        Shapes (members, m) and (members, n).
+    q_std
+        Standard deviations of q, or None if the law has no covariance.
+    factors
+        Covariances; None where members step separately, each with its own.
+    """
+
+    q: Array
+    u: Array
+    q_std: Array | None
+    factors: Factors | None = None
+
+
+class FleetEngine(ABC):
+    """Abstract stepper of all members by one law.
+
+    A state is a value: a returned state never changes.
+    """
+
+    def __init__(self, law: Any, work: Any) -> None:
+        self.law = law
+        self.work = work
+
+    def subset(self, which: IntArray) -> FleetEngine:
+        """Return a stepper of some members, by number."""
+        return self
+
+    @abstractmethod
+    def start(self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]) -> State:
+        """Return the state at the start, from coefficients of each member."""
+
+    @abstractmethod
+    def begin(self, state: State, span: Span) -> State:
+        """Return the state after a sample at the initial time."""
+
+    @abstractmethod
+    def step(self, state: State, span: Span) -> tuple[State, MemberReports]:
+        """Return the state at the end of a span, with that before it for members that failed."""
+
+    @abstractmethod
+    def settled(self, state: State) -> State:
+        """Return the state after the work that the law spreads over samples; see `Law.settled`."""
+
+    @abstractmethod
+    def believed(self, state: State, k: int) -> Belief:
+        """Return the belief about a member, in latent coefficients."""
+
+    @abstractmethod
+    def beliefs(self, state: State) -> Beliefs:
+        """Return the beliefs about all members."""
+
+    @abstractmethod
+    def member(self, state: State, k: int) -> Any:
+        """Return the state of a member as the law itself has it."""
+
+    def leaves(self, state: State) -> dict[str, Any]:
+        """Return the state as plain arrays."""
+        return checkpoint.flatten(state)
+
+    def restored(self, template: State, leaves: Mapping[str, Array]) -> State:
+        """Return the state that `leaves` gave; raises KeyError or ValueError if it does not fit."""
+        return checkpoint.rebuild(template, leaves)
+
+
+class SeparateEngine(FleetEngine):
+    """Any law, member by member, with its precomputed parts shared by all members.
+
+    The state is a tuple of the states of the law.
+    """
+
+    def __init__(self, law: AnyLaw, work: Any, problem: Problem) -> None:
+        super().__init__(law, work)
+        self.problem = problem
+
+    def start(
+        self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
+    ) -> tuple[Any, ...]:
+        each = zip(q0, u0, moments, strict=True)
+        return tuple(self.law.start(self.work, q, u, moment) for q, u, moment in each)
+
+    def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
+        return tuple(self.law.begin(self.work, one, span.member(k)) for k, one in enumerate(state))
+
+    def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], MemberReports]:
+        taken = [self.law.step(self.work, one, span.member(k)) for k, one in enumerate(state)]
+        members, sensors = len(taken), len(taken[0][1].predicted)
+        blank = np.zeros((members, sensors)), np.zeros(members, dtype=int)
+        reports = MemberReports((Status(),) * members, *blank)
+        each = {k: report for k, (_, report) in enumerate(taken)}
+        return tuple(new for new, _ in taken), reports.with_members(each)
+
+    def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(self.law.settled(self.work, one) for one in state)
+
+    def believed(self, state: tuple[Any, ...], k: int) -> Belief:
+        belief: Belief = self.law.belief(self.work, state[k])
+        return belief
+
+    def beliefs(self, state: tuple[Any, ...]) -> Beliefs:
+        beliefs = [self.problem.physical(self.believed(state, k)) for k in range(len(state))]
+        stds = [belief.q_std for belief in beliefs]
+        known = [std for std in stds if std is not None]
+        q, u = (np.array([getattr(belief, name) for belief in beliefs]) for name in ("q", "u"))
+        return Beliefs(q, u, np.array(known) if known else None)
+
+    def member(self, state: tuple[Any, ...], k: int) -> Any:
+        return state[k]
+
+
+class BlockEngine(FleetEngine):
+    """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members.
+
+    `readings` are those that the initial state of each member was made of, `initial` how it was
+    given.
+    """
+
+    def __init__(
+        self,
+        law: Any,
+        work: SensitivityWork,
+        readings: Sequence[Mapping[str, InitialReading]],
+        initial: Sequence[Any],
+    ) -> None:
+        super().__init__(law, work)
+        made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
+        self._begins = []
+        for one, u0 in zip(readings, initial, strict=True):
+            begin = made.get(id(u0)) if not one else None
+            if begin is None:
+                begin = work.made_of(one, u0)
+                made |= {} if one else {id(u0): begin}
+            self._begins.append(begin)
+
+    def subset(self, which: IntArray) -> BlockEngine:
+        other = copy.copy(self)
+        other._begins = [self._begins[k] for k in which]
+        return other
+
+    def start(
+        self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
+    ) -> SensitivityState:
+        starts = zip(self._begins, q0, u0, moments, strict=True)
+        first: SensitivityState = join(*(self.law.start(*start) for start in starts))
+        return first
+
+    def begin(self, state: SensitivityState, span: Span) -> SensitivityState:
+        each = enumerate(self._begins)
+        begun: SensitivityState = join(
+            *(self.law.begin(work, take(state, k), span.member(k)) for k, work in each)
+        )
+        return begun
+
+    def step(self, state: SensitivityState, span: Span) -> tuple[SensitivityState, MemberReports]:
+        found: tuple[SensitivityState, MemberReports]
+        found = self.law.step_members(self.work, state, span)
+        return found
+
+    def settled(self, state: SensitivityState) -> SensitivityState:
+        settled: SensitivityState = self.law.settled(self.work, state)
+        return settled
+
+    def believed(self, state: SensitivityState, k: int) -> Belief:
+        belief: Belief = self.law.member_belief(self.work, state.now, k)
+        return belief
+
+    @np.errstate(over="ignore", invalid="ignore")  # of members whose step has failed
+    def beliefs(self, state: SensitivityState) -> Beliefs:
+        now, reduction = state.now, self.work.filter.reduction
+        latent = self.work.filter.problem.model.latent
+        a = reduction.bounded(self.work.filter.estimate(now))
+        U, C = self.law.factors(self.work, now)
+        factor = reduction.directions(a, C).transpose(0, 2, 1)
+        units = np.broadcast_to(np.eye(reduction.size), (len(a), *2 * (reduction.size,)))
+        prior = reduction.directions(a, units).transpose(0, 2, 1)
+        std = np.sqrt((factor**2).sum(axis=2))
+        factors = Factors(factor, U.transpose(0, 2, 1), prior)
+        return Beliefs(latent.value(a.T).T, now.u + now.du, std, factors)
+
+    def member(self, state: SensitivityState, k: int) -> SensitivityState:
+        return take(state, k)
+
+    def restored(self, template: SensitivityState, leaves: Mapping[str, Array]) -> SensitivityState:
+        state: SensitivityState = super().restored(template, leaves)
+        if len(state) != len(template):
+            raise ValueError(f"{len(state)} members, needs {len(template)}")
+        return state

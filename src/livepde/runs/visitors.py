@@ -1,0 +1,98 @@
+"""Deadlines for the connections of a web server (waitress), which holds a thread only to answer."""
+
+from __future__ import annotations
+
+import socket
+import time
+from typing import TYPE_CHECKING, Any
+
+from waitress import wasyncore
+from waitress.channel import HTTPChannel
+from waitress.server import TcpWSGIServer
+
+if TYPE_CHECKING:
+    from wsgiref.types import WSGIApplication
+
+__all__ = ["listener"]
+
+THREADS = 16  # answers that are computed at a time
+ROOM = 256  # connections at a time; of more the oldest idle one is closed
+LONGEST_HEADER = 16_384  # bytes
+LONGEST_BODY = 1_000_000  # bytes
+IN_MEMORY = 65_536  # bytes of a body; the rest of it is in a temporary file
+DEADLINE = 10  # seconds within which a request has to be there as a whole
+LONGEST = 30  # seconds within which its answer has to be taken
+
+
+class Visitor(HTTPChannel):  # type: ignore[misc]
+    """A connection that remembers when its last request began."""
+
+    begun = 0.0
+
+    def received(self, data: bytes) -> Any:
+        """Take received bytes; bytes that come one by one do not move the deadline."""
+        if self.request is None:
+            self.begun = time.time()
+        return super().received(data)
+
+    def handle_close(self) -> None:
+        """Close the connection, and the file that holds a part of its request."""
+        if self.request is not None:
+            self.request.close()
+        super().handle_close()
+
+
+class Listener(TcpWSGIServer):  # type: ignore[misc]
+    """A server that closes connections after a deadline, and the oldest idle ones for new ones."""
+
+    channel_class = Visitor
+
+    def maintenance(self, now: float) -> None:
+        """Close connections that are idle, ask too slowly, or take their answer too slowly."""
+        super().maintenance(now)
+        for visitor in [*self.active_channels.values()]:
+            since = now - visitor.begun
+            asking, answered = visitor.request is not None, visitor.total_outbufs_len > 0
+            if (asking and since > DEADLINE) or (answered and since > LONGEST):
+                # With `will_close` it would be closed only once it has taken more of its answer.
+                visitor.handle_close()
+
+    def handle_accept(self) -> None:
+        """Accept a connection."""
+        if len(self.active_channels) >= ROOM:
+            here = self.active_channels.values()  # the oldest come first
+            idle = (v for v in here if not (v.requests or v.total_outbufs_len or v.will_close))
+            for visitor in idle:
+                visitor.will_close = True
+                break
+        super().handle_accept()
+
+    def stop(self) -> None:
+        """Close all sockets in the thread that polls them, which ends without any."""
+
+        def end() -> None:
+            for visitor in [*self.active_channels.values()]:
+                visitor.handle_close()
+            wasyncore.close_all(self._map)
+
+        self.trigger.pull_trigger(end)
+
+
+def listener(application: WSGIApplication, place: socket.socket) -> Listener:
+    """Return a server that listens at a bound socket; its `run` serves."""
+    return Listener(
+        application,
+        _sock=place,
+        bind_socket=False,
+        sockinfo=(place.family, place.type, place.proto, place.getsockname()),
+        threads=THREADS,
+        ident=None,
+        connection_limit=2 * ROOM,
+        channel_timeout=DEADLINE,
+        cleanup_interval=1,
+        inbuf_overflow=IN_MEMORY,
+        max_request_header_size=LONGEST_HEADER,
+        max_request_body_size=LONGEST_BODY,
+        log_socket_errors=False,
+        asyncore_use_poll=True,
+    )
