@@ -163,7 +163,7 @@ def absorb(
     shadows, off = filter_.shadows, None
     expected, told = e, d
     if shadows is not None:
-        off = shadows.seen(x, span.end)
+        off = shadows.in_readings(x, span.end)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         known = off[:, shadows.counted].sum(axis=1) / noise
@@ -189,7 +189,7 @@ def absorb(
     if options.adaptive:
         new = changed(new, **_learned(x, used, d, noise, made))
     if shadows is not None and off is not None:
-        followed = shadows.updated(x, new, made.left, used / noise, off, span.t1)
+        followed = shadows.update(x, new, made.left, used / noise, off, span.t1)
         new = changed(new, shadows=followed)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell

@@ -66,7 +66,7 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
     if not x.ledger.seen[member]:
         return lambda: Verdict.of([_unseen()])
     # The answers of the process are states of the size of u, which no finding reads.
-    x = changed(x, ledger=changed(x.ledger, process=x.ledger.process[:, :0]))
+    x = changed(x, ledger=changed(x.ledger, process=np.zeros((len(x), 0, 0))))
 
     def found() -> Verdict:
         one = take(x, member)
