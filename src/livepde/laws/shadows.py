@@ -104,7 +104,7 @@ class Shadows:
             raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
 
 
-class Block(NamedTuple):
+class ShadowedSteps(NamedTuple):
     """Steps of some members whose error a shadow estimates: all since the previous estimate.
 
     Attributes
@@ -217,7 +217,7 @@ class Shadow(ABC):
         """
 
     @abstractmethod
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         """Return the discretisation error of a block of steps."""
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
@@ -268,7 +268,7 @@ class StepShadow(Shadow):
     ) -> ShadowState:
         return changed(s, halves=self.halves.stage.kept(1))
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         u, kept, failed = self.halves.propagate(block.x, block.x.u, s.halves, block.step)
         error = self.factor * (block.end.u - u)
         size = np.sqrt((error * error).sum(axis=1))
@@ -342,7 +342,7 @@ class InputShadow(Shadow):
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
         return {"slope": slope, "length": length, "bend": bend, "missed": missed}
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
         # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
         # this off again when they have been read.
@@ -434,7 +434,7 @@ class MeshShadow(Shadow):
         gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
         return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         x, end, mesh, span = block.x, block.end, self.mesh, block.span
         coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
         # A long step for the whole block has a time error of its own, which cancels only in the
@@ -577,7 +577,7 @@ class ShadowSet:
             span = replace(step, t0=s.begun, inputs0=s.inputs0, interval=None)
         wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
         wait = np.where(s.count - s.jumped < CALM, 1, wait)
-        block = Block(x, end, step, span, waited, wait, jumps)
+        block = ShadowedSteps(x, end, step, span, waited, wait, jumps)
         u, a, failed = s.u.copy(), s.a.copy(), s.failed
         parts: dict[str, Any] = {}
         for row, shadow in enumerate(self.shadows):
