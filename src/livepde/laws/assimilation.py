@@ -162,18 +162,19 @@ def absorb(
     variance = 1.0 + (Y * Y).sum(axis=1)
     e = d / np.sqrt(variance)
     shadows, off = filter_.shadows, None
-    expected, told = e, d
+    told, shift = d, np.zeros_like(d)
     if shadows is not None:
-        off = shadows.seen(x, at)
+        off = shadows.in_readings(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
-        known = off[:, shadows.counted].sum(axis=1) / noise
-        expected, told = d / np.sqrt(variance + known * known), d + known
+        shift = off[:, shadows.counted].sum(axis=1) / noise
+        told = d + shift
     dropped, newest = np.zeros(len(d)), None
     parts: dict[str, Any] = {}
     # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
-    near = np.abs(expected) <= options.gate
+    near = np.abs(e) <= options.gate
     if np.count_nonzero(near) < near.size or np.count_nonzero(x.refused):
+        expected = d / np.sqrt(variance + shift * shift)
         used, parts["refused"], dropped, newest = _gated(x, e, expected, used, options)
         if newest is not None:
             whole = bool(used.all())
@@ -188,7 +189,7 @@ def absorb(
     new, made = filter_.update(x, Y, d, **parts)
     learned: dict[str, Any] = _learned(x, used, d, noise, made) if options.adaptive else {}
     if shadows is not None and off is not None:
-        learned["shadows"] = shadows.updated(x, new, made.left, used / noise, off, span.t1)
+        learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell

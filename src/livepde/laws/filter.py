@@ -188,7 +188,7 @@ class Filter:
         if failure is not None:
             return x, taken, failure
         if self.shadows is not None:
-            end = self.shadows.predicted(x, end, span)
+            end = self.shadows.predict(x, end, span)
         if self.fading < math.inf:  # exponential decay of the cross-covariance
             end = changed(end, U=np.exp(-(span.t1 - span.start) / self.fading) * end.U)
         return end, taken, None

@@ -268,7 +268,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         )
         if filter_.shadows is not None:
             given = problem.initial
-            x = changed(x, shadows=filter_.shadows.begun(x, moment, given))
+            x = changed(x, shadows=filter_.shadows.start(x, moment, given))
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
             now=x,
