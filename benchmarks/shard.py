@@ -12,6 +12,7 @@ from time import perf_counter, process_time, sleep
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from benchmarks.fleet import NODES, NOISE, SENSORS, STEP
 from livepde.atomic_write import write_bytes
@@ -201,10 +202,11 @@ def _paced(barrier: Any, spent: Any, count: int) -> None:
     model = _rod()
     one, pieces = _shard(model, FEW), list(_batches(model, count, FEW))
     barrier.wait(PATIENCE)
-    begun = process_time()
-    for offset, batch in pieces:
-        one.step(offset, batch)
-    spent.put(process_time() - begun)
+    with threadpool_limits(1):  # threads of BLAS that wait for each other are no work
+        begun = process_time()
+        for offset, batch in pieces:
+            one.step(offset, batch)
+        spent.put(process_time() - begun)
 
 
 def _killed(kills: int) -> tuple[int, int, int, int]:
@@ -291,7 +293,8 @@ def _in_process(what: Callable[[int, str], Found], count: int, law: str) -> Foun
 
 
 def _send(pipe: Connection, what: Callable[[int, str], Any], count: int, law: str) -> None:
-    pipe.send(what(count, law))
+    with threadpool_limits(1):
+        pipe.send(what(count, law))
 
 
 def _rod() -> Model:

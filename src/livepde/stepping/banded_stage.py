@@ -64,16 +64,17 @@ class BandedStage(MemberStage):
         rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
         slopes = [maps["A"] @ form.data("v", "u", some, u=zero, q=q) for q in units]
         self._blocks = BandedBlocks(BandedSolver(self.pattern))
-        self._mass = self._product(mass * free[rows])
-        self._slopes = self._product(*(slope * inner for slope in slopes))
+        self._mass = compact(self._stacked(mass * free[rows]))
+        self._slopes = compact(self._stacked(*(slope * inner for slope in slopes)))
         self._mass_band = self._blocks.band(mass * inner)
         # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
         self._rest_band = self._blocks.band(rest * inner + ones)
         self._slope_bands = self._blocks.band(np.array(slopes) * inner)
         # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
-        mass_edge, rest_edge = self._product(mass * outer), self._product(rest * outer)
-        slope_edge = self._product(*(slope * outer for slope in slopes))
+        # They have few entries, and stay sparse: their products are formed once.
+        mass_edge, rest_edge = self._stacked(mass * outer), self._stacked(rest * outer)
+        slope_edge = self._stacked(*(slope * outer for slope in slopes))
 
         def boundary(moment: Moment) -> Array:
             return model.impose(zero, moment)
@@ -117,12 +118,12 @@ class BandedStage(MemberStage):
             return "the model is not affine in its input channels"
         return ""
 
-    def _product(self, *parts: Array) -> sp.csr_array | Array:
-        """Return vertically stacked matrices of the pattern, for products."""
+    def _stacked(self, *parts: Array) -> sp.csr_array:
+        """Return vertically stacked matrices of the pattern."""
         blocks = [self.pattern.matrix(part) for part in parts]
         whole = sp.csr_array(sp.vstack(blocks, format="csr"))
         whole.eliminate_zeros()  # an unknown of a layer has an effect there only
-        return compact(whole)
+        return whole
 
     def twin(self) -> BandedStage:
         return self  # it keeps no factor
