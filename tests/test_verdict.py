@@ -236,6 +236,29 @@ def test_errors_that_follow_each_other_are_no_cause():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("sensors", "kinds"), [(40, ["gain", "drift"]), (120, ["offset", "lag"])])
+def test_where_sensors_are_many_kinds_of_causes_are_left_out(sensors: int, kinds: list[str]):
+    places = {f"s{k}": (k + 0.5) / sensors for k in range(sensors)}
+    points = lp.Points(places, noise=NOISE)
+    identifier = lp.Identifier(rod(), points, lp.SensitivityLaw(), u0=0.0)
+    for t in TIMES[:40].tolist():
+        estimate = identifier.step(t, np.zeros(sensors), {"T_left": driven(t)})
+    told = [text for text in estimate.verdict.untested if text.endswith(f"there are {sensors}")]
+    assert all(any(text.startswith(kind) for text in told) for kind in kinds)
+    assert estimate.verdict.level == "do not trust"
+
+
+@pytest.mark.slow
+def test_a_kept_verdict_holds_no_responses_of_the_process():
+    identifier, _ = run(shown() + errors())
+    cells = identifier.law.judge(identifier._work, identifier._state).__closure__ or ()
+    (x,) = (cell.cell_contents for cell in cells if hasattr(cell.cell_contents, "ledger"))
+    assert identifier._state.now.ledger.process.size
+    assert x.ledger.process.size == 0
+    assert x.ledger.process.base is None or x.ledger.process.base.size == 0
+
+
+@pytest.mark.slow
 def test_directions_move_the_estimate_by_what_they_say():
     """For an unknown source model and filter are linear: the shift by an offset is exact."""
     mesh = lp.interval(0.0, 1.0, 20)

@@ -78,11 +78,11 @@ class HalvedMesh:
             return None
         return compact(self.observed.G)
 
-    def prolonged(self, u: Array) -> Array:
+    def prolong(self, u: Array) -> Array:
         """Return states on the halved mesh, shape (members, N) for (members, n)."""
         return np.asarray((self.P @ u.T).T)
 
-    def begun(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
+    def initial_difference(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
         """Return the initial state on the halved mesh minus that of the given mesh, shape (N,).
 
         Parameters
@@ -95,7 +95,7 @@ class HalvedMesh:
         q, u
             Latent parameter and initial state, shapes (m,) and (n,).
         """
-        coarse = self.prolonged(u[None])[0]
+        coarse = self.prolong(u[None])[0]
         if moment is None:
             return np.zeros_like(coarse)
         if self.model.form_initial is not None:
@@ -104,7 +104,9 @@ class HalvedMesh:
             return np.zeros_like(coarse)
         return np.asarray(self.model.initial(given, moment) - coarse)
 
-    def seen(self, u: Array, q: Array, difference: Array, moment: Callable[[int], Moment]) -> Array:
+    def in_readings(
+        self, u: Array, q: Array, difference: Array, moment: Callable[[int], Moment]
+    ) -> Array:
         """Return the differences in the readings for those of the states there.
 
         Shape (members, sensors).
@@ -121,7 +123,7 @@ class HalvedMesh:
         if self.G is not None:
             return np.asarray((self.G @ difference.T).T)
         # Sensors without one constant matrix: their derivative at the prolonged state.
-        at, found = self.prolonged(u), []
+        at, found = self.prolong(u), []
         for k, more in enumerate(difference):
             physical = self.model.latent.value(self.unknowns @ q[k])
             found.append(self.observed.jacobian(at[k], physical, moment(k))[0] @ more)

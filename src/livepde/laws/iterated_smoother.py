@@ -36,6 +36,9 @@ CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at t
 HOLDS = 0.1  # the same in each direction, of the first step, for a linearisation that holds
 ENOUGH = 16  # samples that no other trajectory explains as well as one that is found, and with
 # which the start ends where the linearisation holds: what follows moves the estimate less
+# Unknowns up to which the first pass was the last one in 65 of 66 iterations on rods of layers
+# whose samples the filter had explained; with 6 to 10 of them it was in half of 110.
+FEW = 4
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -110,11 +113,10 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     intervals = intervals_since(log, problem.channels)
     whole = bare = _Samples(work, state, opening, intervals)
     # A search needs neither the ledger nor the errors of the discretisation, which cost as much
-    # again: the last pass alone follows them. That is most often the first one, where the filter
-    # has explained the samples.
+    # again: the last pass alone follows them, and the first one where it is likely the last.
     if work.filter.judge is not None or work.filter.shadows is not None:
         bare = _Samples(work.unaccompanied, state.unaccompanied, opening, intervals)
-    samples = whole if _explained(state.now) else bare
+    samples = whole if _ends_at_once(state.now) else bare
     ends: list[_Pass] = []
     for trajectory in _beginnings(bare, (1 + len(intervals), state.now.C.shape[2])):
         one, samples = samples.about(trajectory), bare
@@ -135,10 +137,10 @@ def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterS
     return changed(found.x, past=found.x.past[:, :, :0], dpast=found.x.dpast[:, :0])
 
 
-def _explained(x: FilterState) -> bool:
-    """True if the innovations of a filter are no larger than their noise makes usual."""
+def _ends_at_once(x: FilterState) -> bool:
+    """True if the first pass is likely the last: few unknowns, innovations no larger than usual."""
     count, squares = x.innovations.sums[0, 0], x.innovations.sums[0, 2]
-    return bool(squares <= count + 3.0 * math.sqrt(2.0 * count))
+    return bool(x.C.shape[2] <= FEW and squares <= count + 3.0 * math.sqrt(2.0 * count))
 
 
 def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:

@@ -104,7 +104,7 @@ class Shadows:
             raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
 
 
-class Block(NamedTuple):
+class ShadowedSteps(NamedTuple):
     """Steps of some members whose error a shadow estimates: all since the previous estimate.
 
     Attributes
@@ -205,7 +205,7 @@ class Shadow(ABC):
     kind: ClassVar[str]
 
     @abstractmethod
-    def begun(
+    def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         """Return the state before the first step, of one member.
@@ -217,7 +217,7 @@ class Shadow(ABC):
         """
 
     @abstractmethod
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         """Return the discretisation error of a block of steps."""
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
@@ -263,12 +263,12 @@ class StepShadow(Shadow):
         halves = replace(process, control=control, stage=process.stage.twin())
         return cls(halves, ratio / (ratio - 1.0))
 
-    def begun(
+    def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         return changed(s, halves=self.halves.stage.kept(1))
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         u, kept, failed = self.halves.propagate(block.x, block.x.u, s.halves, block.step)
         error = self.factor * (block.end.u - u)
         size = np.sqrt((error * error).sum(axis=1))
@@ -300,7 +300,7 @@ class InputShadow(Shadow):
 
     kind = "input"
 
-    def begun(
+    def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         nothing = np.zeros((1, self.channels))
@@ -342,7 +342,7 @@ class InputShadow(Shadow):
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
         return {"slope": slope, "length": length, "bend": bend, "missed": missed}
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
         # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
         # this off again when they have been read.
@@ -370,10 +370,10 @@ class HeldInputShadow(InputShadow):
 
     kind = HELD
 
-    def begun(
+    def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        s = super().begun(s, x, moment, given)
+        s = super().start(s, x, moment, given)
         return changed(s, held=np.full((1, 4, self.channels), np.nan))
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
@@ -421,20 +421,20 @@ class MeshShadow(Shadow):
         mesh, coarse = HalvedMesh.of(problem), replace(process, stage=process.stage.twin())
         return cls(coarse, replace(process, stage=mesh.stage), mesh)
 
-    def begun(
+    def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         if moment is None:
             difference = np.zeros((1, self.mesh.model.X.dim))
             seen = np.zeros((1, self.mesh.observed.size))
         else:
-            difference = self.mesh.begun(given, x.q[0], x.u[0], moment)[None]
-            seen = self.mesh.seen(x.u, x.q, difference, lambda k: moment)
+            difference = self.mesh.initial_difference(given, x.q[0], x.u[0], moment)[None]
+            seen = self.mesh.in_readings(x.u, x.q, difference, lambda k: moment)
         kept = {"blocks": self.coarse.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
         gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
         return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
 
-    def error(self, s: ShadowState, block: Block) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
         x, end, mesh, span = block.x, block.end, self.mesh, block.span
         coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
         # A long step for the whole block has a time error of its own, which cancels only in the
@@ -442,11 +442,11 @@ class MeshShadow(Shadow):
         if (block.waited > 1).any():
             coarse, blocks, failed = self.coarse.propagate(x, s.u0, blocks, span)
         # The fine trajectory begins at the filter's state, prolonged, and the difference so far.
-        start = mesh.prolonged(s.u0) + s.fine
+        start = mesh.prolong(s.u0) + s.fine
         u, kept, wrong = self.fine.propagate(x, start, s.fine_stage, span)
         failed = failed | wrong
-        fine = np.where(failed[:, None], s.fine, u - mesh.prolonged(coarse))
-        seen = mesh.seen(end.u, end.q, fine, span.end.member)
+        fine = np.where(failed[:, None], s.fine, u - mesh.prolong(coarse))
+        seen = mesh.in_readings(end.u, end.q, fine, span.end.member)
         slope = (seen - s.seen) / (span.t1 - span.t0)[:, None]
         # `gains` weighs the gain of each sample by the time since the block began: times the slope
         # that is the effect of a difference which has grown linearly.
@@ -522,17 +522,17 @@ class ShadowSet:
         """Kind of each shadow."""
         return tuple(shadow.kind for shadow in self.shadows)
 
-    def begun(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
+    def start(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
         """Return the shadows of one member at the start; None stands for no moment yet."""
         n, k, rows = x.u.shape[1], x.C.shape[2], len(self.shadows)
         u, a = np.zeros((1, rows, n)), np.zeros((1, rows, k))
         nothing = np.zeros((1, len(self.problem.channels)))
         s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing)
         for shadow in self.shadows:
-            s = shadow.begun(s, x, moment, given)
+            s = shadow.start(s, x, moment, given)
         return s
 
-    def predicted(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
+    def predict(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
         """Return the state after a span with the errors that have come about in it.
 
         Parameters
@@ -541,7 +541,7 @@ class ShadowSet:
             Before and after the span; `end` with the errors of before, propagated.
         """
         s = end.shadows
-        parts, jumps = _watched(s, x, end, span)
+        parts, jumps = _watch_rate(s, x, end, span)
         fresh = s.count == s.last  # members that begin a block
         if np.count_nonzero(fresh):
             rows = fresh[:, None]
@@ -561,14 +561,14 @@ class ShadowSet:
         for t in sorted(set(s.begun[due].tolist())) if np.count_nonzero(due) else ():
             group = np.flatnonzero(due & (s.begun == t))
             if len(group) == len(s):
-                s = self._with_errors(s, x, end, span, jumps)
+                s = self._add_errors(s, x, end, span, jumps)
             else:
                 some, one, after = take(s, group), take(x, group), take(end, group)
-                new = self._with_errors(some, one, after, _part(span, group), jumps[group])
+                new = self._add_errors(some, one, after, _part(span, group), jumps[group])
                 s = put(s, group, new)
         return changed(end, shadows=s)
 
-    def _with_errors(
+    def _add_errors(
         self, s: ShadowState, x: FilterState, end: FilterState, step: Span, jumps: Mask
     ) -> ShadowState:
         """Return members whose blocks began together, with the errors of these blocks added."""
@@ -577,7 +577,7 @@ class ShadowSet:
             span = replace(step, t0=s.begun, inputs0=s.inputs0, interval=None)
         wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
         wait = np.where(s.count - s.jumped < CALM, 1, wait)
-        block = Block(x, end, step, span, waited, wait, jumps)
+        block = ShadowedSteps(x, end, step, span, waited, wait, jumps)
         u, a, failed = s.u.copy(), s.a.copy(), s.failed
         parts: dict[str, Any] = {}
         for row, shadow in enumerate(self.shadows):
@@ -596,7 +596,7 @@ class ShadowSet:
         parts |= {"begun": begun, "last": s.count, "due": s.count + wait, "failed": failed}
         return changed(s, u=u, a=a, **parts)
 
-    def seen(self, x: FilterState, at: Moments) -> Array:
+    def in_readings(self, x: FilterState, at: Moments) -> Array:
         """Return by how much predictions are off, (members, shadows, sensors)."""
         s = x.shadows
         seen = self.rows(x, s.u, s.a, at)
@@ -606,7 +606,7 @@ class ShadowSet:
                 seen[:, row] += more
         return seen
 
-    def updated(
+    def update(
         self, x: FilterState, new: FilterState, left: Array, weights: Array, off: Array, t: float
     ) -> ShadowState:
         """Return the shadows after a sample.
@@ -620,7 +620,7 @@ class ShadowSet:
         weights
             One over the noise of each value that was used, zero for others, (members, sensors).
         off, t
-            By how much predictions of such values were off, as `seen` says, zero for others; and
+            By how much predictions of such values were off (`in_readings`), zero for others; and
             the time.
         """
         s = x.shadows
@@ -690,7 +690,7 @@ class ShadowSet:
         return np.where(good, u, 0.0) * factor, np.where(good, a, 0.0) * factor
 
 
-def _watched(
+def _watch_rate(
     s: ShadowState, x: FilterState, end: FilterState, span: Span
 ) -> tuple[dict[str, Any], Mask]:
     """Return fields after one more step, and members whose rate of the state jumped in it."""

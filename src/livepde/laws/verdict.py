@@ -66,7 +66,7 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
     if not x.ledger.seen[member]:
         return lambda: Verdict.of([_unseen()])
     # The answers of the process are states of the size of u, which no finding reads.
-    x = changed(x, ledger=changed(x.ledger, process=x.ledger.process[:, :0]))
+    x = changed(x, ledger=changed(x.ledger, process=np.zeros((len(x), 0, 0))))
 
     def found() -> Verdict:
         one = take(x, member)
@@ -105,8 +105,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     for label, place in reduction.stay:
         names[place] = label
     return Position(
-        ledger=x.ledger,
-        member=0,
+        ledger=x.ledger.of_member(0),
         moved=found,
         distance=_distance(reduction, x, a),
         sensors=problem.observed.names,

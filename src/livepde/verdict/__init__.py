@@ -1,6 +1,7 @@
 """Verdict of a run on itself: trusted, caution or do not trust, with the findings against it."""
 
 from livepde.verdict.assess import Position, assess
+from livepde.verdict.channel_ledgers import InputLedger, WithheldLedger
 from livepde.verdict.directions import Dictionary, ScoreDirection
 from livepde.verdict.findings import (
     FLAT,
@@ -14,11 +15,9 @@ from livepde.verdict.findings import (
     at_bound,
     flat,
 )
-from livepde.verdict.inputs import InputLedger
 from livepde.verdict.judge import Judge, ScoredSample
 from livepde.verdict.ledger import WINDOWS, Ledger
 from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
-from livepde.verdict.withheld import WithheldLedger
 
 __all__ = [
     "FLAT",

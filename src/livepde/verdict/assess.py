@@ -51,8 +51,8 @@ class Position:
 
     Attributes
     ----------
-    ledger, member
-        The ledger, and the number of the member in it.
+    ledger
+        The ledger of the member: see `Ledger.of_member`.
     moved
         Shift of the estimate from the truth by each direction of each window, in reported standard
         deviations: unknown -> (windows, directions).
@@ -72,7 +72,6 @@ class Position:
     """
 
     ledger: Ledger
-    member: int
     moved: dict[str, Array]
     distance: tuple[float, int]
     sensors: Sequence[str]
@@ -85,12 +84,12 @@ class Position:
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
     """Return the verdict on one member."""
-    seen = int(at.ledger.seen[at.member])
+    seen = int(at.ledger.seen)
     if seen < FEWEST:
         text = f"There are {seen} samples: too few to judge by."
         few = Finding("samples", "caution", text, evidence=float(seen))
         return Verdict.of([few], dictionary.left_out)
-    evidence = causes_of(at.ledger, at.member)
+    evidence = causes_of(at.ledger)
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
@@ -105,7 +104,7 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
     amplitude of its direction, which is a usual size.
     """
     # sum g g, the information on each amplitude: its standard error is one over the root.
-    den = at.ledger.sums[at.member, 1, 0].sum(axis=1)
+    den = at.ledger.sums[1, 0].sum(axis=1)
     hidden = np.minimum(SEEN / np.sqrt(np.maximum(den, 1e-300)), 1.0)
     found = []
     for d, direction in enumerate(dictionary.directions):
@@ -177,10 +176,10 @@ def _mended(at: Position, evidence: CauseEvidence) -> bool:
     There is none in the restarted windows: neither in the current ones nor, as long as the longest
     of them is young, in the one before it.
     """
-    ledger, k = at.ledger, at.member
-    if not ledger.epoch[k, -1] or not (ledger.sound[k] or ledger.age[k, -1] >= MENDED):
+    ledger = at.ledger
+    if not ledger.epoch[-1] or not (ledger.sound or ledger.age[-1] >= MENDED):
         return False
-    return quiet(ledger, k, evidence.log_e)
+    return quiet(ledger, evidence.log_e)
 
 
 def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int, int]]) -> bool:
@@ -195,7 +194,7 @@ def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int,
 
 
 def _past(at: Position) -> Finding:
-    count = int(at.ledger.age[at.member, -1])
+    count = int(at.ledger.age[-1])
     text = (
         f"The data did not fit the model earlier; in the last {count} samples nothing speaks "
         "against it, and what was wrong moves no unknown by a standard deviation any more."
@@ -229,7 +228,7 @@ def _cause(
     size, share = evidence.size[window, number], evidence.share[window, number]
     text, remedy = _words(direction, float(size), at)
     if window and direction.kind not in ("jump", "initial"):
-        text += f" in the last {int(at.ledger.age[at.member, window])} samples"
+        text += f" in the last {int(at.ledger.age[window])} samples"
     share = float(min(max(share, 0.0), 1.0))
     setting = _setting(direction, float(size), at)
     return Cause(direction.kind, direction.subject, text, share, remedy, setting)
@@ -265,7 +264,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
     """Return a cause of a size, and its remedy, in words."""
     name, amount = direction.subject, _amount(direction, size, at)
     unit = f" {direction.unit}" if direction.unit else ""
-    interval = float(at.ledger.times[at.member, 1])
+    interval = float(at.ledger.times[1])
     time = f" {at.time_unit}" if at.time_unit else ""
     typical, of = float(np.median(at.noise)), f" {at.unit}" if at.unit else ""
     side = "above" if size > 0 else "below"
@@ -329,11 +328,11 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
 
 def _following(at: Position, window: int) -> Iterator[Finding]:
     """Return whether successive errors of a sensor are correlated though no cause explains it."""
-    found = following(at.ledger, at.member, window)
+    found = following(at.ledger, window)
     if found is None:
         return
     name = at.sensors[found.sensor]
-    size = float(mean_squares(at.ledger, at.member)[window, found.sensor])
+    size = float(mean_squares(at.ledger)[window, found.sensor])
     if at.moving and size < 1.0:
         text = (
             f"Successive errors of sensor {name} follow each other (correlation "
@@ -356,7 +355,7 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     # Variance of a mean of AR(1) errors over that of independent ones.
     wider = (1.0 + rho) / (1.0 - rho)
     severity: Severity = "caution" if _mended(at, evidence) else "do not trust"
-    change = constancy(at.ledger, at.member, wider)
+    change = constancy(at.ledger, wider)
     if change is not None and change.p_value < RECORD:
         name = at.unknowns[int(np.argmax(np.abs(change.change)))]
         text = f"{name} has changed after {change.after:.0%} of the samples."
@@ -365,7 +364,7 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
         cause = Cause("jump", name, said, remedy=remedy, setting=_jump(name))
         p = change.p_value
         yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
-    found = disagreement(at.ledger, at.member, wider)
+    found = disagreement(at.ledger, wider)
     if found is not None and found[0] < RECORD:
         name = at.sensors[int(np.argmax(found[1]))]
         text = f"The sensors disagree on the unknowns, {name} the most."
@@ -375,7 +374,7 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
 
 def _noise(at: Position) -> Iterator[Finding]:
     """Return notes on noise that is not as stated: intervals and tests do not depend on it."""
-    ratio = np.sqrt(levels(at.ledger, at.member)[0])
+    ratio = np.sqrt(levels(at.ledger)[0])
     typical = float(np.median(ratio))
     if typical > LARGER or typical < SMALLER:
         text = f"The readings scatter by {typical:.2g} times the stated noise."
@@ -383,12 +382,12 @@ def _noise(at: Position) -> Iterator[Finding]:
 
 
 def _stuck(at: Position) -> Iterator[Finding]:
-    ledger, k = at.ledger, at.member
+    ledger = at.ledger
     # A steady process repeats readings rightly: a sensor is stuck if the model expects another
     # value.
-    off = np.abs(ledger.value[k] - ledger.last[k]) / at.noise
-    for i in np.flatnonzero((ledger.stuck[k] >= STANDS - 1) & (off > FAR)):
-        name, count = at.sensors[int(i)], int(ledger.stuck[k, i]) + 1
+    off = np.abs(ledger.value - ledger.last) / at.noise
+    for i in np.flatnonzero((ledger.stuck >= STANDS - 1) & (off > FAR)):
+        name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
         cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
@@ -396,7 +395,7 @@ def _stuck(at: Position) -> Iterator[Finding]:
 
 def _refused(at: Position) -> Iterator[Finding]:
     """Return whether the gate refuses more readings than a mishap now and then."""
-    shown, refused = at.ledger.shown[at.member]
+    shown, refused = at.ledger.shown
     share = refused.sum() / max(int(shown.sum()), 1)
     if share <= REFUSED:
         return

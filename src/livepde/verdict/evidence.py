@@ -1,5 +1,7 @@
 """Evidence in a ledger: e-values of causes, and tests whose statistics are chi-square.
 
+Ledgers are those of one member here: see `Ledger.of_member`.
+
 The e-value of a direction is the Bayes factor of its amplitude, free with a normal prior of size
 one, against zero, with the noise level integrated out. Under white errors of any size it is a
 martingale that begins at one, and so is a mean of several: the probability that it ever exceeds
@@ -71,14 +73,13 @@ class CauseEvidence:
     correlation: Array
 
 
-def levels(ledger: Ledger, member: int = 0) -> Array:
+def levels(ledger: Ledger) -> Array:
     """Return the variance of each sensor's noise in each window, in units of the stated one.
 
     From successive differences of the whitened innovations (von Neumann 1941), so that slow misfit
     does not count: shape (windows, sensors).
     """
-    count, _, squares, products, pairs = ledger.noise[member]
-    del count
+    _, _, squares, products, pairs = ledger.noise
     # Half of the squared differences: the ends of a window hardly count.
     # sum (r_k - r_(k-1))^2 / 2 = sum r r - sum r_k r_(k-1), up to the ends.
     differences = np.maximum(squares - products, 0.0)
@@ -93,19 +94,18 @@ def chance(statistic: float, freedom: int) -> float:
     return float(scipy.special.gammaincc(0.5 * freedom, 0.5 * statistic))
 
 
-def mean_squares(ledger: Ledger, member: int = 0) -> Array:
+def mean_squares(ledger: Ledger) -> Array:
     """Return mean squares of the whitened innovations, 1 if as stated, (windows, sensors)."""
-    count, _, squares, *_ = ledger.noise[member]
+    count, _, squares, *_ = ledger.noise
     found: Array = squares / np.maximum(count, 1.0)
     return found
 
 
-def causes_of(ledger: Ledger, member: int = 0) -> CauseEvidence:
-    """Return the evidence of all directions of one member."""
-    sums, noise = ledger.sums[member], ledger.noise[member]
-    spread = levels(ledger, member)
+def causes_of(ledger: Ledger) -> CauseEvidence:
+    """Return the evidence of all directions."""
+    sums, noise, spread = ledger.sums, ledger.noise, levels(ledger)
     log_e, size, share = _tested(sums, noise, spread, np.zeros_like(spread))
-    weights = _weights(ledger, member, log_e.shape[1])
+    weights = _weights(ledger, log_e.shape[1])
     total = float(scipy.special.logsumexp(log_e + weights)) if log_e.size else 0.0
     # The same test once more with first-order autoregressive errors: what slow noise explains as
     # well is no evidence for a cause. The smaller one counts.
@@ -123,9 +123,9 @@ class Following(NamedTuple):
     p_value: float
 
 
-def following(ledger: Ledger, member: int, window: int) -> Following | None:
+def following(ledger: Ledger, window: int) -> Following | None:
     """Return the sensor whose successive errors are correlated most, None if by chance."""
-    _, _, squares, products, pairs = ledger.noise[member][:, window]
+    _, _, squares, products, pairs = ledger.noise[:, window]
     rho = products / np.maximum(squares, 1e-300)
     # Under white errors the correlation of n pairs is normal with the variance 1/n.
     z = rho * np.sqrt(np.maximum(pairs, 1.0))
@@ -136,7 +136,7 @@ def following(ledger: Ledger, member: int, window: int) -> Following | None:
     return Following(worst, float(rho[worst]), p)
 
 
-def quiet(ledger: Ledger, member: int, log_e: Array) -> bool:
+def quiet(ledger: Ledger, log_e: Array) -> bool:
     """Return whether nothing speaks against the model in the windows that begin anew.
 
     Parameters
@@ -148,7 +148,7 @@ def quiet(ledger: Ledger, member: int, log_e: Array) -> bool:
         each = scipy.special.logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
         if not (each < -np.log(CAUSES)).all():
             return False
-    return following(ledger, member, -1) is None
+    return following(ledger, -1) is None
 
 
 def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:
@@ -199,13 +199,13 @@ def _left(sums: Array, noise: Array, log_e: Array, size: Array) -> tuple[Array, 
     return rho, (np.maximum(white, 0.0) + NU) / (count + NU)
 
 
-def _weights(ledger: Ledger, member: int, directions: int) -> Array:
+def _weights(ledger: Ledger, directions: int) -> Array:
     """Return logarithms of the prior weights of all directions, (windows, directions).
 
     Half for the window of all samples; the other windows share the rest, and each spends of it the
     less the more often it has begun anew, 1/((n + 1)(n + 2)), so that the sum is one at most.
     """
-    epoch = ledger.epoch[member].astype(float)
+    epoch = ledger.epoch.astype(float)
     windows = len(epoch)
     share = np.full(windows, 0.5 / max(windows - 1, 1)) / ((epoch + 1.0) * (epoch + 2.0))
     share[0] = 0.5
@@ -232,11 +232,11 @@ class Constancy:
     change: Array
 
 
-def _record(ledger: Ledger, member: int, wider: float) -> tuple[Array, Array]:
+def _record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
     """Return score, (blocks, sensors, k), and information in units of the noise that was found."""
-    spread = levels(ledger, member)[0] * wider
-    score = ledger.score[member] / spread[:, None]
-    return score, ledger.information[member] / spread[:, None, None]
+    spread = levels(ledger)[0] * wider
+    score = ledger.score / spread[:, None]
+    return score, ledger.information / spread[:, None, None]
 
 
 def _inverse(F: Array) -> tuple[Array, int]:
@@ -247,15 +247,15 @@ def _inverse(F: Array) -> tuple[Array, int]:
     return inverse, int(told.sum())
 
 
-def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy | None:
+def constancy(ledger: Ledger, wider: float = 1.0) -> Constancy | None:
     """Return the test of whether the unknowns stayed; None without a record.
 
     `wider` is by how much a mean of correlated errors varies more than one of independent errors.
     """
-    score, information = (part.sum(axis=1) for part in _record(ledger, member, wider))
+    score, information = (part.sum(axis=1) for part in _record(ledger, wider))
     k = score.shape[1]
     # A change is looked for between blocks of the record, each as many samples long.
-    used = int(ledger.seen[member] - 1) // int(ledger.length[member]) + 1
+    used = int(ledger.seen - 1) // int(ledger.length) + 1
     if not k or used < 4:
         return None
     F, B = information.cumsum(axis=0), score.cumsum(axis=0)
@@ -281,17 +281,17 @@ def constancy(ledger: Ledger, member: int = 0, wider: float = 1.0) -> Constancy 
         return None
     # Bonferroni's bound over the places that were looked at.
     p = min(1.0, looks * chance(best, rank))
-    after = (at + 1) * int(ledger.length[member]) / int(ledger.seen[member])
+    after = (at + 1) * int(ledger.length) / int(ledger.seen)
     return Constancy(p, min(after, 1.0), change)
 
 
-def disagreement(ledger: Ledger, member: int = 0, wider: float = 1.0) -> tuple[float, Array] | None:
+def disagreement(ledger: Ledger, wider: float = 1.0) -> tuple[float, Array] | None:
     """Return p-value and share of each sensor of the test of whether sensors agree; None without.
 
     Q = sum_i Bp_i^T F_i^+ Bp_i, Bp_i = B_i - F_i F^-1 sum B: the heterogeneity of the estimates of
     the unknowns by each sensor alone (Cochran 1954), chi-square under the model.
     """
-    score, information = (part.sum(axis=0) for part in _record(ledger, member, wider))
+    score, information = (part.sum(axis=0) for part in _record(ledger, wider))
     sensors, k = score.shape
     if sensors < 2 or not k:
         return None

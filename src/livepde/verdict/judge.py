@@ -152,10 +152,10 @@ class Judge:
         # A batch is summed when the next sample comes, so that whoever reads the verdict in between
         # sums a copy and changes nothing. None waits before the first sample, too.
         if np.count_nonzero(ledger.waiting % self.batch) < members:
-            M, ledger = self._batch_begun(ledger, sample)
+            M, ledger = self._begin_batch(ledger, sample)
         reached = ledger.reached[:, 1] >= sample.at.t
         if self.answered(members) and np.count_nonzero(reached) < members:
-            ledger = self._answered(ledger, sample)
+            ledger = self._extend_answers(ledger, sample)
         # In the order of `_at`; the rows that a square root lacks are zeros.
         row = [
             np.full((members, 1), sample.at.t),
@@ -202,11 +202,11 @@ class Judge:
         # Only as many rows as some member has waiting are summed.
         batch = max(int(ledger.waiting.max(initial=0)), 1)
         rows, there = ledger.rows[:, :batch], np.arange(batch) < ledger.waiting[:, None]
-        ledger = self._timed(ledger, rows, there)
+        ledger = self._with_interval(ledger, rows, there)
         used = rows[:, :, at["used"]] * there[:, :, None]
         Y = rows[:, :, at["Y"]].reshape(members, batch, self.rank, self.sensors)
         f, growth = self._effects(ledger, rows, used, due)
-        before, w = self._followed(ledger, rows, there, _in_windows(Y @ f, growth))
+        before, w = self._coordinates(ledger, rows, there, _in_windows(Y @ f, growth))
         # Innovations and g, not yet whitened, in one array: (members, batch, sensors, 1 + columns).
         d = rows[:, :, at["d"], None]
         found = np.concatenate([d, _in_windows(f, growth) + Y.swapaxes(-1, -2) @ before], axis=-1)
@@ -229,7 +229,7 @@ class Judge:
         refused = shown & ~(used > 0.0)
         times = np.concatenate([last[:, at["t"]], ledger.times[:, 1:]], axis=1)
         parts |= self._stuck(ledger, np.where(shown, z, np.nan)) | {
-            "sound": _sounded(ledger, due),
+            "sound": _sound(ledger, due),
             "shown": ledger.shown + np.stack([shown.sum(axis=1), refused.sum(axis=1)], axis=1),
             "waiting": np.zeros_like(ledger.waiting),
             "age": np.where(due, 0, ledger.age) + ledger.waiting[:, None],
@@ -239,7 +239,7 @@ class Judge:
         }
         return M @ w, changed(ledger, **parts)
 
-    def _followed(
+    def _coordinates(
         self, ledger: Ledger, rows: Array, there: Mask, effect: Array
     ) -> tuple[Array, Array]:
         """Return w before the update of each sample that waits, and w - Y f of the last one.
@@ -272,7 +272,7 @@ class Judge:
         since = t - float(ledger.rows[k, 0, 0])
         return known if np.isfinite(known) else since if since > 0.0 else 1.0
 
-    def _timed(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
+    def _with_interval(self, ledger: Ledger, rows: Array, there: Mask) -> Ledger:
         """Return the ledger with the usual interval, the first one, and the first predictions."""
         if np.isfinite(ledger.times[:, 1]).all() and np.isfinite(ledger.first).all():
             return ledger
@@ -302,7 +302,7 @@ class Judge:
         stuck = np.where(changes > 0, 0, ledger.stuck) + since
         return {"stuck": stuck, "value": value[:, -1]}
 
-    def _batch_begun(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
+    def _begin_batch(self, ledger: Ledger, sample: ScoredSample) -> tuple[Array, Ledger]:
         """Return M and the ledger of members whose batch is full, or the first one."""
         full = ledger.waiting == self.batch
         begins = full | (ledger.waiting == 0)
@@ -312,14 +312,14 @@ class Judge:
             found, settled = self.summed_up(ledger, sample.M)
             w[full] = found[full]
             ledger = settled if full.all() else _where(full, settled, ledger)
-        w = self._window_begun(ledger, sample, ledger.due & begins[:, None], w)
+        w = self._begin_windows(ledger, sample, ledger.due & begins[:, None], w)
         kept = np.zeros_like(ledger.w)
         kept[:, :r] = w[:, : self.rank]
         chosen = begins[:, None, None]
         M = np.where(chosen, self._eye[:, :r], sample.M)
         return M, changed(ledger, w=np.where(chosen, kept, ledger.w))
 
-    def _window_begun(self, ledger: Ledger, sample: ScoredSample, due: Mask, w: Array) -> Array:
+    def _begin_windows(self, ledger: Ledger, sample: ScoredSample, due: Mask, w: Array) -> Array:
         """Return w with that of windows that begin: nothing but jumps of the unknowns."""
         count = len(self.dictionary)
         if not due.any() or not count:
@@ -341,8 +341,8 @@ class Judge:
     def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
         """Return f of the samples that wait, (members, batch, sensors, directions).
 
-        And by what it is larger in each window, (members, batch, windows, directions): a drift
-        begins with its window and grows by one unit with each sample.
+        And its factor in each window, (members, batch, windows, directions): a drift begins with
+        its window and grows by one unit with each sample.
         """
         at, (members, batch, _) = self._at, rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
@@ -368,7 +368,7 @@ class Judge:
         low, slope = ledger.readings.reshape(len(known), 2, 1, -1).swapaxes(0, 1)
         return np.where(np.isnan(known), low + since * slope, known)
 
-    def _answered(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
+    def _extend_answers(self, ledger: Ledger, sample: ScoredSample) -> Ledger:
         """Return the ledger with responses of the process that reach a sample at least.
 
         One step of the process answers for several samples, which interpolate between its ends.
@@ -387,15 +387,15 @@ class Judge:
             unit = self._unit(ledger, k, t)
             now = Now(sample.u[k], q[k], sample.at.member(k), unit, rest)
             if not np.isfinite(reached[k, 1]):
-                p[k] = process.begun()
-                readings[k] = process.shown(p[k], now), np.zeros_like(readings[k, 1])
+                p[k] = process.start()
+                readings[k] = process.readings(p[k], now), np.zeros_like(readings[k, 1])
                 reached[k] = t
                 continue
             begin = float(reached[k, 1])
             h = max(stride(int(ledger.seen[k])) * unit, t - begin)
             p[k] = process.advance(p[k], now, h)
             low = readings[k, 0] + (begin - reached[k, 0]) * readings[k, 1]
-            readings[k] = low, (process.shown(p[k], now) - low) / h
+            readings[k] = low, (process.readings(p[k], now) - low) / h
             reached[k] = begin, begin + h
         return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
 
@@ -417,14 +417,15 @@ def _in_windows(effect: Array, growth: Array) -> Array:
     return (effect[..., None, :] * growth[:, :, None]).reshape(*effect.shape[:3], -1)
 
 
-def _sounded(ledger: Ledger, due: Mask) -> Mask:
+def _sound(ledger: Ledger, due: Mask) -> Mask:
     """Return whether nothing spoke against the model in the longest window that ended last."""
     ends = due[:, -1] & (ledger.age[:, -1] > 0)
     if not ends.any():
         return ledger.sound
     sound = ledger.sound.copy()
     for k in np.flatnonzero(ends).tolist():
-        sound[k] = quiet(ledger, k, causes_of(ledger, k).log_e)
+        one = ledger.of_member(k)
+        sound[k] = quiet(one, causes_of(one).log_e)
     return sound
 
 

@@ -154,6 +154,10 @@ class Ledger:
             value=never,
         )
 
+    def of_member(self, k: int) -> Ledger:
+        """Return the ledger of one member, whose arrays have no axis of members."""
+        return changed(self, **{name: value[k] for name, value in vars(self).items()})
+
     @property
     def due(self) -> Mask:
         """Windows that begin anew with the next sample, shape (members, windows)."""

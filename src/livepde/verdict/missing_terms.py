@@ -154,7 +154,7 @@ class Process:
         others = [name for name in self.model.channels if name not in taken]
         return [Term("channel", name, load=_gain(self.model, name)) for name in others]
 
-    def begun(self) -> Array:
+    def start(self) -> Array:
         """Return the responses at the start, (terms, n): that to another initial state."""
         p: Array = self._lifts.copy()
         p[[term.kind == "initial" for term in self.terms]] = self.level * self.model.X.free
@@ -173,7 +173,7 @@ class Process:
         found: Array = solved * free + self._lifts
         return found
 
-    def shown(self, p: Array, now: Now) -> Array:
+    def readings(self, p: Array, now: Now) -> Array:
         """Return the readings of the responses, shape (terms, sensors)."""
         physical = self.model.latent.value(now.q)
         H, _ = self.observed.jacobian(now.u, physical, now.moment)
