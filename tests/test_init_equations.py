@@ -270,4 +270,6 @@ def test_the_case_runs_as_written(here, name):
 
 
 def text(value: Any) -> str:
-    return "" if value is None else json.dumps(value) if isinstance(value, list | bool) else str(value)
+    if value is None:
+        return ""
+    return json.dumps(value) if isinstance(value, list | bool) else str(value)
