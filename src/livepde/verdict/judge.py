@@ -341,8 +341,8 @@ class Judge:
     def _effects(self, ledger: Ledger, rows: Array, used: Array, due: Mask) -> tuple[Array, Array]:
         """Return f of the samples that wait, (members, batch, sensors, directions).
 
-        And its factor in each window, (members, batch, windows, directions): a drift begins with its
-        window and grows by one unit with each sample.
+        And its factor in each window, (members, batch, windows, directions): a drift begins with
+        its window and grows by one unit with each sample.
         """
         at, (members, batch, _) = self._at, rows.shape
         t, h = rows[:, :, 0], rows[:, :, at["predicted"]]
