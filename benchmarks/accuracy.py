@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from benchmarks.jobs import each
 from benchmarks.offline import Fit, Trajectory, fit
 from benchmarks.problems import PROBLEMS, Data, Problem
 from benchmarks.scoring import (
@@ -32,7 +33,6 @@ from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, AutoLaw, GradientLaw, Replay, ResidualDamping, SensitivityLaw
 from livepde.linalg import Array
 from livepde.observation import Discrepancy, Observation, Tikhonov
-from livepde.progress import watched
 from livepde.runs.outcome import Check, Outcome
 from livepde.stepping import StepFailed
 
@@ -229,18 +229,24 @@ def accuracy(
         for level in problem.chosen(levels)
         for seed in range(seeds if level is not None else 1)
     ]
-    for problem, level, seed in watched(jobs, len(jobs), "data sets") if progress else jobs:
-        try:
-            data = problem.data(level, seed)
-        except (LivepdeError, StepFailed) as error:
-            notes.append(f"{problem.name}: not run, {error}")
+    for (problem, level, _), scores in each(_scores, jobs, "data sets", progress=progress):
+        if isinstance(scores, str):
+            notes.append(scores)
             continue
-        for name, contender in ROWS.items():
-            score = scored(contender, data)
-            if score is not None:
-                found.setdefault((problem.name, level, name), []).append(score)
+        for name, score in scores.items():
+            found.setdefault((problem.name, level, name), []).append(score)
     tables = table_of(found, limit=EACH_SAMPLE)
     return Outcome(tables=tables, checks=_checks(found), notes=[*dict.fromkeys(notes), *NOTES])
+
+
+def _scores(problem: Problem, level: float | None, seed: int) -> dict[str, Score] | str:
+    """Return the score of each row on a data set, or why there is no such data set."""
+    try:
+        data = problem.data(level, seed)
+    except (LivepdeError, StepFailed) as error:
+        return f"{problem.name}: not run, {error}"
+    found = {name: scored(contender, data) for name, contender in ROWS.items()}
+    return {name: score for name, score in found.items() if score is not None}
 
 
 def _checks(found: Found) -> list[Check]:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import find_cases
+from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.errors import LivepdeError
 from livepde.fem import Field, LogNormal, Normal, Piecewise, dot, grad, interval, linear
@@ -29,7 +30,6 @@ from livepde.model import Model
 from livepde.models import burgers
 from livepde.observation import Observation, Points, Subdomain
 from livepde.plots import NORMAL_95
-from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.runs import Check, Outcome, Table, drive, unexplained
 from livepde.stepping import Advance, simulate
@@ -379,32 +379,24 @@ def alarms(seeds: int = 5, *, few: bool = False, progress: bool = False) -> Outc
         One run without a jump of each process, and one data set for each wrong model.
     """
     calm_runs, twins = (1, 1) if few else (CALM_RUNS, TWINS)
-    jumped = [
+    runs = [
         (name, seed, sign * JUMP) for name in PROCESSES for seed in range(seeds) for sign in (1, -1)
     ]
-    todo: list[Any] = [
-        *jumped,
-        *((name, seed, 0.0) for name in PROCESSES for seed in range(calm_runs)),
-        *((name, seed) for name in SUSPECTS for seed in range(twins)),
-        *CASES,
-    ]
+    runs += [(name, seed, 0.0) for name in PROCESSES for seed in range(calm_runs)]
     jumps: dict[str, list[Told]] = {name: [] for name in PROCESSES}
     quiet: dict[str, list[Told]] = {name: [] for name in PROCESSES}
+    for (name, _, change), told in each(_followed, runs, "runs", progress=progress):
+        (jumps if change else quiet)[name].append(told)
     models: dict[str, list[tuple[bool, bool]]] = {name: [] for name in SUSPECTS}
+    pairs = [(name, seed) for name in SUSPECTS for seed in range(twins)]
+    for (name, _), doubted in each(_warned, pairs, "wrong models", progress=progress):
+        models[name].append(doubted)
     real, notes = [], []
-    for name, *rest in watched(todo, len(todo), "runs") if progress else todo:
-        if len(rest) == 1:
-            models[name].append(warned(SUSPECTS[name], rest[0]))
-        elif len(rest) == 2:
-            seed, change = rest
-            told = followed(PROCESSES[name](), seed, change, CALM)
-            (jumps if change else quiet)[name].append(told)
+    for (name, *_, wrong), said in each(_case, CASES, "cases", progress=progress):
+        if isinstance(said, str):
+            notes.append(said)
         else:
-            case, settings, wrong = rest
-            try:
-                real.append((name, wrong, _case(case, settings)))
-            except LivepdeError as error:
-                notes.append(f"{name}: not run, {error}")
+            real.append((name, wrong, said))
     tables = [_jumps(jumps), _false(jumps, quiet), _models(models, real)]
     return Outcome(tables, _checks(jumps, quiet, models, real), [*NOTES, *notes])
 
@@ -415,13 +407,24 @@ NOTES = (
 )
 
 
-def _case(name: str, settings: Mapping[str, Any]) -> bool:
-    """Return whether a run of a case says that its model does not explain the data."""
-    path = next((path for path in find_cases() if path.stem == name), None)
-    if path is None:
-        raise LivepdeError(f"there is no case {name}.toml beside the other cases.")
-    prepared = load(path, settings=settings).prepare()
-    run = drive(prepared.identifier, prepared.stream, journal=prepared.journal())
+def _followed(name: str, seed: int, change: float) -> Told:
+    return followed(PROCESSES[name](), seed, change, CALM)
+
+
+def _warned(name: str, seed: int) -> tuple[bool, bool]:
+    return warned(SUSPECTS[name], seed)
+
+
+def _case(row: str, name: str, settings: Mapping[str, Any], _wrong: bool) -> bool | str:
+    """Return whether a run of a case is doubted by itself, or why the case cannot be run."""
+    try:
+        path = next((path for path in find_cases() if path.stem == name), None)
+        if path is None:
+            return f"{row}: not run, there is no case {name}.toml beside the other cases."
+        prepared = load(path, settings=settings).prepare()
+        run = drive(prepared.identifier, prepared.stream, journal=prepared.journal())
+    except LivepdeError as error:
+        return f"{row}: not run, {error}"
     return unexplained(run.result.to_xarray())
 
 

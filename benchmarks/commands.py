@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from livepde.cli.experiments import conducted
+from livepde.cli.experiments import run_experiment
 from livepde.cli.options import JsonOption
 from livepde.cli.printing import named, report_outcome
 from livepde.runs.outcome import Outcome
@@ -126,7 +126,7 @@ class Program:
                 given |= {key: shared[key] for key in shared if key in parameters}
                 words = self._words(context)
                 title = (inspect.getdoc(function) or "").split("\n")[0].rstrip(".")
-                outcome = conducted(lambda: function(**given), shared["out"], words, title)
+                outcome = run_experiment(lambda: function(**given), shared["out"], words, title)
                 report_outcome(outcome, words, shared["as_json"])
 
             shared = {

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.jobs import each
 from livepde.fem import (
     Field,
     Inputs,
@@ -37,7 +38,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
 from livepde.plots import NORMAL_95
-from livepde.progress import watched
 from livepde.result import Estimate
 from livepde.runs import unexplained
 from livepde.runs.outcome import Check, Outcome, Table
@@ -185,8 +185,8 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
     """Run all problems, each with so many twins."""
     todo = [(name, seed) for name in PROBLEMS for seed in range(twins)]
     found: dict[str, list[Twin]] = {name: [] for name in PROBLEMS}
-    for name, seed in watched(todo, len(todo), "twins") if progress else todo:
-        found[name].append(twin(PROBLEMS[name], seed))
+    for (name, _), scored in each(_twin, todo, "twins", progress=progress):
+        found[name].append(scored)
     rows, checks = [], []
     for name, several in found.items():
         inside = {level: _mean([one.inside[level] for one in several]) for level in LEVELS}
@@ -235,6 +235,10 @@ def coverage(twins: int = 200, *, progress: bool = False) -> Outcome:
 
 def _mean(values: Sequence[float]) -> float:
     return float(np.mean(values))
+
+
+def _twin(name: str, seed: int) -> Twin:
+    return twin(PROBLEMS[name], seed)
 
 
 def twin(problem: Problem, seed: int) -> Twin:

@@ -12,7 +12,6 @@ import runpy
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,8 @@ import livepde as lp
 from benchmarks import ROOT
 from benchmarks.honest.linear import diffusion, fine_times
 from benchmarks.honest.problems.borehole import Borehole
+from benchmarks.jobs import each
 from livepde.cases import load
-from livepde.progress import watched
 from livepde.runs.outcome import Check, Outcome, Table
 
 __all__ = ["FOLDER", "first_hour", "write"]
@@ -189,11 +188,8 @@ def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = F
         Truths of each walk.
     """
     todo = [(walk, seed) for walk in walks for seed in range(seeds)]
-    stream: Iterator[tuple[str, dict[str, float]]] = (
-        (walk, _scores(walk, seed)) for walk, seed in todo
-    )
     scores: dict[tuple[str, str], list[float]] = {}
-    for walk, found in watched(stream, len(todo), "truths") if progress else stream:
+    for (walk, _), found in each(_scores, todo, "truths", progress=progress):
         for name, score in found.items():
             scores.setdefault((walk, name), []).append(score)
     rows, checks = [], []

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from livepde.cases import Wiring, load
+from livepde.cases import LiveCase, load
 from livepde.cases.new_case import write_template
 from livepde.result import Estimate
 from livepde.runs import Sink
@@ -47,7 +47,7 @@ def main() -> dict[str, tuple[float, float]]:
         folder = Path(name)
         case, data = write_template(folder)
         # A journal that is there already is gone on with, also after a crash.
-        with Wiring(load(case), Rows(measured(data)), path=folder / "journal.sqlite") as wiring:
+        with LiveCase(load(case), Rows(measured(data)), path=folder / "journal.sqlite") as wiring:
             live = wiring.live([Printer()])
             live.run()
             for (kind, channel), number in live.journal.counts.items():

@@ -27,18 +27,17 @@ from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.observation import Discrepancy, Full, Subdomain, Tikhonov
 from livepde.reproduce import seed, seed_excited
-from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 LEVELS = (0.0, 0.01, 0.05, 0.10)
 SEEDS = tuple(range(100, 110))
 TARGET = 1.3
-EXAMPLES: dict[str, tuple[Any, Any, tuple[float, ...], tuple[float, ...]]] = {
-    # module, model and sensors, gains, c1; a gain counts in units of 1/std^2
-    "seed": (seed, seed.build(std=0.01), (1e2, 1e4, 1e6, 1e8), (0.1, 1.0, 10.0, 100.0)),
+EXAMPLES: dict[str, tuple[Any, float, tuple[float, ...], tuple[float, ...]]] = {
+    # module, prior deviation of q, gains, c1; a gain counts in units of 1/std^2
+    "seed": (seed, 0.01, (1e2, 1e4, 1e6, 1e8), (0.1, 1.0, 10.0, 100.0)),
     "seed-excited": (
         seed_excited,
-        seed_excited.build(),
+        1.0,
         (10.0, 100.0, 1e3, 1e5),
         (1.0, 100.0, 1e3),
     ),
@@ -65,20 +64,11 @@ def smoothed(observation: Any, level: float) -> Any:
 
 def compare(name: str, level: float, number: int) -> tuple[float, float]:
     """Print and return the error of the law that tunes itself, and the best of the grid."""
-    module, (model, observation), gains, damping = EXAMPLES[name]
-    twin = Twin(
-        scheme=ImplicitEuler(),
-        model=model,
-        observation=observation,
-        q_true=module.q_true,
-        u_true=module.u_true,
-        times=module.TIMES,
-    )
+    module, std, gains, damping = EXAMPLES[name]
+    twin = module.twin_of(std)
+    observation, u0 = twin.observation, module.start
     samples = list(WhiteNoise(twin, level, number) if level else twin)
     sensors = smoothed(observation, level) if level else observation
-
-    def u0(x: Any) -> Any:
-        return module.u_true(x, 0.0)
 
     own = final(twin, samples, observation, GradientLaw(gain="auto"), u0)
     grid = {

@@ -9,7 +9,7 @@ learned. With exact data it picks the largest c_1 of the grid, and with it the w
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -35,9 +35,7 @@ class Tried:
 def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
     """Run a law and return its objective; infinity if a step failed."""
     X, R = twin.model.X, twin.observed.split().R
-    identifier = lp.Identifier(
-        twin.model, twin.observation, law, q0=0.0, u0=lambda x: seed.u_true(x, 0.0)
-    )
+    identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=seed.start)
     squares = []
     for sample in twin:
         estimate = identifier.step(sample.t, sample.z)
@@ -49,15 +47,7 @@ def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
 
 def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -> list[Tried]:
     """Search c_1 for the paper's first experiment."""
-    model, omega = seed.build()
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=seed.TIMES[:samples],
-    )
+    twin = seed.twin_of(times=seed.TIMES[:samples])
     laws = {c1: lp.GradientLaw(gain, lp.laws.ResidualDamping(c1)) for c1 in steps}
     return [try_out(twin, law, (c1,)) for c1, law in laws.items()]
 
@@ -70,19 +60,10 @@ def noisy(
     smooth: bool = False,
 ) -> list[Tried]:
     """Search mu and nu for the paper's second experiment, with alpha = 0 or G_alpha in V~."""
-    model, omega = seed.build()
+    twin = seed.twin_of(times=0.6 * np.arange(samples), noise=RelativeNoise(level))
     if smooth:
         rule = Tikhonov("V", Discrepancy(level=level))
-        omega = lp.Subdomain(omega.omega, reconstruction=rule)
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=0.6 * np.arange(samples),
-        noise=RelativeNoise(level),
-    )
+        twin = replace(twin, observation=replace(twin.observation, reconstruction=rule))
     found = []
     for mu, nu in product(steps, steps):
         law = lp.GradientLaw(gain, lp.laws.ConstantDamping(mu), nu=nu)

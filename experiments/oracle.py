@@ -94,18 +94,9 @@ def follow(name: str, twin: Twin, law: lp.GradientLaw, c: Constants, u0: Any, nu
 
 def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Found]:
     """Run all rules on the paper's example, from the exact initial state."""
-    model, omega = seed.build()
     noise = RelativeNoise(level) if level else None
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=seed.TIMES[:samples],
-        noise=noise,
-    )
-    spaces = Spaces(model, twin.observed)
+    twin = seed.twin_of(times=seed.TIMES[:samples], noise=noise)
+    spaces = Spaces(twin.model, twin.observed)
     c = constants(spaces, twin.q, twin.states[::10], gain=gain)
     zero = Norms()
     nothing = Errors(0.0, 0.0, r=zero, p=zero, d=zero, r_alpha=zero, Pu=0.0, rate=0.0, theta=0.0)
@@ -116,7 +107,7 @@ def run(gain: float = 100.0, samples: int = 41, level: float = 0.0) -> list[Foun
         "oracle mu and nu": (Oracle(c, nothing, noisy=level > 0), True),
     }
     return [
-        follow(name, twin, lp.GradientLaw(gain, rule), c, lambda x: seed.u_true(x, 0.0), nu)
+        follow(name, twin, lp.GradientLaw(gain, rule), c, seed.start, nu)
         for name, (rule, nu) in rules.items()
     ]
 
@@ -129,16 +120,8 @@ def main() -> None:
             energy = found.errors[-1].energy / found.errors[0].energy
             print(f"{found.name:<28} {found.error:10.4g} {energy:17.4g} {found.nu:11.4g}")
     found = run()[2]
-    model, omega = seed.build()
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=omega,
-        q_true=seed.q_true,
-        u_true=seed.u_true,
-        times=[0, 1],
-    )
-    c = constants(Spaces(model, twin.observed), twin.q, twin.states, gain=100.0)
+    twin = seed.twin_of(times=[0, 1])
+    c = constants(Spaces(twin.model, twin.observed), twin.q, twin.states, gain=100.0)
     print(f"\n{found.name}:")
     print(bounds(found.errors, c))
     print(conditions(found.errors, c, floor=FLOOR))

@@ -21,8 +21,6 @@ from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Track, track
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import ImplicitEuler
-from livepde.streams import Twin
 
 __all__ = ["EXPECTED", "LAWS", "law", "relatives"]
 
@@ -57,16 +55,7 @@ def compare(
     refusal = ""
     for problem in problems:
         source, gain = SOURCES[problem]
-        model, _ = source.build()
-        start = partial(source.u_true, t=0.0)
-        full = Twin(
-            scheme=ImplicitEuler(),
-            model=model,
-            observation=Full(),
-            q_true=source.q_true,
-            u_true=source.u_true,
-            times=source.TIMES,
-        )
+        full = source.twin_of(observation=Full())
         for seen, observation in observations().items():
             twin = replace(full, observation=observation)
             for name in LAWS:
@@ -74,11 +63,11 @@ def compare(
                     head = [problem, seen, name, gain, pull, twin.baseline(0.0)]
                     try:
                         identifier = Identifier(
-                            model,
+                            full.model,
                             observation,
                             law(name, gain, pull),
                             q0=0.0,
-                            u0=start,
+                            u0=source.start,
                             halvings=0,
                         )
                     except LawError as error:

@@ -25,12 +25,10 @@ from livepde.errors import ConfigurationError
 from livepde.identifier import Sample
 from livepde.laws import ResidualDamping
 from livepde.linalg import Array
-from livepde.model import Model
 from livepde.observation import Discrepancy, Full, Pseudoinverse, Tikhonov
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import ImplicitEuler
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
 
 __all__ = ["NoisyRun", "WhiteNoise", "noisy_run", "seed_excited_noise"]
@@ -92,17 +90,8 @@ Runs: TypeAlias = dict[tuple[float, Kind, bool], list[NoisyRun]]
 
 
 @cache
-def _problem() -> tuple[Model, Twin]:
-    model, full = seed_excited.build()
-    twin = Twin(
-        scheme=ImplicitEuler(),
-        model=model,
-        observation=full,
-        q_true=seed_excited.q_true,
-        u_true=seed_excited.u_true,
-        times=seed_excited.TIMES,
-    )
-    return model, twin
+def _twin() -> Twin:
+    return seed_excited.twin_of()
 
 
 def noisy_run(
@@ -132,7 +121,7 @@ def noisy_run(
     progress
         True: show a progress bar.
     """
-    model, twin = _problem()
+    twin = _twin()
     stream = _stream(twin, level, seed, kind)
     full, smoothed = Full(reconstruction=Pseudoinverse()), None
     if smoothing:
@@ -142,12 +131,12 @@ def noisy_run(
         full = Full(reconstruction=Tikhonov("V", Discrepancy(TAU, level=left)))
         stream = smoothed = smoother(stream)
     identifier = paper.identifier(
-        model,
+        twin.model,
         full,
         gain=GAIN if gain is None else gain,
         damping=ResidualDamping(C1 if c1 is None else c1),
         D=seed_excited.D,
-        u0=lambda x: seed_excited.u_true(x, 0.0),
+        u0=seed_excited.start,
     )
     label = f"{level:.0%}, seed {seed}, {'smoothed' if smoothing else 'raw'}"
     errors, rates = [], []
@@ -193,7 +182,6 @@ def seed_excited_noise(*, quick: bool = False, progress: bool = False) -> Outcom
     progress
         Show a progress bar for every run.
     """
-    _, twin = _problem()
     cases, seeds = (WHITE[:1], SEEDS[:1]) if quick else (CASES, SEEDS)
     runs = {
         (level, kind, smoothing): [
@@ -202,7 +190,7 @@ def seed_excited_noise(*, quick: bool = False, progress: bool = False) -> Outcom
         for level, kind in cases
         for smoothing in (True, False)
     }
-    tables = [_table(runs, len(seeds), twin.baseline(0.0))]
+    tables = [_table(runs, len(seeds), _twin().baseline(0.0))]
     mean = {key: float(np.mean([one.error for one in found])) for key, found in runs.items()}
     worse = {
         level: mean[level, kind, False] / mean[level, kind, True]

@@ -13,7 +13,7 @@ import numpy as np
 
 import livepde as lp
 from livepde.diagnostics import OnlineTracker, TwinTracker, constants, stopping_time
-from livepde.observation import Tikhonov
+from livepde.observation import Discrepancy, Tikhonov
 from livepde.reproduce import seed_excited as excited
 from livepde.streams import RelativeNoise, Twin
 
@@ -51,17 +51,10 @@ SETTINGS = [
 
 def twin(setting: Setting, seed: int, samples: int) -> Twin:
     """Return the noisy twin of a setting."""
-    from livepde.observation import Discrepancy
-
-    model, _ = excited.build()
     rule: Any = Discrepancy(level=setting.level) if setting.alpha is None else setting.alpha
     full = lp.Full(reconstruction=Tikhonov("V", rule))
-    return Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
+    return excited.twin_of(
         observation=full,
-        q_true=excited.q_true,
-        u_true=excited.u_true,
         times=setting.h * np.arange(samples),
         noise=RelativeNoise(setting.level),
         seed=seed,

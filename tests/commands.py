@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -46,6 +49,16 @@ def shell(*arguments: str, **options) -> subprocess.CompletedProcess[str]:
     code = "import sys; from livepde.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, **options)
+
+
+def cut(whole: str, target: str, samples: int) -> None:
+    """Copy a run as if it had been killed within its sample of this number."""
+    shutil.copytree(whole, target)
+    with closing(sqlite3.connect(f"{target}/{JOURNAL}")) as journal, journal:
+        journal.execute("DELETE FROM checkpoints")
+        journal.execute("DELETE FROM samples WHERE id > ?", (samples,))
+        journal.execute("DELETE FROM estimates WHERE id >= ?", (samples,))
+        journal.execute("DELETE FROM fields WHERE id >= ?", (samples,))
 
 
 def start(*arguments: str) -> subprocess.Popen[str]:

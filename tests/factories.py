@@ -152,6 +152,18 @@ def truth(
     return [u for _, u in lp.simulate(model, q, u0, list(times), control, inputs)]
 
 
+def broad(value: float) -> lp.Normal:
+    """Return a prior around a value that hardly says anything."""
+    return lp.Normal(value, max(abs(value), 1.0))
+
+
+def last_state(model: lp.Model, u0: Any, times: Any, inputs: Any = None) -> np.ndarray:
+    """Return the state at the vertices at the last time, with the unknowns of the prior."""
+    control = lp.Advance(lp.Alexander2())
+    *_, (_, u) = lp.simulate(model, model.initial_parameter(), u0, times, control, inputs)
+    return model.state_block.at_vertices @ u
+
+
 def advanced(
     forward: ForwardStage,
     u: np.ndarray,

@@ -60,7 +60,7 @@ def run(scale, noise, strict):
     return np.array(q), np.array(ok)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("scale", SCALES)
 def test_an_accepted_stage_is_solved(scale, noise):
@@ -71,7 +71,7 @@ def test_an_accepted_stage_is_solved(scale, noise):
     assert ok.all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("scale", SCALES[1:])
 def test_the_run_is_the_same_in_every_unit(scale, noise):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from factories import broad, last_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,18 +13,6 @@ from livepde.cases import load
 from livepde.diagnostics import check_model
 from livepde.errors import CaseError, ModelError
 from livepde.models import advection_diffusion
-from livepde.stepping import Advance, Alexander2, simulate
-
-
-def number(value: float) -> lp.Normal:
-    return lp.Normal(value, max(abs(value), 1.0))
-
-
-def run(model, u0, times, inputs=None):
-    """Return the state at the vertices at the last time."""
-    steps = simulate(model, model.initial_parameter(), u0, times, Advance(Alexander2()), inputs)
-    *_, (_, u) = steps
-    return model.state_block.at_vertices @ u
 
 
 def steady(x, w, kappa):
@@ -35,8 +24,8 @@ def test_steady_profile(w):
     errors = []
     for cells in (20, 40):
         mesh = lp.interval(0.0, 1.0, cells)
-        model = advection_diffusion(mesh, number(0.5), {"left": 0.0, "right": 1.0}, v=number(w))
-        found = run(model, 0.0, np.linspace(0, 20, 41))
+        model = advection_diffusion(mesh, broad(0.5), {"left": 0.0, "right": 1.0}, v=broad(w))
+        found = last_state(model, 0.0, np.linspace(0, 20, 41))
         errors.append(np.abs(found - steady(mesh.p[0], w, 0.5)).max())
     assert errors[0] < 0.02
     assert errors[1] < 0.27 * errors[0]  # second order
@@ -45,8 +34,8 @@ def test_steady_profile(w):
 def test_stabilised_it_is_exact_at_the_vertices_however_fast():
     mesh = lp.interval(0.0, 1.0, 10)
     sides = {"left": 0.0, "right": 1.0}
-    model = advection_diffusion(mesh, number(0.01), sides, v=number(1.0), stabilise=True)
-    found = run(model, 0.0, np.linspace(0, 20, 41))
+    model = advection_diffusion(mesh, broad(0.01), sides, v=broad(1.0), stabilise=True)
+    found = last_state(model, 0.0, np.linspace(0, 20, 41))
     assert found == pytest.approx(steady(mesh.p[0], 1.0, 0.01), abs=1e-9)
 
 
@@ -55,11 +44,9 @@ def test_a_warm_spot_drifts_with_the_water_and_spreads():
     """A Gaussian; the water follows the head, w = ratio K dH(t)/L, here back and forth."""
     kappa, K, L, ratio, start = 0.02, 3.0, 2.0, 1.5, 0.05
     mesh = lp.interval(-4.0, 4.0, 400)
-    model = advection_diffusion(
-        mesh, number(kappa), {"boundary": 0.0}, K=number(K), L=L, ratio=ratio
-    )
+    model = advection_diffusion(mesh, broad(kappa), {"boundary": 0.0}, K=broad(K), L=L, ratio=ratio)
     end = 2.0
-    found = run(
+    found = last_state(
         model,
         lambda x: np.exp(-(x[0] ** 2) / (4 * start)),
         np.linspace(0, end, 201),
@@ -74,19 +61,19 @@ def test_dispersion_grows_with_the_speed_of_either_sign():
     mesh = lp.interval(0.0, 1.0, 40)
     sides = {"left": 0.0, "right": 1.0}
     for w in (-2.0, 2.0):
-        model = advection_diffusion(mesh, number(0.3), sides, v=number(w), dispersivity=number(0.1))
-        plain = advection_diffusion(mesh, number(0.5), sides, v=number(w))
+        model = advection_diffusion(mesh, broad(0.3), sides, v=broad(w), dispersivity=broad(0.1))
+        plain = advection_diffusion(mesh, broad(0.5), sides, v=broad(w))
         times = np.linspace(0, 5, 11)
-        assert np.allclose(run(model, 0.0, times), run(plain, 0.0, times))
+        assert np.allclose(last_state(model, 0.0, times), last_state(plain, 0.0, times))
 
 
 def test_flux_and_head_add_up():
     mesh = lp.interval(0.0, 1.0, 20)
     sides, times = {"left": 1.0, "right": 0.0}, np.linspace(0, 0.5, 11)
-    both = advection_diffusion(mesh, number(0.1), sides, v=number(0.5), K=number(2.0), L=4.0)
-    one = advection_diffusion(mesh, number(0.1), sides, v=number(0.75))
-    found = run(both, 0.0, times, lambda t: {"dH": 0.5})
-    assert np.allclose(found, run(one, 0.0, times))
+    both = advection_diffusion(mesh, broad(0.1), sides, v=broad(0.5), K=broad(2.0), L=4.0)
+    one = advection_diffusion(mesh, broad(0.1), sides, v=broad(0.75))
+    found = last_state(both, 0.0, times, lambda t: {"dH": 0.5})
+    assert np.allclose(found, last_state(one, 0.0, times))
 
 
 @pytest.mark.slow
@@ -114,9 +101,9 @@ def test_random_columns_pass_the_checks(kappa, flux, dispersivity, seed):
 def test_what_cannot_be_is_said():
     mesh = lp.interval(0.0, 1.0, 4)
     with pytest.raises(ModelError, match="give v"):
-        advection_diffusion(mesh, number(1.0))
+        advection_diffusion(mesh, broad(1.0))
     with pytest.raises(ModelError, match="L must be positive"):
-        advection_diffusion(mesh, number(1.0), v=number(1.0), L=0.0)
+        advection_diffusion(mesh, broad(1.0), v=broad(1.0), L=0.0)
 
 
 CASE = """

@@ -14,7 +14,7 @@ import livepde as lp
 from livepde.cases import load
 from livepde.cases.new_case import write_template
 from livepde.laws import MemberReports
-from livepde.laws.guess import GUESSED, PATIENCE, first_guess
+from livepde.laws.bank import GUESSED, PATIENCE, first_guess
 
 pytestmark = pytest.mark.slow
 

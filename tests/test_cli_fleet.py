@@ -19,7 +19,7 @@ from commands import call, estimates, until
 from patience import PATIENCE
 
 from livepde import Fleet, cases, runs
-from livepde.cases import members_together
+from livepde.cases import member_blocks
 from livepde.cases.new_case import write_template
 from livepde.cli.printing import INTERRUPTED
 from livepde.errors import ConfigurationError, DataError, RunError
@@ -157,10 +157,10 @@ def test_an_interruption_ends_all(here, monkeypatch):
 
     def alone(self, member, prepared):
         begun.append(member.name)
-        return module.Ended(begun[-1], "interrupted" if len(begun) == 2 else "finished")
+        return module.MemberOutcome(begun[-1], "interrupted" if len(begun) == 2 else "finished")
 
     module = sys.modules["livepde.cli.fleet_command"]
-    monkeypatch.setattr(module.Runs, "_alone", alone)
+    monkeypatch.setattr(module.FleetRunner, "_alone", alone)
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\nlast,\n")
     code, _ = call(
         "fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--separately"
@@ -351,8 +351,8 @@ def test_the_summary_is_written_also_if_the_command_fails(here, monkeypatch):
         return alone(self, member, prepared)
 
     module = sys.modules["livepde.cli.fleet_command"]
-    alone = module.Runs._alone
-    monkeypatch.setattr(module.Runs, "_alone", defect)
+    alone = module.FleetRunner._alone
+    monkeypatch.setattr(module.FleetRunner, "_alone", defect)
     with pytest.raises(ZeroDivisionError):
         call(*FIRST, "rods", "--separately")
     assert runs.open(Path("rods/warm")).status == "failed"
@@ -436,7 +436,7 @@ def test_what_it_leaves_serves_other_commands(alike):
 def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
     """A journal that is written piece by piece is the same as one that is written at once."""
     call(*FIRST, "rods")
-    monkeypatch.setattr(members_together, "WAITING", 500)
+    monkeypatch.setattr(member_blocks, "WAITING", 500)
     extend, pieces = Journal.extend, []
 
     def told(journal, rows, state):
@@ -460,7 +460,7 @@ def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
 def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
     """Separately from what was written, or together where nothing was."""
     call(*FIRST, "rods")
-    monkeypatch.setattr(members_together, "WAITING", waiting)
+    monkeypatch.setattr(member_blocks, "WAITING", waiting)
     stepped = Fleet.step
 
     def step(self, t, z, inputs=None):

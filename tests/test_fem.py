@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 import skfem
@@ -25,7 +28,8 @@ from skfem import (
 from skfem.helpers import dot, grad
 
 import livepde as lp
-from livepde.fem import START, Form, FunctionSpace, Moment, Place
+from livepde.errors import MissingInputError
+from livepde.fem import START, Form, FunctionSpace, Inputs, Moment, Place
 
 ORDER = 6
 
@@ -402,3 +406,26 @@ def test_place():
     assert place.t == 0.0
     assert len(place.inputs) == 0
     assert place.used == {"t", "inputs"}
+
+
+def test_inputs_of_a_moment_never_change_and_name_what_is_missing():
+    inputs = Inputs({"T": 1.0, "Q": 2.0})
+    changes = (
+        lambda: inputs.__setitem__("T", 3.0),
+        lambda: inputs.__delitem__("T"),
+        lambda: inputs.update(T=3.0),
+        lambda: inputs.setdefault("R", 3.0),
+        lambda: inputs.pop("T"),
+        inputs.popitem,
+        inputs.clear,
+        lambda: inputs.__ior__({"T": 3.0}),
+    )
+    for change in changes:
+        with pytest.raises(TypeError, match="never change"):
+            change()
+    assert inputs == {"T": 1.0, "Q": 2.0}
+    for other in (copy.deepcopy(inputs), pickle.loads(pickle.dumps(inputs)), Inputs(inputs)):
+        assert isinstance(other, Inputs)
+        assert other == inputs
+    with pytest.raises(MissingInputError, match="'R' has no value; channels with one: Q, T"):
+        inputs["R"]

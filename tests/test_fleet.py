@@ -188,8 +188,7 @@ PAIRS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "law"), PAIRS)
 def test_equals_separate_identifiers(model, law):
-    steps = 8 if model == "walks" else 16  # whose iterated start is dear
-    fleet, _ = compare(MODELS[model](), LAWS[law], partial(samples, steps=steps))
+    fleet, _ = compare(MODELS[model](), LAWS[law], partial(samples, steps=11), members=3)
     assert fleet.together, fleet.note
 
 
@@ -472,6 +471,24 @@ def test_blocks_solve_what_each_would_and_a_singular_one_disturbs_none():
     for k in (0, 2, 5):
         dense = pattern.matrix(data[k]).toarray()
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense, right[:, k].T).T, rtol=1e-9)
+
+
+def test_estimates_are_computed_when_they_are_read_and_are_those_of_their_sample(monkeypatch):
+    kept, eager = (lp.Fleet(rod(), SENSORS, law(), 3) for _ in range(2))
+    stream, calls, beliefs = samples(kept, 6), [], kept._engine.beliefs
+
+    def counted(state):
+        calls.append(state)
+        return beliefs(state)
+
+    monkeypatch.setattr(kept._engine, "beliefs", counted)
+    later = [kept.step(*sample) for sample in stream]
+    now = [(one.q, one.q_std, one.u) for one in (eager.step(*sample) for sample in stream)]
+    assert not calls
+    for estimate, numbers in zip(later, now, strict=True):
+        for found, expected in zip((estimate.q, estimate.q_std, estimate.u), numbers, strict=True):
+            np.testing.assert_array_equal(found, expected)
+    assert len(calls) == len(stream)
 
 
 @pytest.mark.parametrize("shift", [3.0, 0.5])

@@ -13,8 +13,8 @@ from live_rod import CLOCK
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.live_case import Wiring
-from livepde.cli.run import batch, concluded, writer_of
+from livepde.cases.live_case import LiveCase
+from livepde.cli.run import concluded, run_batch, writer_of
 from livepde.streams import DataTable, FillGaps
 from livepde.streams.gaps import bridged, fill_table, filled_column, find_spikes
 from livepde.streams.intake import Habit, Intake, Policy
@@ -314,7 +314,7 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
         return writer_of(case, folder, (), False, ["test"])
 
     with ExitStack() as stack:
-        writer, (_, driven) = batch(prepared, folder, write, stack, quiet=True)
+        writer, (_, driven) = run_batch(prepared, folder, write, stack, quiet=True)
         _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
         "Channel left: 1 values far off those before and after were refused as spikes; 3 gaps were "
@@ -348,7 +348,7 @@ def test_beside_a_process_the_wait_decides(tmp_path, wait, known):
     rows = [{"t": SECONDS * k, "left": v, "T": 20.0} for k, v in enumerate(u.tolist())]
     del rows[50]["left"]
     journal = tmp_path / "journal.sqlite"
-    with Wiring(cases.load(path), Rows(rows), path=journal) as wiring:
+    with LiveCase(cases.load(path), Rows(rows), path=journal) as wiring:
         live = wiring.live()
         live.run()
     with runs.Journal.open(journal) as kept:

@@ -72,6 +72,13 @@ def finished(folder: Path, count: int = 30) -> Path:
     return path
 
 
+def folders(parent: Path) -> tuple[Path, Path]:
+    """Make a folder for a run as it should be, and one for what happens to it."""
+    whole, other = parent / "whole", parent / "other"
+    whole.mkdir(), other.mkdir()
+    return whole, other
+
+
 def content(path: Path) -> dict[str, dict[int, tuple]]:
     """Return all that a journal holds, row by row."""
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as raw:
@@ -105,8 +112,7 @@ class Breaks:
 @pytest.mark.parametrize("method", ["accept", "append", "checkpoint", "step"])
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monkeypatch, method):
     count = CHECKPOINT + 40
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir(), broken.mkdir()
+    whole, broken = folders(tmp_path)
     finished(whole, count)
     run = started(broken, count)
     owner, calls = (run.identifier if method == "step" else run.journal), []
@@ -158,8 +164,7 @@ def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
 
 @pytest.mark.long
 def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
-    whole, stopped = tmp_path / "whole", tmp_path / "stopped"
-    whole.mkdir(), stopped.mkdir()
+    whole, stopped = folders(tmp_path)
     finished(whole, 60)
     finished(stopped, 37)
     run = started(stopped, 60)
@@ -196,8 +201,7 @@ def limit_pages(kept: Journal, more: int) -> None:
 
 @pytest.mark.long
 def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
-    whole, full = tmp_path / "whole", tmp_path / "full"
-    whole.mkdir(), full.mkdir()
+    whole, full = folders(tmp_path)
     finished(whole, 150)
     run = started(full, 150)
     limit_pages(run.journal, 20)
@@ -264,8 +268,7 @@ class Failing:
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [2, 40, 43, 73])
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first):
-    whole, failing = tmp_path / "whole", tmp_path / "failing"
-    whole.mkdir(), failing.mkdir()
+    whole, failing = folders(tmp_path)
     broken = [*rows(40)]
     broken[20:20] = [{"t": 0.1, "a": "none", "left": 1.0}, {"t": -1.0, "a": 1.0, "left": 1.0}] * 3
     calm = live(whole, Rows(broken))
@@ -357,8 +360,7 @@ except livepde.errors.RunError as error:
 @pytest.mark.process
 @pytest.mark.skipif(sys.platform == "win32", reason="needs limits of POSIX")
 def test_a_file_that_may_not_grow(tmp_path):
-    whole, full = tmp_path / "whole", tmp_path / "full"
-    whole.mkdir(), full.mkdir()
+    whole, full = folders(tmp_path)
     finished(whole, 400)
     for size in (150_000, 300_000):
         found = subprocess.run(
@@ -742,8 +744,7 @@ class First:
 @pytest.mark.long
 def test_thinning_keeps_what_a_resume_needs_and_the_phase_of_the_fields(tmp_path):
     count, retention = 10 * CHECKPOINT, Retention(10.0, 7)
-    whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir(), broken.mkdir()
+    whole, broken = folders(tmp_path)
     run = started(whole, count, retention=retention)
     run.run()
     run.journal.close()

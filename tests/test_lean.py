@@ -200,7 +200,7 @@ def full(augmented, columns, order):
     return whole[order]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("row", ["EnKF as arrays, 20 members", "unscented filter as arrays"])
 def test_filters_as_arrays_find_the_parameter(row):
     score = table.run_row(ROD, 0.01, 0, row)

@@ -14,8 +14,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.live_case import Wiring
-from livepde.cases.members_together import blocks
+from livepde.cases.live_case import LiveCase
+from livepde.cases.member_blocks import blocks
 from livepde.errors import CaseError, ConfigurationError, SampleError
 from livepde.models import heat
 from livepde.runs.drive import drive, journal_of
@@ -297,7 +297,7 @@ def test_rows_as_they_come_are_the_table(tmp_path):
     # The noise of a reading may come in a row of its own.
     parts = [part for row in rows for part in ({**row, "s": None}, {"t": row["t"], "s": row["s"]})]
     text = CASE.replace("[unknowns", "[intake]\nwait = 1\n[unknowns")
-    with Wiring(case(tmp_path, text), Rows(parts), path=tmp_path / "journal.sqlite") as wiring:
+    with LiveCase(case(tmp_path, text), Rows(parts), path=tmp_path / "journal.sqlite") as wiring:
         live = wiring.live()
         live.run()
         assert same(live.result.last, finished)

@@ -323,7 +323,7 @@ def test_checked_contract_of_the_law():
 
 @pytest.mark.slow
 def test_white_noise_has_its_level_in_L2():
-    _, twin = noisy._problem()
+    twin = noisy._twin()
     gram, ratio = twin.weights, []
     for sample, z in zip(noisy.WhiteNoise(twin, 0.05, 0), twin.exact_data, strict=True):
         n = sample.z - z

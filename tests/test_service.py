@@ -18,7 +18,7 @@ from commands import bad, call, estimates, start, stopped, until
 import livepde as lp
 from livepde import cases, runs
 from livepde.cases.data import source_of
-from livepde.cases.live_case import Wiring
+from livepde.cases.live_case import LiveCase
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.feeds import Paced, SampleFeed
@@ -287,11 +287,13 @@ def test_from_a_broker_and_back(here, server):
 
 
 def test_a_source_of_ones_own(here):
-    with Wiring(cases.load(case()), Rows(row(k) for k in range(7)), path=here / "j.sqlite") as mine:
+    with LiveCase(
+        cases.load(case()), Rows(row(k) for k in range(7)), path=here / "j.sqlite"
+    ) as mine:
         run = mine.live()
         run.run()
         assert len(run.result) == 7
-    with Wiring(
+    with LiveCase(
         cases.load("case.toml"), Rows(row(k) for k in range(9)), path=here / "j.sqlite"
     ) as mine:
         run = mine.live()
@@ -303,11 +305,11 @@ def test_a_source_of_ones_own(here):
 def test_rows_that_are_sent_are_taken_though_the_file_has_titles(here):
     Path("rows.csv").write_text("a title\n" + HEADER + table(*(row(k) for k in range(9))))
     loaded = cases.load(case('file = "rows.csv"\nskip = 1'))
-    with Wiring(loaded, Rows(row(k) for k in range(4)), path=here / "sent.sqlite") as wiring:
+    with LiveCase(loaded, Rows(row(k) for k in range(4)), path=here / "sent.sqlite") as wiring:
         run = wiring.live()
         run.run()
         assert len(run.result) == 4
-    with Wiring(loaded, path=here / "file.sqlite") as wiring:
+    with LiveCase(loaded, path=here / "file.sqlite") as wiring:
         run = wiring.live()
         run.run()
         assert len(run.result) == 9
@@ -318,7 +320,7 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
     for zone, origin in (("UTC", "2026-11-21 00:00:00"), ("Europe/Berlin", "2026-11-20 23:00:00")):
         text = case(f'file = "rows.csv"\nzone = "{zone}"')
         assert str(cases.load(text).prepare().origin) == origin
-        with Wiring(cases.load(text)) as wiring:
+        with LiveCase(cases.load(text)) as wiring:
             assert wiring.live().journal.layout.attrs["origin"] == origin
 
 
@@ -390,14 +392,14 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
     loaded = cases.load(case())
     with (
         caplog.at_level("WARNING"),
-        Wiring(loaded, Rows(wrong)) as wiring,
+        LiveCase(loaded, Rows(wrong)) as wiring,
         pytest.raises(lp.errors.DataError, match=r"no sample came \(malformed: .*'time'"),
     ):
         wiring.live()
     assert [one.message.split(":")[0] for one in caplog.records] == ["malformed"]
 
     good = [row(k) for k in range(3)]
-    with Wiring(loaded, Rows([*wrong, *good])) as wiring:
+    with LiveCase(loaded, Rows([*wrong, *good])) as wiring:
         live = wiring.live()
         live.run()
         assert live.journal.counts == {("malformed", ""): 3}
@@ -415,7 +417,7 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
             return []
 
     caplog.clear()
-    with Wiring(cases.load(case(intake='silence = "1 ms"')), Nothing([])) as wiring:
+    with LiveCase(cases.load(case(intake='silence = "1 ms"')), Nothing([])) as wiring:
         assert wiring.live(stopping=Nothing.stopping) is None
         assert wiring.silent
     assert "nothing has come from the source" in caplog.text

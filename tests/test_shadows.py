@@ -156,7 +156,7 @@ def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.slow
+@pytest.mark.long
 def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
     """A mesh shift of nearly nothing is not found large where eight samples see half a turn."""
 
@@ -175,7 +175,7 @@ def test_follows_a_drive_that_turns_between_two_shadows_of_the_mesh() -> None:
     assert abs(coarse.diagnostics.shifts.by("mesh")["a"]) < 0.1 * fine.q_std[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_predicts_the_shift_by_input_lines() -> None:
     """Against a run that is told the inputs ten times for each reading of the sensors."""
     rows = samples()

@@ -79,7 +79,7 @@ PAIRS = [
 @pytest.mark.parametrize(("model", "rule"), PAIRS)
 def test_equals_separate_identifiers(model, rule):
     built, chosen = MODELS[model](), lp.AutoLaw() if rule == "auto" else LAWS[rule]
-    items = stream(built, {"walks": 8}.get(model, 16))
+    items = stream(built, 10)
     one = shard(built, chosen)
     assert bool(one.note) == (rule == "auto")
     q, q_std, innovation, status = run(one, batches(items))
@@ -95,7 +95,7 @@ def test_equals_separate_identifiers(model, rule):
 def test_goes_on_from_a_dump_at_any_batch(rule):
     """With identical numbers, and at its offset."""
     model, chosen = rod(), lp.AutoLaw() if rule == "auto" else LAWS[rule]
-    pieces = batches(stream(model, 12))
+    pieces = batches(stream(model, 9))
     whole, others = shard(model, chosen), [shard(model, chosen) for _ in range(2)]
     dumps, found = [], []
     for offset, batch in pieces:

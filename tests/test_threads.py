@@ -66,7 +66,7 @@ def powered(x: Any, _: float) -> Any:
     return x.inputs["power"] * x[0]
 
 
-def rod(cells: int = 30, **options: Any) -> lp.Model:
+def rod(cells: int = 16, **options: Any) -> lp.Model:
     """Return a rod with two unknowns, whose left end and source change with time."""
     unknowns = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}
     given = {"unknowns": unknowns, "A": conduction, "f": heating, **options}
@@ -92,11 +92,11 @@ def nonlinear_rod() -> lp.Model:
 
 
 def field_rod() -> lp.Model:
-    return reaction(line(30), ElementLineP1(), f=heating)
+    return reaction(line(16), ElementLineP1(), f=heating)
 
 
 def powered_field() -> lp.Model:
-    return reaction(line(30), ElementLineP1(), f=powered, inputs=("power",))
+    return reaction(line(16), ElementLineP1(), f=powered, inputs=("power",))
 
 
 def square() -> lp.Model:
@@ -178,7 +178,7 @@ CASES = {
     "gradient, smoothed": Case(lp.GradientLaw(gain=10.0), field_rod, smoothed, missing=0.02),
     "gradient, square": Case(lp.GradientLaw(gain=10.0), square, inner, samples=5),
     "gradient, nonlinear plate": Case(lp.GradientLaw(gain=10.0), plate, inner),
-    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=3),
+    "gradient, blocks": Case(lp.GradientLaw(gain=10.0), large_square, inner, samples=2),
     "auto gain": Case(lp.GradientLaw(gain="auto"), field_rod, inner),
     "auto gain, chosen smoothing": Case(
         lp.GradientLaw(gain="auto"), field_rod, lp.Full, missing=0.01
@@ -194,7 +194,7 @@ CASES = {
     "sensitivity, moving sensor": Case(lp.SensitivityLaw(), powered_rod, probe),
     "sensitivity, square": Case(lp.SensitivityLaw(modes=4), square, averages),
     "sensitivity, large square": Case(
-        lp.SensitivityLaw(modes=3), large_square, averages, samples=3
+        lp.SensitivityLaw(modes=3), large_square, averages, samples=2
     ),
     "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=6),
     "guards and jumps": Case(GUARDED, powered_rod, samples=6),

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,7 +16,7 @@ from benchmarks.census.report import outcome
 from benchmarks.census.trace import trace
 from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS as TRUTHS
-from livepde.progress import watched
+from benchmarks.jobs import each
 from livepde.runs.outcome import Outcome
 from livepde.verdict import Finding, Verdict
 
@@ -104,8 +102,8 @@ def census(
         if not fault or _fits(name, fault)
         for seed in range(seeds if fault else sound)
     ]
-    stream = _all(todo, workers or os.cpu_count() or 1)
-    scores = list(watched(stream, len(todo), "runs") if progress else stream)
+    done = each(scored, todo, "runs", workers=workers or os.cpu_count() or 1, progress=progress)
+    scores = [score for _, score in done]
     return outcome(sorted(scores, key=lambda s: (s.fault, s.problem, s.seed)))
 
 
@@ -117,15 +115,6 @@ def _fits(name: str, fault: str) -> bool:
     moved = about.text.startswith("two sensors") and single
     own = about.own_state and problem.model().form_initial is not None
     return not (about.channels and not problem.channels) and not moved and not own
-
-
-def _all(todo: Sequence[tuple[str, str, int]], workers: int) -> Iterator[Score]:
-    if workers == 1:
-        yield from (scored(*item) for item in todo)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(scored, *item) for item in todo]):
-            yield future.result()
 
 
 def scored(name: str, fault: str, seed: int) -> Score:

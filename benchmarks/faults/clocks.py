@@ -11,7 +11,7 @@ from typing import Any
 from benchmarks.faults.plan import Plan
 from benchmarks.faults.rod import Row, case_text, rod_rows
 from livepde.cases import load
-from livepde.cases.live_case import Wiring
+from livepde.cases.live_case import LiveCase
 from livepde.runs import Check, Outcome, Table
 from livepde.streams.sources import Rows
 
@@ -55,7 +55,7 @@ def clock_faults(plan: Plan) -> Outcome:
         path = Path(name) / "case.toml"
         path.write_text(case_text().replace('leap = "1 d"', 'leap = "30 d"'))
         for fault, change in CLOCKS.items():
-            with Wiring(load(path), Rows(change(rows))) as wiring:
+            with LiveCase(load(path), Rows(change(rows))) as wiring:
                 live = wiring.live()
                 if live is None:
                     raise RuntimeError("the run did not begin")

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from collections.abc import Sequence
 
 from benchmarks.honest.noise import KINDS
 from benchmarks.honest.problems import PROBLEMS
 from benchmarks.honest.report import outcome
-from benchmarks.honest.twin import Run, twins
-from livepde.progress import watched
+from benchmarks.honest.twin import twins
+from benchmarks.jobs import each
 from livepde.runs.outcome import Outcome
 
 __all__ = ["QUICK", "honest"]
@@ -38,20 +36,7 @@ def honest(
         Processes; default one for each processor. One runs in this process.
     """
     kinds = [kind for kind in KINDS if kind in (kinds or KINDS)]
-    todo = [(name, seed) for seed in range(seeds) for name in (only or PROBLEMS)]
-    stream = _all(todo, kinds, workers or os.cpu_count() or 1)
-    found = watched(stream, len(todo), "twins") if progress else stream
-    runs = [run for several in found for run in several]
+    todo = [(name, seed, kinds) for seed in range(seeds) for name in (only or PROBLEMS)]
+    done = each(twins, todo, "twins", workers=workers or os.cpu_count() or 1, progress=progress)
+    runs = [run for _, several in done for run in several]
     return outcome(sorted(runs, key=lambda run: (run.problem, run.kind, run.seed)))
-
-
-def _all(
-    todo: Sequence[tuple[str, int]], kinds: Sequence[str], workers: int
-) -> Iterator[list[Run]]:
-    if workers == 1:
-        for name, seed in todo:
-            yield twins(name, seed, kinds)
-        return
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        for future in as_completed([pool.submit(twins, *item, kinds) for item in todo]):
-            yield future.result()

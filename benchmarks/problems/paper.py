@@ -9,7 +9,6 @@ import numpy as np
 
 from benchmarks.problems.data import Problem, Process
 from livepde.reproduce import seed, seed_excited
-from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
 __all__ = ["SEED", "SEED_EXCITED"]
@@ -18,18 +17,10 @@ __all__ = ["SEED", "SEED_EXCITED"]
 @cache
 def _twin(experiment: ModuleType, std: float) -> Process:
     """Return an experiment's own twin, with a prior deviation of q."""
-    model, observation = experiment.build(std=std)
-    twin = Twin(
-        scheme=ImplicitEuler(),
-        model=model,
-        observation=observation,
-        q_true=experiment.q_true,
-        u_true=experiment.u_true,
-        times=experiment.TIMES,
-    )
+    twin: Twin = experiment.twin_of(std)
     return Process(
-        model=model,
-        observation=observation,
+        model=twin.model,
+        observation=twin.observation,
         times=np.asarray(twin.times, dtype=float),
         exact=twin.exact_data,
         q_true=np.tile(twin.q, (len(twin.times), 1)),

@@ -23,6 +23,9 @@ A step that fails numerically is not an exception: it is reported as `Status` of
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 __all__ = [
     "CaseError",
     "ConfigurationError",
@@ -100,3 +103,20 @@ class RunError(LivepdeError, OSError):
 
 class LinearAlgebraError(LivepdeError, ArithmeticError):
     """A matrix that is singular to working precision."""
+
+
+@contextmanager
+def optional(
+    extra: str, what: str, kind: type[LivepdeError] = ConfigurationError
+) -> Iterator[None]:
+    """Turn the import of a package that is not installed into an error that names its extra.
+
+    >>> with optional("mqtt", "MQTT needs paho-mqtt"):
+    ...     import no_such_package
+    Traceback (most recent call last):
+    livepde.errors.ConfigurationError: MQTT needs paho-mqtt: pip install 'livepde[mqtt]'.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise kind(f"{what}: pip install 'livepde[{extra}]'.") from error

@@ -279,7 +279,8 @@ class Identifier:
         names, gaps = self._channels.inputs, {}
         if names:
             missing = np.array(list(map(held.__contains__, names)), dtype=float)
-            gaps = self._gaps.gaps(names, missing)
+            if held or np.count_nonzero(self._gaps.held):
+                gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
         self._state, report = self._stepped(interval)
@@ -435,7 +436,7 @@ class Identifier:
         judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        if not names and not (inputs and gaps.counts[1:].any()):
+        if not names and not np.count_nonzero(gaps.counts[1:]):
             return judge
 
         def found() -> Verdict:

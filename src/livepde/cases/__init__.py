@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from livepde.cases.case import Case, Prepared, load
-from livepde.cases.live_case import Wiring
+from livepde.cases.live_case import LiveCase
 
-__all__ = ["Case", "Prepared", "Wiring", "load"]
+__all__ = ["Case", "LiveCase", "Prepared", "load"]

@@ -23,12 +23,11 @@ from livepde.cases.case_channels import (
     observation_of,
     sensor_notes,
 )
-from livepde.cases.case_frame import Frame
+from livepde.cases.case_content import CaseContent
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
-from livepde.cases.geometry import mesh_of
 from livepde.cases.laws import law_of
-from livepde.cases.process import conditioned, drive_notes, model_of, options_of, process_notes
+from livepde.cases.process import conditioned, drive_notes, model_of, process_notes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
@@ -104,7 +103,7 @@ class Prepared:
             return {}
         weights = {}
         if self.u0 is not None:
-            weights = initial_weights(case, case.mesh, self.first)
+            weights = initial_weights(case, self.first)
         return {"input_noise": input_noise_of(case), "u0_from": weights}
 
     @cached_property
@@ -112,7 +111,7 @@ class Prepared:
         """The initial state: a number, or a function of x; None if the model defines it."""
         case = self.case
         if case.model.form_initial is None:
-            return initial_of(case, case.mesh, self.first)
+            return initial_of(case, self.first)
         if case.spec.initial is not None:
             raise case.error("initial", "the equation has its own initial state; leave it out.")
         return None
@@ -195,14 +194,14 @@ def load(
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.
-    frame = conditioned(expanded(Frame(file, spec, resolve(*place), reader_of(*place))))
-    case = Case(frame.path, frame.spec, frame.equation, frame.reader, text, original)
+    content = conditioned(expanded(CaseContent(file, spec, resolve(*place), reader_of(*place))))
+    case = Case(content.path, content.spec, content.equation, content.reader, text, original)
     case.check()
     return case
 
 
 @dataclass(frozen=True, eq=False)
-class Case(Frame):
+class Case(CaseContent):
     """A case file with consistent parts; `prepare` adds the data.
 
     Attributes
@@ -218,8 +217,10 @@ class Case(Frame):
 
     def check(self) -> None:
         """Build all parts that need no data; raises `CaseError`."""
-        _ = self.model, self.observation, self.withheld, self.law, self.columns, self.clock
-        _ = self.scheme, self.dt_max, self.references, input_noise_of(self)
+        # In this order: an error about the mesh comes before those about what lies on it.
+        _ = self.mesh, self.options, self.model, self.observation, self.withheld, self.law
+        _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
+        _ = input_noise_of(self)
         self._check_names()
 
     def _check_names(self) -> None:
@@ -266,19 +267,9 @@ class Case(Frame):
         return dict(self.spec.expect)
 
     @cached_property
-    def mesh(self) -> Any:
-        """The mesh."""
-        return mesh_of(self)
-
-    @cached_property
-    def options(self) -> dict[str, Any]:
-        """Known numbers of the equation."""
-        return options_of(self)
-
-    @cached_property
     def model(self) -> Model:
         """The model."""
-        return model_of(self, self.mesh, self.options)
+        return model_of(self)
 
     @cached_property
     def columns(self) -> dict[str, Column]:
@@ -288,7 +279,7 @@ class Case(Frame):
     @cached_property
     def observation(self) -> Observation:
         """The assimilated sensors."""
-        observation = observation_of(self, self.mesh, self.options, "sensor")
+        observation = observation_of(self, "sensor")
         if observation is None:
             text = "there is no sensor to learn from; give at least one channel role = 'sensor'."
             raise self.error("channels", text)
@@ -302,7 +293,7 @@ class Case(Frame):
     @cached_property
     def withheld(self) -> Observation | None:
         """The withheld sensors, which are scored only; None if there are none."""
-        return observation_of(self, self.mesh, self.options, "withheld")
+        return observation_of(self, "withheld")
 
     @cached_property
     def law(self) -> AnyLaw:
@@ -332,8 +323,8 @@ class Case(Frame):
         """Notes on allowed settings that may be mistakes."""
         found = [
             *drive_notes(self, self.model),
-            *process_notes(self, self.mesh),
-            *sensor_notes(self, self.mesh),
+            *process_notes(self),
+            *sensor_notes(self),
         ]
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(

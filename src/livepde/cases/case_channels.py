@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 import pandas as pd
 
-from livepde.cases.case_frame import Frame
-from livepde.cases.geometry import sides_of
+from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
@@ -38,7 +37,6 @@ from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
 
 __all__ = [
-    "calibrated",
     "columns_of",
     "expanded",
     "initial_of",
@@ -55,17 +53,18 @@ INTERPOLATED = ("interpolate", "interpolate-exact")
 
 Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, ChannelSpec]]
 """(kind of sensor, component of the state) -> its channels."""
+MEMBERS = 10_000  # channels of one `each`
 
 
-def columns_of(frame: Frame) -> dict[str, Column]:
+def columns_of(case: CaseContent) -> dict[str, Column]:
     """Return channel -> its column in the data."""
     found = {}
-    for name, channel in frame.spec.channels.items():
-        unit = frame.unit(name)
-        rule = conversion(channel.unit or unit, unit, frame.where(f"channels.{name}.unit"))
+    for name, channel in case.spec.channels.items():
+        unit = case.unit(name)
+        rule = conversion(channel.unit or unit, unit, case.where(f"channels.{name}.unit"))
         valid = (-np.inf, np.inf)
         if channel.valid is not None:
-            valid = frame.pair(channel.valid, unit, f"channels.{name}.valid")
+            valid = case.pair(channel.valid, unit, f"channels.{name}.valid")
         needed = channel.gaps == "skip"
         found[name] = Column(
             channel.sources,
@@ -73,29 +72,27 @@ def columns_of(frame: Frame) -> dict[str, Column]:
             rule.offset,
             valid,
             needed,
-            decimal=frame.spec.data.decimal,
+            decimal=case.spec.data.decimal,
         )
         if channel.noise_column is not None:
-            found[noise_channel(name)] = _noise_column(frame, name, channel, rule.factor)
+            found[noise_channel(name)] = _noise_column(case, name, channel, rule.factor)
     return found
 
 
-def _noise_column(frame: Frame, name: str, channel: ChannelSpec, factor: float) -> Column:
+def _noise_column(case: CaseContent, name: str, channel: ChannelSpec, factor: float) -> Column:
     """Return where the noise of the readings of a channel comes from, in its unit."""
     key = f"channels.{name}.noise_column"
-    if isinstance(frame.spec.law, GradientSpec):
-        raise frame.error(key, "the gradient law does not weigh readings: leave it out.")
-    if noise_channel(name) in frame.spec.channels:
-        raise frame.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
-    decimal = frame.spec.data.decimal
+    if isinstance(case.spec.law, GradientSpec):
+        raise case.error(key, "the gradient law does not weigh readings: leave it out.")
+    if noise_channel(name) in case.spec.channels:
+        raise case.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
+    decimal = case.spec.data.decimal
     return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
-def observation_of(
-    frame: Frame, mesh: Any, options: Mapping[str, Any], role: str
-) -> Observation | None:
+def observation_of(case: CaseContent, role: str) -> Observation | None:
     """Return the observation of the channels of a role; None if there are none."""
-    channels = frame.roles(role)
+    channels = case.roles(role)
     if not channels:
         return None
     # One observation reads all channels of a kind and a component of the state.
@@ -103,25 +100,23 @@ def observation_of(
     for name, channel in channels.items():
         kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
     names = [*chain.from_iterable(kinds.values())]
-    levels = noise_of(frame, role)
+    levels = noise_of(case, role)
     outer: dict[str, Any] = {
         "noise": levels and [levels[name] for name in names],
-        "unit": frame.equation.state.unit,
-        "reconstruction": _reconstruction(frame) if role == "sensor" else Pseudoinverse(),
+        "unit": case.equation.state.unit,
+        "reconstruction": _reconstruction(case) if role == "sensor" else Pseudoinverse(),
     }
     if any(item.offset or item.gain or item.correlated for item in channels.values()):
-        whole = _whole(frame, mesh, options, kinds, {})
-        return calibrated(frame, whole, names, **outer)
-    return _whole(frame, mesh, options, kinds, outer)
+        whole = _whole(case, kinds, {})
+        return _calibrated(case, whole, names, **outer)
+    return _whole(case, kinds, outer)
 
 
-def _whole(
-    frame: Frame, mesh: Any, options: Mapping[str, Any], kinds: Kinds, outer: Mapping[str, Any]
-) -> Observation:
+def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> Observation:
     """Return one observation of all kinds, which has the keyword arguments `outer`."""
     common = outer if len(kinds) == 1 else {}
     parts = [
-        _part(frame, mesh, options, kind, members, {"of": of, **common} if of else common)
+        _part(case, kind, members, {"of": of, **common} if of else common)
         for (kind, of), members in kinds.items()
     ]
     return parts[0] if len(parts) == 1 else Combined(parts, **outer)
@@ -133,132 +128,126 @@ def _kind(channel: ChannelSpec) -> str:
     return next(given, "at")
 
 
-def _regions(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+def _regions(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
     """Return the parts of the mesh over which means are taken."""
-    known = {**(mesh.boundaries or {}), **(mesh.subdomains or {})}
+    known = {**(case.mesh.boundaries or {}), **(case.mesh.subdomains or {})}
     regions: dict[str, Any] = {}
     for name, item in channels.items():
         key = f"channels.{name}.over"
         if isinstance(item.over, str):
-            frame.require(item.over, known, key, f"the mesh has no part '{item.over}'")
+            case.require(item.over, known, key, f"the mesh has no part '{item.over}'")
             regions[name] = item.over
         else:
-            regions[name] = _inside(sides_of(frame, item.over, len(mesh.p), key))
+            regions[name] = inside(case, item.over, len(case.mesh.p), key, closed=True)
     return regions
 
 
-def _lines(frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+def _lines(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
     """Return the ends of lines along which means are taken."""
     return {
-        name: tuple(_inside_mesh(frame, mesh, end, f"channels.{name}.along") for end in item.along)
+        name: tuple(_inside_mesh(case, end, f"channels.{name}.along") for end in item.along)
         for name, item in channels.items()
         if item.along is not None
     }
 
 
-def _followed(
-    frame: Frame, mesh: Any, channels: Mapping[str, ChannelSpec]
-) -> dict[str, tuple[str, ...]]:
+def _followed(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, tuple[str, ...]]:
     """Return the channels of the positions of sensors that move."""
     positions: dict[str, tuple[str, ...]] = {}
-    known = frame.roles("position")
+    known = case.roles("position")
     for name, item in channels.items():
         given = item.follows if isinstance(item.follows, tuple) else (str(item.follows),)
         for channel in given:
             text = f"there is no channel '{channel}' of role position"
-            frame.require(channel, known, f"channels.{name}.follows", text)
-        if len(given) != len(mesh.p):
-            text = f"got {len(given)} channels; needs one for each of {len(mesh.p)} coordinates."
-            raise frame.error(f"channels.{name}.follows", text)
+            case.require(channel, known, f"channels.{name}.follows", text)
+        if len(given) != len(case.mesh.p):
+            text = (
+                f"got {len(given)} channels; needs one for each of {len(case.mesh.p)} coordinates."
+            )
+            raise case.error(f"channels.{name}.follows", text)
         positions[name] = given
     return positions
 
 
 def _part(
-    frame: Frame,
-    mesh: Any,
-    options: Mapping[str, Any],
+    case: CaseContent,
     kind: str,
     channels: Mapping[str, ChannelSpec],
     common: Mapping[str, Any],
 ) -> Observation:
     """Return the observation of channels of one kind."""
     if kind == "over":
-        return Averages(_regions(frame, mesh, channels), **common)
+        return Averages(_regions(case, channels), **common)
     if kind == "along":
-        return LineIntegrals(_lines(frame, mesh, channels), mean=True, **common)
+        return LineIntegrals(_lines(case, channels), mean=True, **common)
     if kind == "follows":
-        return Moving(_followed(frame, mesh, channels), **common)
-    points = {name: _position(frame, mesh, name, item) for name, item in channels.items()}
-    constants = frame.constants
+        return Moving(_followed(case, channels), **common)
+    points = {name: _position(case, name, item) for name, item in channels.items()}
+    constants = case.constants
     direct = {  # what a quantity sees beside the state
-        name: with_constants(frame.equation.quantities[item.quantity].direct(options), constants)
+        name: with_constants(
+            case.equation.quantities[item.quantity].direct(case.options), constants
+        )
         for name, item in channels.items()
         if item.quantity is not None
     }
-    uncertain = {name: std for name, std in _shifted(frame).items() if name in channels}
+    uncertain = {name: std for name, std in _shifted(case).items() if name in channels}
     return Points(points, direct, uncertain or None, **common)
 
 
-def _reconstruction(frame: Frame) -> Reconstruction:
+def _reconstruction(case: CaseContent) -> Reconstruction:
     """Return the reconstruction of the observed part, by the key law.tikhonov."""
-    law = frame.spec.law
+    law = case.spec.law
     given = law.tikhonov if isinstance(law, GradientSpec) else False
     if given is False:
         return Pseudoinverse()
     spec = TikhonovSpec() if given is True else given
     alpha = Discrepancy(spec.tau) if spec.alpha == "discrepancy" else spec.alpha
-    if spec.alpha == "discrepancy" and noise_of(frame, "sensor") is None:
+    if spec.alpha == "discrepancy" and noise_of(case, "sensor") is None:
         text = "the discrepancy principle needs the noise of every sensor; or give alpha a number."
-        raise frame.error("law.tikhonov.alpha", text)
+        raise case.error("law.tikhonov.alpha", text)
     return Tikhonov(spec.norm, alpha)
 
 
-def _inside(sides: list[tuple[float, float]]) -> Any:
-    return lambda x: np.logical_and.reduce(
-        [(x[k] >= low) & (x[k] <= high) for k, (low, high) in enumerate(sides)]
-    )
-
-
-def _position(frame: Frame, mesh: Any, name: str, channel: ChannelSpec) -> Any:
+def _position(case: CaseContent, name: str, channel: ChannelSpec) -> Any:
     """Return where a point sensor sits: a number, or a list of coordinates."""
     key = f"channels.{name}.at"
-    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+    low, high = case.mesh.p.min(axis=1), case.mesh.p.max(axis=1)
     if channel.quantity is not None:
-        known, asked = frame.equation.quantities, channel.quantity
-        text = f"'{frame.equation.name}' has no quantity '{asked}'"
-        frame.require(asked, known, f"channels.{name}.quantity", text)
+        known, asked = case.equation.quantities, channel.quantity
+        text = f"'{case.equation.name}' has no quantity '{asked}'"
+        case.require(asked, known, f"channels.{name}.quantity", text)
         return known[asked].at(float(low[0]), float(high[0]))
-    return _inside_mesh(frame, mesh, channel.at, key)
+    return _inside_mesh(case, channel.at, key)
 
 
-def _inside_mesh(frame: Frame, mesh: Any, at: Any, key: str) -> Any:
+def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
     """Return a position in the mesh: a number, or a list of coordinates."""
-    low, high = mesh.p.min(axis=1), mesh.p.max(axis=1)
+    low, high = case.mesh.p.min(axis=1), case.mesh.p.max(axis=1)
     given = at if isinstance(at, tuple) else (at,)
-    unit = frame.equation.length_unit
-    point = [frame.convert(value, unit, key) for value in given]
+    unit = case.equation.length_unit
+    point = [case.convert(value, unit, key) for value in given]
     if len(point) != len(low):
-        raise frame.error(key, f"got {len(point)} coordinates; needs {len(low)}.")
+        raise case.error(key, f"got {len(point)} coordinates; needs {len(low)}.")
     for x, left, right in zip(point, low, high, strict=True):
         slack = 1e-9 * (right - left)
         if not left - slack <= x <= right + slack:
-            raise frame.error(
+            raise case.error(
                 key,
                 f"{x:g} {unit} lies outside of the mesh, which spans {left:g} to {right:g} {unit}; "
                 "check the position and its unit.",
             )
-    inside = [float(np.clip(x, a, b)) for x, a, b in zip(point, low, high, strict=True)]
-    return inside[0] if len(inside) == 1 else inside
+    place = [float(np.clip(x, a, b)) for x, a, b in zip(point, low, high, strict=True)]
+    return place[0] if len(place) == 1 else place
 
 
-def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
+def sensor_notes(case: CaseContent) -> list[str]:
     """Return notes on positions of sensors that are allowed and yet doubtful."""
-    channels = frame.roles("sensor", "withheld")
-    if len(mesh.p) != 1 or any(item.at is None for item in channels.values()):
+    channels = case.roles("sensor", "withheld")
+    if len(case.mesh.p) != 1 or any(item.at is None for item in channels.values()):
         return []
-    at = {float(_position(frame, mesh, name, item)) for name, item in channels.items()}
-    if len(at) == 1 or len(set(np.searchsorted(np.sort(mesh.p[0]), list(at)).tolist())) > 1:
+    at = {float(_position(case, name, item)) for name, item in channels.items()}
+    if len(at) == 1 or len(set(np.searchsorted(np.sort(case.mesh.p[0]), list(at)).tolist())) > 1:
         return []
     return [
         f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which hardly tells them "
@@ -266,52 +255,52 @@ def sensor_notes(frame: Frame, mesh: Any) -> list[str]:
     ]
 
 
-def noise_of(frame: Frame, role: str) -> dict[str, float] | None:
+def noise_of(case: CaseContent, role: str) -> dict[str, float] | None:
     """Return the noise of each sensor of a role; None if none is given."""
-    channels, levels = frame.roles(role), _stated(frame, "noise", role)
+    channels, levels = case.roles(role), _stated(case, "noise", role)
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."
-        raise frame.missing(f"channels.{missing}.noise", text)
+        raise case.missing(f"channels.{missing}.noise", text)
     return levels or None
 
 
-def input_noise_of(frame: Frame) -> dict[str, float]:
+def input_noise_of(case: CaseContent) -> dict[str, float]:
     """Return the noise of the boundary and input channels that state one."""
-    return _stated(frame, "noise", "boundary", "input")
+    return _stated(case, "noise", "boundary", "input")
 
 
-def initial_of(frame: Frame, mesh: Any, first: Sample) -> Any:
+def initial_of(case: CaseContent, first: Sample) -> Any:
     """Return the initial state: a number (of each component), or the first sample interpolated.
 
     Withheld channels take no part.
     """
-    initial = frame.spec.initial
+    initial = case.spec.initial
     if initial is None:
-        raise frame.missing("initial", "a number, or 'interpolate' from the first sample.")
+        raise case.missing("initial", "a number, or 'interpolate' from the first sample.")
     if isinstance(initial, dict):
-        unit = frame.equation.state.unit
-        return {name: frame.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
+        unit = case.equation.state.unit
+        return {name: case.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
     if initial not in INTERPOLATED:
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
             text = f"got '{initial}'; {did_you_mean(initial, [*INTERPOLATED, 'a number'])}"
-            raise frame.error("initial", text)
-        return frame.convert(initial, frame.equation.state.unit, "initial")
-    if len(mesh.p) != 1:
-        raise frame.error("initial", f"'{initial}' needs an interval; give a number.")
-    at, level = _level(_initial_readings(frame, mesh, first))
+            raise case.error("initial", text)
+        return case.convert(initial, case.equation.state.unit, "initial")
+    if len(case.mesh.p) != 1:
+        raise case.error("initial", f"'{initial}' needs an interval; give a number.")
+    at, level = _level(_initial_readings(case, first))
     return partial(_interpolated, at, level)
 
 
-def initial_weights(frame: Frame, mesh: Any, first: Sample) -> dict[str, Any]:
+def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
     """Return channel -> how an interpolated initial state changes with its reading, and its noise.
 
     As x -> u, and NaN for that of the sensor. Empty where readings are taken as exact (`initial =
     "interpolate-exact"`).
     """
-    if frame.spec.initial != "interpolate" or len(mesh.p) != 1:
+    if case.spec.initial != "interpolate" or len(case.mesh.p) != 1:
         return {}
-    readings = _initial_readings(frame, mesh, first)
+    readings = _initial_readings(case, first)
     given = by_name(first.z, ())
     found = {}
     for number, one in enumerate(readings):
@@ -340,179 +329,176 @@ def _level(readings: Sequence[_Reading]) -> tuple[list[float], list[float]]:
     return places, [fmean(one.value for one in readings if one.at == place) for place in places]
 
 
-def _initial_readings(frame: Frame, mesh: Any, first: Sample) -> list[_Reading]:
+def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
     """Return the readings that the initial state is interpolated from."""
-    ends = {"left": float(mesh.p.min()), "right": float(mesh.p.max())}
+    ends = {"left": float(case.mesh.p.min()), "right": float(case.mesh.p.max())}
     values = dict(first.z) if isinstance(first.z, Mapping) else {}
     found = []
-    for name, channel in frame.roles("sensor", "boundary").items():
+    for name, channel in case.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
             found.append(_Reading(ends[str(channel.at)], values[name], name))
         elif channel.role == "sensor" and channel.at is not None:
-            place = _position(frame, mesh, name, channel)
+            place = _position(case, name, channel)
             found.append(_Reading(place, values[name], name))
     present = [one for one in found if np.isfinite(one.value)]
     if not present:
         raise MissingInputError(
-            f"{frame.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
+            f"{case.where('initial')}: 'interpolate' found no sensor or boundary with a value in "
             "the first sample; start later, or give a number."
         )
     return present
 
 
-MEMBERS = 10_000  # channels of one `each`
-
-
-def expanded(frame: Frame) -> Frame:
-    """Return the frame with every family of channels, `each` or `positions`, as single ones."""
+def expanded(case: CaseContent) -> CaseContent:
+    """Return the case with every family of channels, `each` or `positions`, as single ones."""
     channels: dict[str, ChannelSpec] = {}
-    for name, channel in frame.spec.channels.items():
+    for name, channel in case.spec.channels.items():
         if channel.each is not None:
-            key, members = f"channels.{name}.each", _evenly(frame, name, channel)
+            key, members = f"channels.{name}.each", _evenly(case, name, channel)
         elif channel.positions is not None:
-            key, members = f"channels.{name}.positions", _listed(frame, name, channel)
+            key, members = f"channels.{name}.positions", _listed(case, name, channel)
         else:
             channels[name] = channel
             continue
         for label, (at, column) in members.items():
-            if label in frame.spec.channels or label in channels:
-                raise frame.error(key, f"there is a channel '{label}' already; rename it.")
+            if label in case.spec.channels or label in channels:
+                raise case.error(key, f"there is a channel '{label}' already; rename it.")
             member = {"each": None, "positions": None, "at": at, "column": column}
             channels[label] = channel.model_copy(update=member)
-    spec: CaseSpec = frame.spec.model_copy(update={"channels": channels})
-    return Frame(frame.path, spec, frame.equation, frame.reader)
+    spec: CaseSpec = case.spec.model_copy(update={"channels": channels})
+    return CaseContent(case.path, spec, case.equation, case.reader)
 
 
-def _evenly(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+def _evenly(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a row with even distances."""
     start, stop, count = channel.each or (0.0, 0.0, 0)
-    unit, key = frame.equation.length_unit, f"channels.{name}.each"
+    unit, key = case.equation.length_unit, f"channels.{name}.each"
     if count > MEMBERS:
-        raise frame.error(key, f"got {count} channels; expected at most {MEMBERS}.")
-    ends = (frame.convert(start, unit, key), frame.convert(stop, unit, key))
+        raise case.error(key, f"got {count} channels; expected at most {MEMBERS}.")
+    ends = (case.convert(start, unit, key), case.convert(stop, unit, key))
     return {
         f"{name}_{k}": (x, str(channel.column).replace("{}", str(k)))
         for k, x in enumerate(np.linspace(*ends, count).tolist())
     }
 
 
-def _listed(frame: Frame, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+def _listed(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a table of positions."""
-    key, file = f"channels.{name}.positions", frame.path.parent / str(channel.positions)
-    table = _positions_table(frame, key, file)
+    key, file = f"channels.{name}.positions", case.path.parent / str(channel.positions)
+    table = _positions_table(case, key, file)
     axes = [axis for axis in "xyz" if axis in table.columns]
     found: dict[str, tuple[Any, str]] = {}
     # Row 1 of the file is its header.
     for row, label in enumerate(table["name"], 2):
         if not label or label in found:
             what = f"the name '{label}' stands there twice" if label else "the name is missing"
-            raise frame.error(key, f"{file}, row {row}: {what}.")
+            raise case.error(key, f"{file}, row {row}: {what}.")
         where = f"{key}: {file}, row {row}"
-        place = tuple(_coordinate(frame, table[axis][row - 2], where) for axis in axes)
+        place = tuple(_coordinate(case, table[axis][row - 2], where) for axis in axes)
         column = str(channel.column or "{}").replace("{}", label)
         found[label] = (place if len(place) > 1 else place[0], column)
     return found
 
 
-def _positions_table(frame: Frame, key: str, file: Path) -> pd.DataFrame:
+def _positions_table(case: CaseContent, key: str, file: Path) -> pd.DataFrame:
     """Return a table with the columns name, x (and y, z), as text; empty where a cell is."""
     try:
         table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
     except (OSError, ValueError) as error:
-        raise frame.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
+        raise case.error(key, f"{file} cannot be read as a CSV table: {error}.") from None
     if "name" not in table.columns or table.columns.intersection(["x", "y", "z"]).empty:
         got = ", ".join(map(str, table.columns[:8]))
-        raise frame.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
+        raise case.error(key, f"{file}: got the columns {got}; expected name, x (and y, z).")
     if len(table) > MEMBERS:
-        raise frame.error(key, f"{file} has more than {MEMBERS} sensors.")
+        raise case.error(key, f"{file} has more than {MEMBERS} sensors.")
     return table
 
 
-def _coordinate(frame: Frame, cell: str, where: str) -> float:
+def _coordinate(case: CaseContent, cell: str, where: str) -> float:
     if is_blank(cell):
         raise CaseError(f"{where}: still to be filled in, where it says '?'.")
     try:
         value: float | str = float(cell)
     except ValueError:
         value = cell
-    number = frame.convert(value, frame.equation.length_unit, where)
+    number = case.convert(value, case.equation.length_unit, where)
     if not np.isfinite(number):
-        raise frame.error(where, f"got '{cell}'; expected a coordinate.")
+        raise case.error(where, f"got '{cell}'; expected a coordinate.")
     return number
 
 
-def unknowns_of(frame: Frame) -> dict[str, Unknown]:
+def unknowns_of(case: CaseContent) -> dict[str, Unknown]:
     """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
-    state = frame.equation.state.unit
+    state = case.equation.state.unit
     found: dict[str, Unknown] = {}
     # Differences of a temperature are in K.
     unit = "K" if state == "degC" else state
-    if offsets := _stated(frame, "offset", "sensor"):
-        prior = Normal(0.0, _common(frame, offsets, "offset"))
+    if offsets := _stated(case, "offset", "sensor"):
+        prior = Normal(0.0, _common(case, offsets, "offset"))
         found["offset"] = Scalars(tuple(offsets), prior, unit=unit)
     # A gain is a factor without a unit, 1 for an exact sensor.
-    if gains := _stated(frame, "gain", "sensor", unit=""):
-        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(frame, gains, "gain")))
-    if stds := _shifted(frame):
-        places = {name: frame.spec.channels[name].at for name in stds}
+    if gains := _stated(case, "gain", "sensor", unit=""):
+        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(case, gains, "gain")))
+    if stds := _shifted(case):
+        places = {name: case.spec.channels[name].at for name in stds}
         names = [
             shift
             for name, at in places.items()
             for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
         ]
-        prior = Normal(0.0, _common(frame, stds, "at_std"))
-        found[POSITION] = Scalars(names, prior, unit=frame.equation.length_unit)
-    if errors := _correlated(frame):
-        std, time = _common(frame, errors, "correlated")
+        prior = Normal(0.0, _common(case, stds, "at_std"))
+        found[POSITION] = Scalars(names, prior, unit=case.equation.length_unit)
+    if errors := _correlated(case):
+        std, time = _common(case, errors, "correlated")
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
         prior, fades = Normal(0.0, std), MeanReverting(time)
         found["correlated"] = Scalars(tuple(errors), prior, unit=unit, evolution=fades)
     return found
 
 
-def _shifted(frame: Frame) -> dict[str, float]:
+def _shifted(case: CaseContent) -> dict[str, float]:
     """Return the standard deviation of the position of each sensor that states one."""
-    return _stated(frame, "at_std", "sensor", unit=frame.equation.length_unit)
+    return _stated(case, "at_std", "sensor", unit=case.equation.length_unit)
 
 
-def _correlated(frame: Frame) -> dict[str, tuple[float, float]]:
+def _correlated(case: CaseContent) -> dict[str, tuple[float, float]]:
     """Return standard deviation and correlation time of the errors of sensors that fade."""
     found = {}
-    for name, item in frame.roles("sensor").items():
+    for name, item in case.roles("sensor").items():
         if item.correlated is not None:
             key = f"channels.{name}.correlated"
-            std = frame.positive(item.correlated.std, frame.equation.state.unit, f"{key}.std")
-            time = frame.positive(item.correlated.time, frame.equation.time_unit, f"{key}.time")
+            std = case.positive(item.correlated.std, case.equation.state.unit, f"{key}.std")
+            time = case.positive(item.correlated.time, case.equation.time_unit, f"{key}.time")
             found[name] = (std, time)
     return found
 
 
-def _stated(frame: Frame, key: str, *roles: str, unit: str | None = None) -> dict[str, float]:
+def _stated(case: CaseContent, key: str, *roles: str, unit: str | None = None) -> dict[str, float]:
     """Return a number > 0 of each channel that states one, in the channel's unit or another."""
     return {
-        name: frame.positive(
-            value, frame.unit(name) if unit is None else unit, f"channels.{name}.{key}"
+        name: case.positive(
+            value, case.unit(name) if unit is None else unit, f"channels.{name}.{key}"
         )
-        for name, item in frame.roles(*roles).items()
+        for name, item in case.roles(*roles).items()
         if (value := getattr(item, key)) is not None
     }
 
 
-def _common(frame: Frame, given: Mapping[str, Any], key: str) -> Any:
+def _common(case: CaseContent, given: Mapping[str, Any], key: str) -> Any:
     """Return the common value of all sensors: they share a prior."""
     (first, value), *others = given.items()
     for name, other in others:
         if other != value:
             text = f"differs from that of '{first}'; all sensors share one prior."
-            raise frame.error(f"channels.{name}.{key}", text)
+            raise case.error(f"channels.{name}.{key}", text)
     return value
 
 
-def calibrated(
-    frame: Frame, base: Observation, names: Sequence[str], **options: Any
+def _calibrated(
+    case: CaseContent, base: Observation, names: Sequence[str], **options: Any
 ) -> Observation:
     """Return the readings: gain * (reading of the base) + offset + correlated."""
-    channels = frame.spec.channels
+    channels = case.spec.channels
 
     def reading(y: Any, q: Any, x: Any) -> Any:
         shown = []

@@ -16,11 +16,10 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from livepde.cases.case_frame import Frame
-from livepde.cases.equations import check_options, load_code
+from livepde.cases.case_content import CaseContent
+from livepde.cases.equations import check_options, load_code, own_code
 from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
-from livepde.errors import LivepdeError
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -62,68 +61,71 @@ UNSET = (
     f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
     "the measurements."
 )
+LOG = logging.getLogger("livepde.run")
+LEAP = "30 d"  # after a longer pause a second row has to confirm the time
+Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
 
-def clock_of(frame: Frame, data: DataSpec | None = None) -> Clock:
+def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
     """Return how times are read, by default those of `[data]`."""
-    data, unit = data or frame.spec.data, frame.equation.time_unit
-    rule = conversion(data.time_unit or unit, unit, frame.where("data.time_unit"))
-    second = conversion("s", unit, frame.where("data.time")).factor if unit else 1.0
-    start, stop = _instant(frame, data.start, "start"), _instant(frame, data.stop, "stop")
+    data, unit = data or case.spec.data, case.equation.time_unit
+    rule = conversion(data.time_unit or unit, unit, case.where("data.time_unit"))
+    second = conversion("s", unit, case.where("data.time")).factor if unit else 1.0
+    start, stop = _instant(case, data.start, "start"), _instant(case, data.stop, "stop")
     return Clock(
         data.times[0],
         rule.factor,
         start,
         stop,
         second,
-        zone=_zone(frame),
+        zone=_zone(case),
         format=data.time_format,
         decimal=data.decimal,
         hour="".join(data.times[1:]),
     )
 
 
-def _zone(frame: Frame) -> tzinfo:
+def _zone(case: CaseContent) -> tzinfo:
     """Return the zone of dates that name none."""
-    name = frame.spec.data.zone
+    name = case.spec.data.zone
     try:
         return ZoneInfo(name)
     except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
         text = f"there is no time zone '{name}'; expected a name as Europe/Berlin."
-        raise frame.error("data.zone", text) from None
+        raise case.error("data.zone", text) from None
 
 
-def _instant(frame: Frame, value: Any, key: str) -> Any:
+def _instant(case: CaseContent, value: Any, key: str) -> Any:
     """Return a date as it is, a quantity in the model's unit."""
     if isinstance(value, str) and not DATE.match(value):
-        return frame.convert(value, frame.equation.time_unit, f"data.{key}")
+        return case.convert(value, case.equation.time_unit, f"data.{key}")
     return value
 
 
 def read_data(
-    frame: Frame,
+    case: CaseContent,
     columns: Mapping[str, Column],
     clock: Clock,
     source: str | Iterable[str] | None,
 ) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
-    spec = frame.spec.data
+    spec = case.spec.data
     if source is None and isinstance(spec.file, tuple):
-        return _joined(frame, spec.file, columns)
-    check_hours(frame, clock, spec.file if source is None else source)
+        return _joined(case, spec.file, columns)
+    check_hours(case, clock, spec.file if source is None else source)
     if not isinstance(source, str | None):
         return JsonLines(source, columns, clock, every=spec.every, missing=spec.missing)
-    if source is None and frame.reader is not None:
-        return _from_reader(frame, frame.reader, columns, clock)
-    return _read(data_file(frame) if source is None else Path(source), columns, clock, spec)
+    if source is None and case.reader is not None:
+        return _from_reader(case, case.reader, columns, clock)
+    return _read(data_file(case) if source is None else Path(source), columns, clock, spec)
 
 
-def check_hours(frame: Frame, clock: Clock, source: Any) -> None:
+def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
     """Refuse times in two columns of a source that is no CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."
-        raise frame.error("data.time", text)
+        raise case.error("data.time", text)
 
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
@@ -143,12 +145,14 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
     return read_csv(path, columns, clock, **rows, **written)
 
 
-def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Column]) -> DataTable:
+def _joined(
+    case: CaseContent, files: Sequence[FileSpec], columns: Mapping[str, Column]
+) -> DataTable:
     """Return several files as one table, joined by time; each channel comes from one of them."""
-    specs = [frame.spec.data.of(file) for file in files]
-    paths = [_found(frame, str(spec.file)) for spec in specs]
-    headers = list(map(partial(_header, frame), specs, paths))
-    owners = {name: _owner(frame, name, one, paths, headers) for name, one in columns.items()}
+    specs = [case.spec.data.of(file) for file in files]
+    paths = [_found(case, str(spec.file)) for spec in specs]
+    headers = list(map(partial(_header, case), specs, paths))
+    owners = {name: _owner(case, name, one, paths, headers) for name, one in columns.items()}
     tables = []
     for k, (spec, path) in enumerate(zip(specs, paths, strict=True)):
         # Which rows are needed is decided once they are joined.
@@ -158,16 +162,20 @@ def _joined(frame: Frame, files: Sequence[FileSpec], columns: Mapping[str, Colum
             if owners[name] == k
         }
         if not own:
-            raise frame.error("data.file", f"no channel has a column of {path}; leave it out.")
-        tables.append(_read(path, own, clock_of(frame, spec), spec))
-    second = clock_of(frame).second
-    sensors = frame.roles("sensor", "withheld")
+            raise case.error("data.file", f"no channel has a column of {path}; leave it out.")
+        tables.append(_read(path, own, clock_of(case, spec), spec))
+    second = clock_of(case).second
+    sensors = case.roles("sensor", "withheld")
     needed = [name for name, column in columns.items() if column.needed]
-    return join_tables(tables, second, sensors, needed, frame.where("data.file"))
+    return join_tables(tables, second, sensors, needed, case.where("data.file"))
 
 
 def _owner(
-    frame: Frame, name: str, column: Column, paths: Sequence[Path], headers: Sequence[list[str]]
+    case: CaseContent,
+    name: str,
+    column: Column,
+    paths: Sequence[Path],
+    headers: Sequence[list[str]],
 ) -> int:
     """Return the number of the one file that has a column."""
     places = [k for k, header in enumerate(headers) if set(column.names) <= set(header)]
@@ -178,19 +186,19 @@ def _owner(
     if places:
         both = " and ".join(str(paths[k]) for k in places)
         text = f"{both} have a column {what} each; rename one."
-    raise frame.error(f"channels.{column.noise_of or name}", text)
+    raise case.error(f"channels.{column.noise_of or name}", text)
 
 
-def _header(frame: Frame, spec: DataSpec, path: Path) -> list[str]:
+def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
     """Return the names of the columns of one of several files."""
     if path.suffix in (".parquet", *JSON_LINES):
-        raise frame.error("data.file", f"{path} is no CSV file; only these are joined.")
+        raise case.error("data.file", f"{path} is no CSV file; only these are joined.")
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
-def without_gaps(frame: Frame, table: DataTable) -> DataTable:
+def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    channels = frame.spec.channels
+    channels = case.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
     screened = [name for name, item in channels.items() if item.screened]
     return fill_table(table, interpolated, screened)
@@ -208,109 +216,99 @@ def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any
 
 
 def _from_reader(
-    frame: Frame, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
+    case: CaseContent, reader: Callable[..., Any], columns: Mapping[str, Column], clock: Clock
 ) -> DataTable:
     """Return the data of the user's function: times, and a mapping from column to values."""
-    spec, where = frame.spec.data, frame.where(f"data.reader: {frame.spec.data.reader}")
-    folder = _measurements(frame)
-    try:
-        found = reader(folder or frame.path.parent, **spec.options)
-    except LivepdeError:
-        raise
-    except FileNotFoundError as error:
-        remedy = "" if folder else f" {UNSET}"
-        text = f"there is no file '{error.filename}'.{remedy}"
-        raise frame.error("data.reader", text) from None
-    except Exception as error:
-        text = f"{spec.reader} failed with {type(error).__name__}: {error}."
-        raise frame.error("data.reader", text) from error
+    spec, where = case.spec.data, case.where(f"data.reader: {case.spec.data.reader}")
+    folder = _measurements(case)
+    with own_code(where):
+        try:
+            found = reader(folder or case.path.parent, **spec.options)
+        except FileNotFoundError as error:
+            remedy = "" if folder else f" {UNSET}"
+            text = f"there is no file '{error.filename}'.{remedy}"
+            raise case.error("data.reader", text) from None
     match found:
         case (times, Mapping() as values):
             pass
         case _:
             text = f"{spec.reader} returned {type(found).__name__}; expected times and a mapping "
-            raise frame.error("data.reader", text + "from column to values.")
+            raise case.error("data.reader", text + "from column to values.")
     return tabulated(
         times, values, columns, clock, every=spec.every, missing=spec.missing, where=where
     )
 
 
-def data_file(frame: Frame) -> Path:
+def data_file(case: CaseContent) -> Path:
     """Return the data file; relative names start at the case file."""
-    given = frame.spec.data.file
+    given = case.spec.data.file
     if given is None:
-        raise frame.missing("data.file", "name one, or add --data to the command.")
+        raise case.missing("data.file", "name one, or add --data to the command.")
     if not isinstance(given, str):
         text = "several files are joined for 'check' and 'run' of a complete record; a process is "
-        raise frame.error("data.file", text + "followed in one: name it, or join them first.")
-    return _found(frame, given)
+        raise case.error("data.file", text + "followed in one: name it, or join them first.")
+    return _found(case, given)
 
 
-def _found(frame: Frame, given: str) -> Path:
+def _found(case: CaseContent, given: str) -> Path:
     """Return where a file of the case is; relative names start at the case file."""
     if VARIABLE in given:
-        if (folder := _measurements(frame)) is None:
-            raise frame.error("data.file", UNSET)
+        if (folder := _measurements(case)) is None:
+            raise case.error("data.file", UNSET)
         given = given.replace(VARIABLE, str(folder))
-    path = frame.path.parent / Path(given).expanduser()
-    if not path.is_file() and not frame.spec.data.follow:
-        raise frame.error("data.file", str(no_file(path)))
+    path = case.path.parent / Path(given).expanduser()
+    if not path.is_file() and not case.spec.data.follow:
+        raise case.error("data.file", str(no_file(path)))
     return path
 
 
-def _measurements(frame: Frame) -> Path | None:
+def _measurements(case: CaseContent) -> Path | None:
     """Return the folder of measurements that several cases share, if there is one."""
     named = os.environ.get("LIVEPDE_DATA")
     if named:
         return Path(named).absolute()
-    for base in (Path.cwd(), *frame.path.absolute().parents):
+    for base in (Path.cwd(), *case.path.absolute().parents):
         folder = base.parent / "shared" / "data"
         if folder.is_dir():
             return folder
     return None
 
 
-def assimilation_start(frame: Frame, clock: Clock, origin: datetime | None) -> float:
+def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None) -> float:
     """Return the model time from which sensors are assimilated."""
-    value = _instant(frame, frame.spec.data.assimilate_from, "assimilate_from")
+    value = _instant(case, case.spec.data.assimilate_from, "assimilate_from")
     if value is None:
         return float(-np.inf)
     if isinstance(value, float | int):
         return float(value)
     if origin is None:
         text = f"got the date {value}; the times of the data are numbers."
-        raise frame.error("data.assimilate_from", text)
+        raise case.error("data.assimilate_from", text)
     stamp = clock.stamp(value)
     if stamp is None:
         text = f"got '{value}'; expected a date as 2025-04-01 12:00."
-        raise frame.error("data.assimilate_from", text)
+        raise case.error("data.assimilate_from", text)
     return (stamp - since_1970(origin)) * clock.second
 
 
-LOG = logging.getLogger("livepde.run")
-LEAP = "30 d"  # after a longer pause a second row has to confirm the time
-
-Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
-
-
-def source_of(frame: Frame, data: Data, position: str) -> RowSource:
+def source_of(case: CaseContent, data: Data, position: str) -> RowSource:
     """Return the source of the rows of a case, from a position on."""
     match data:
         case None:
-            return _own_source(frame, position)
+            return _own_source(case, position)
         case str():
-            return _file_source(frame, Path(data), position)
+            return _file_source(case, Path(data), position)
         case Iterable():
             return Lines(data)
     return data
 
 
-def _own_source(frame: Frame, position: str) -> RowSource:
+def _own_source(case: CaseContent, position: str) -> RowSource:
     """Return the source that the case names: a broker, a server or a file."""
-    spec = frame.spec.data
+    spec = case.spec.data
     if spec.mqtt is not None:
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
-        return MqttSource(_broker(frame, spec.mqtt, "data.mqtt"), topics, spec.times[0])
+        return MqttSource(_broker(case, spec.mqtt, "data.mqtt"), topics, spec.times[0])
     if spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
@@ -318,15 +316,15 @@ def _own_source(frame: Frame, position: str) -> RowSource:
             spec.opcua.url,
             spec.opcua.columns,
             spec.times[0],
-            interval=frame.positive(spec.opcua.interval, "s", "data.opcua.interval"),
+            interval=case.positive(spec.opcua.interval, "s", "data.opcua.interval"),
             username=spec.opcua.username,
-            password=_password(frame, spec.opcua.password_env, "data.opcua"),
+            password=_password(case, spec.opcua.password_env, "data.opcua"),
         )
-    return _file_source(frame, data_file(frame), position)
+    return _file_source(case, data_file(case), position)
 
 
-def _file_source(frame: Frame, path: Path, position: str) -> Follow:
-    spec = frame.spec.data
+def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
+    spec = case.spec.data
     if spec.follow and not path.exists():
         LOG.warning("there is no file '%s' yet: waits for it", path)
     return Follow(
@@ -338,17 +336,17 @@ def _file_source(frame: Frame, path: Path, position: str) -> Follow:
     )
 
 
-def publishers_of(frame: Frame) -> list[Sink]:
+def publishers_of(case: CaseContent) -> list[Sink]:
     """Return the sinks that a case names."""
-    spec = frame.spec.output.mqtt
+    spec = case.spec.output.mqtt
     if spec is None:
         return []
-    return [MqttSink(_broker(frame, spec, "output.mqtt"), spec.topic)]
+    return [MqttSink(_broker(case, spec, "output.mqtt"), spec.topic)]
 
 
-def source_text(frame: Frame) -> str:
+def source_text(case: CaseContent) -> str:
     """Return a description of the source of the rows of a case."""
-    spec = frame.spec.data
+    spec = case.spec.data
     if spec.mqtt is not None:
         topics = ", ".join([*spec.mqtt.rows, *spec.mqtt.columns])
         return f"{topics} of the broker at {spec.mqtt.host}:{spec.mqtt.port}"
@@ -359,55 +357,55 @@ def source_text(frame: Frame) -> str:
     return str(spec.file or spec.reader)
 
 
-def _broker(frame: Frame, spec: BrokerSpec, key: str) -> Broker:
+def _broker(case: CaseContent, spec: BrokerSpec, key: str) -> Broker:
     return Broker(
         host=spec.host,
         port=spec.port,
-        client_id=spec.client_id or f"livepde-{frame.name}",
+        client_id=spec.client_id or f"livepde-{case.name}",
         username=spec.username,
-        password=_password(frame, spec.password_env, key),
+        password=_password(case, spec.password_env, key),
         tls=spec.tls,
         ca_file=spec.ca_file,
-        session=round(frame.positive(spec.session, "s", f"{key}.session")),
+        session=round(case.positive(spec.session, "s", f"{key}.session")),
     )
 
 
-def _password(frame: Frame, variable: str | None, key: str) -> str | None:
+def _password(case: CaseContent, variable: str | None, key: str) -> str | None:
     if variable is None:
         return None
     if variable not in os.environ:
-        raise frame.error(
+        raise case.error(
             f"{key}.password_env", f"the environment variable {variable} is not set; set it."
         )
     return os.environ[variable]
 
 
-def limits_of(frame: Frame) -> tuple[Backlog, Retention, float]:
+def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float]:
     """Return limits of backlog and retention, and the seconds until a source is silent."""
-    spec = frame.spec
+    spec = case.spec
     # Without these keys all estimates are kept, and no source counts as silent.
-    unit, never = frame.equation.time_unit, math.inf
-    span = frame.positive(spec.output.retain, unit, "output.retain", never)
-    silence = frame.positive(spec.intake.silence, "s", "intake.silence", never)
+    unit, never = case.equation.time_unit, math.inf
+    span = case.positive(spec.output.retain, unit, "output.retain", never)
+    silence = case.positive(spec.intake.silence, "s", "intake.silence", never)
     backlog = Backlog(spec.intake.overflow, spec.intake.queue)
     return backlog, Retention(span, spec.output.thin), silence
 
 
-def policy_of(frame: Frame) -> Policy:
+def policy_of(case: CaseContent) -> Policy:
     """Return the policy for rows that are late, repeated or incomplete."""
-    spec, unit = frame.spec.intake, frame.equation.time_unit
+    spec, unit = case.spec.intake, case.equation.time_unit
 
     def duration(value: float | str, key: str) -> float:
-        return frame.convert(value, unit, key, difference=True)
+        return case.convert(value, unit, key, difference=True)
 
     habits = {}
-    for name, channel in frame.spec.channels.items():
+    for name, channel in case.spec.channels.items():
         wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
         interpolated = channel.gaps == "interpolate"
         habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
     # Without a unit of time 30 days cannot be converted: then any pause is accepted.
-    leap = frame.convert(LEAP, unit, "intake.leap") if unit else math.inf
-    leap = frame.positive(spec.leap, unit, "intake.leap", leap)
+    leap = case.convert(LEAP, unit, "intake.leap") if unit else math.inf
+    leap = case.positive(spec.leap, unit, "intake.leap", leap)
     return Policy(
         wait=duration(spec.wait, "intake.wait"),
         tolerance=duration(spec.tolerance, "intake.tolerance"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 from livepde.streams.table import no_file
 
-__all__ = ["check_options", "load_code", "resolve"]
+__all__ = ["check_options", "load_code", "own_code", "resolve"]
 
 
 def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equation:
@@ -69,15 +70,8 @@ def _checked(name: str, function: Any, where: str) -> Callable[..., Model]:
     def build(
         mesh: Any, unknowns: Mapping[str, Any], dirichlet: Mapping[str, Any], **options: Any
     ) -> Model:
-        try:
+        with own_code(f"{where}: equation: {name}(mesh, unknowns, dirichlet, **options)"):
             model = function(mesh, unknowns, dirichlet, **options)
-        except LivepdeError:
-            raise
-        except Exception as error:
-            raise CaseError(
-                f"{where}: equation: {name}(mesh, unknowns, dirichlet, **options) failed with "
-                f"{type(error).__name__}: {error}."
-            ) from error
         if not isinstance(model, Model):
             raise CaseError(
                 f"{where}: equation: {name} returned {type(model).__name__}, not a livepde.Model."
@@ -92,6 +86,17 @@ def _option(value: Any) -> Option:
     if isinstance(value, str) and value[:1].strip("+-.0123456789 "):
         return Option("", "", value)
     return Option("", "", value if isinstance(value, bool) else None)
+
+
+@contextmanager
+def own_code(what: str) -> Iterator[None]:
+    """Raise what fails in code of the user as a `CaseError`; errors of livepde stay as they are."""
+    try:
+        yield
+    except LivepdeError:
+        raise
+    except Exception as error:
+        raise CaseError(f"{what} failed with {type(error).__name__}: {error}.") from error
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
@@ -150,7 +155,7 @@ def _no_code(path: Path, source: str, folder: Path) -> str:
 
 
 def _module(source: str, folder: Path, where: str) -> Any:
-    try:
+    with own_code(f"{where}: loading '{source}'"):
         if not source.endswith(".py"):
             return importlib.import_module(source)
         path = folder / source
@@ -162,10 +167,4 @@ def _module(source: str, folder: Path, where: str) -> Any:
             raise ImportError(f"{path} is not a Python file")
         module = importlib.util.module_from_spec(loader)
         loader.loader.exec_module(module)
-    except LivepdeError:
-        raise
-    except Exception as error:
-        raise CaseError(
-            f"{where}: loading '{source}' failed with {type(error).__name__}: {error}."
-        ) from error
-    return module
+        return module

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 from livepde.cases.case_channels import noise_of, unknowns_of
-from livepde.cases.case_frame import Frame
+from livepde.cases.case_content import CaseContent
 from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
 from livepde.errors import LawError
 from livepde.laws import (
@@ -27,13 +27,13 @@ __all__ = ["law_of"]
 Options = TypeVar("Options")
 
 
-def law_of(frame: Frame) -> AnyLaw:
+def law_of(case: CaseContent) -> AnyLaw:
     """Return the law; raises `CaseError`."""
-    spec = frame.spec.law
-    with frame.located("law", LawError):
+    spec = case.spec.law
+    with case.located("law", LawError):
         if isinstance(spec, GradientSpec):
             return _gradient(spec)
-        return _auto(frame, spec) if isinstance(spec, AutoSpec) else _sensitivity(frame, spec)
+        return _auto(case, spec) if isinstance(spec, AutoSpec) else _sensitivity(case, spec)
 
 
 def _gradient(spec: GradientSpec) -> GradientLaw:
@@ -43,38 +43,38 @@ def _gradient(spec: GradientSpec) -> GradientLaw:
     return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
 
-def _auto(frame: Frame, spec: AutoSpec) -> AutoLaw:
-    noise = None if spec.noise is None else _level(frame, spec.noise)
+def _auto(case: CaseContent, spec: AutoSpec) -> AutoLaw:
+    noise = None if spec.noise is None else _level(case, spec.noise)
     shadows = _chosen(Shadows, spec.shadows)
     return AutoLaw(spec.modes, noise, gate=spec.gate, shadows=shadows)
 
 
-def _sensitivity(frame: Frame, spec: SensitivitySpec) -> SensitivityLaw:
-    time = frame.equation.time_unit
-    memory = frame.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
-    drift = frame.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
+def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
+    time = case.equation.time_unit
+    memory = case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
+    drift = case.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
     return SensitivityLaw(
         spec.modes,
-        _noise(frame, spec),
+        _noise(case, spec),
         drift,
         memory,
         _chosen(Replay, spec.replay),
         gate=spec.gate,
-        jumps=_jumps(frame, spec),
+        jumps=_jumps(case, spec),
         guards=_chosen(Guards, spec.guards),
         shadows=_chosen(Shadows, spec.shadows),
         verdict=spec.verdict,
     )
 
 
-def _jumps(frame: Frame, spec: SensitivitySpec) -> Jumps | None:
+def _jumps(case: CaseContent, spec: SensitivitySpec) -> Jumps | None:
     """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
     given = spec.jumps
     found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
-    known = [*frame.spec.unknowns, *unknowns_of(frame)]
+    known = [*case.spec.unknowns, *unknowns_of(case)]
     key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
     for name in (found.unknowns if found is not None else None) or ():
-        frame.require(name, known, key, f"there is no unknown '{name}'")
+        case.require(name, known, key, f"there is no unknown '{name}'")
     return found
 
 
@@ -85,15 +85,15 @@ def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
     return given
 
 
-def _noise(frame: Frame, spec: SensitivitySpec) -> float | str | None:
+def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
     """Return the noise of the law, which needs it here or from every sensor."""
     if spec.noise is not None and spec.noise != "auto":
-        return _level(frame, spec.noise)
-    if noise_of(frame, "sensor") is None:
+        return _level(case, spec.noise)
+    if noise_of(case, "sensor") is None:
         if spec.noise == "auto":
             text = "got 'auto', which begins with a guess: give every sensor its noise."
-            raise frame.error("law.noise", text)
-        raise frame.missing(
+            raise case.error("law.noise", text)
+        raise case.missing(
             "law.noise",
             "the sensitivity law weighs the sensors by their noise (a standard deviation); "
             "give it here or with every sensor.",
@@ -101,5 +101,5 @@ def _noise(frame: Frame, spec: SensitivitySpec) -> float | str | None:
     return None if spec.noise is None else "auto"
 
 
-def _level(frame: Frame, noise: float | str) -> float:
-    return frame.positive(noise, frame.equation.state.unit, "law.noise")
+def _level(case: CaseContent, noise: float | str) -> float:
+    return case.positive(noise, case.equation.state.unit, "law.noise")

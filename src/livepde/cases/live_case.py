@@ -31,17 +31,17 @@ from livepde.streams.clock import since_1970
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
-__all__ = ["Wiring"]
+__all__ = ["LiveCase"]
 
 LOG = logging.getLogger("livepde.run")
 
 
-class Wiring:
+class LiveCase:
     """Connection of a case to its process; a context manager, or to be closed explicitly.
 
     ::
 
-        with Wiring(load("case.toml"), Rows(my_rows()), path=Path("journal.sqlite")) as wiring:
+        with LiveCase(load("case.toml"), Rows(my_rows()), path=Path("journal.sqlite")) as wiring:
             live = wiring.live()
             live.run()
             print(live.result.table())
@@ -102,7 +102,7 @@ class Wiring:
                 self._feed = Paced(self._feed, pace * case.clock.second)
             self._stack = stack.pop_all()
 
-    def __enter__(self) -> Wiring:
+    def __enter__(self) -> LiveCase:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -239,13 +239,13 @@ class Wiring:
 
     def _reads_all(self, data: Data, named: str | None) -> bool:
         """Return whether all rows are read at once, not followed one by one."""
-        frame, spec = self.case, self.case.spec.data
-        file, reader = (spec.file, frame.reader) if data is None else (named, None)
+        case, spec = self.case, self.case.spec.data
+        file, reader = (spec.file, case.reader) if data is None else (named, None)
         if not isinstance(file, tuple):
-            check_hours(frame, self.case.clock, file)
+            check_hours(case, self.case.clock, file)
         if spec.every > 1 and not (file or reader):
             text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
-            raise frame.error("data.every", text)
+            raise case.error("data.every", text)
         whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
         # These options are of files: lines that are sent have neither titles nor a second column.
         listed = spec.every > 1 or spec.skip > 0 or len(spec.times) > 1

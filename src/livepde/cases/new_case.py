@@ -23,11 +23,9 @@ from livepde.stepping import Advance, Alexander2, simulate
 __all__ = [
     "PLACES",
     "FoundChannel",
-    "case_for",
     "channels_in",
     "check_free",
     "files_for",
-    "places_for",
     "write_files",
     "write_template",
 ]
@@ -50,6 +48,59 @@ VALUES = """\
 # or has a flux or an exchange: [boundary], as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
 # A value given at a boundary: role = "boundary", at = its name, as "left"; others are closed."""
+TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
+NOISE = 0.05
+CASE = """\
+# A case of livepde: which process, what is unknown, which channel is what.
+#   livepde check {0}     what is in here, and what its sensors can tell
+#   livepde run {0}       identify; writes a run directory
+# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
+# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.
+title = "A metal rod, heated and cooled at its left end"
+equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
+                               # or your own as "file.py:function" (run it with --allow-code)
+initial = "interpolate"        # from the first sample; or a number such as "20 degC"
+
+[mesh]
+from = 0
+to = "40 cm"
+cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
+
+[data]
+file = "rod.csv"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
+time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
+time_unit = "s"
+# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
+# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
+# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
+
+[unknowns.alpha]               # names are those of the equation
+prior = "5e-5 m^2/s"           # what you would have said without data ...
+std = "3e-5 m^2/s"             # ... and how far off that may be
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
+# as a field: field = true, length = "10 cm"   (and no bounds)
+
+[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
+T_left = {{ role = "boundary", column = "T_left", at = "left" }}
+T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
+T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
+T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
+T_right = {{ role = "boundary", column = "T_right", at = "right" }}
+
+[law]
+kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
+replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
+                               # kind = "auto" finds out, and needs no noise either
+
+[steps]
+scheme = "alexander2"          # second order; or "implicit-euler"
+dt_max = "20 s"                # longer intervals between samples are divided
+
+[expect]                       # of these very data: drop it, or say what you expect of yours
+alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
+rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
+"""
 
 
 @dataclass(frozen=True)
@@ -79,7 +130,7 @@ class FoundChannel:
         return bool(self.given["role"] == "sensor")
 
 
-def case_for(table: Measured, folder: Path, equation: Equation) -> str:
+def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     """Return the text of a case in `folder` that equation and table tell; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
@@ -102,7 +153,7 @@ def case_for(table: Measured, folder: Path, equation: Equation) -> str:
     return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
 
 
-def places_for(found: list[FoundChannel], equation: Equation) -> str:
+def _places_for(found: list[FoundChannel], equation: Equation) -> str:
     """Return the table of positions that is to be filled in; empty if no channel names one."""
     columns = [c for item in found if item.given.get("positions") == PLACES for c in item.columns]
     axes = "xyz"[: equation.dimension]
@@ -383,61 +434,6 @@ def _range(values: Array) -> str:
     return f"{told}, {missing} missing" if missing else told
 
 
-TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
-NOISE = 0.05
-CASE = """\
-# A case of livepde: which process, what is unknown, which channel is what.
-#   livepde check {0}     what is in here, and what its sensors can tell
-#   livepde run {0}       identify; writes a run directory
-# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
-# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.
-title = "A metal rod, heated and cooled at its left end"
-equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
-                               # or your own as "file.py:function" (run it with --allow-code)
-initial = "interpolate"        # from the first sample; or a number such as "20 degC"
-
-[mesh]
-from = 0
-to = "40 cm"
-cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
-
-[data]
-file = "rod.csv"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
-time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
-time_unit = "s"
-# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
-# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
-# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
-
-[unknowns.alpha]               # names are those of the equation
-prior = "5e-5 m^2/s"           # what you would have said without data ...
-std = "3e-5 m^2/s"             # ... and how far off that may be
-bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
-# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
-# as a field: field = true, length = "10 cm"   (and no bounds)
-
-[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
-T_left = {{ role = "boundary", column = "T_left", at = "left" }}
-T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
-T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
-T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
-T_right = {{ role = "boundary", column = "T_right", at = "right" }}
-
-[law]
-kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
-                               # kind = "auto" finds out, and needs no noise either
-
-[steps]
-scheme = "alexander2"          # second order; or "implicit-euler"
-dt_max = "20 s"                # longer intervals between samples are divided
-
-[expect]                       # of these very data: drop it, or say what you expect of yours
-alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
-rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
-"""
-
-
 def write_template(
     folder: Path, table: Measured | Path | None = None, equation: Equation = EQUATIONS["heat"]
 ) -> tuple[Path, Path]:
@@ -471,8 +467,8 @@ def write_template(
 
 def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, str]:
     """Return name -> text of the files of a case for a table."""
-    places = places_for(channels_in(table, equation), equation)
-    return {"case.toml": case_for(table, folder, equation), **({PLACES: places} if places else {})}
+    places = _places_for(channels_in(table, equation), equation)
+    return {"case.toml": _case_for(table, folder, equation), **({PLACES: places} if places else {})}
 
 
 def check_free(folder: Path, names: Iterable[str]) -> None:

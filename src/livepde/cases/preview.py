@@ -29,6 +29,11 @@ __all__ = ["Advice", "Identified", "Preview", "advise", "linearised", "preview"]
 MOST_SAMPLES = 500
 NEVER = 1 << 60
 
+MOST_CANDIDATES = 400  # positions that are compared
+SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
+NEW = "one more sensor"
+NOTHING = "advice on sensors: the data hold no measurement."
+
 
 @dataclass(frozen=True)
 class Identified:
@@ -207,12 +212,6 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
             label = f"{name} at {at} ({what})"
             found.append(Identified(label, float(prior[k]), float(posterior[k]), units[name]))
     return found
-
-
-MOST_CANDIDATES = 400  # positions that are compared
-SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
-NEW = "one more sensor"
-NOTHING = "advice on sensors: the data hold no measurement."
 
 
 @dataclass(frozen=True, eq=False)

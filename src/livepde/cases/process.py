@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case_channels import unknowns_of
-from livepde.cases.case_frame import Frame
-from livepde.cases.geometry import inside, off_nodes, sides_of, subdomain
+from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import BoundarySpec, EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
@@ -32,226 +31,204 @@ from livepde.fem import (
     linear,
 )
 from livepde.model import Model
-from livepde.models import Exchange, Flux, Fluxes, Option, Source, Variable, with_conditions
+from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount
 
-__all__ = ["conditioned", "drive_notes", "held", "model_of", "options_of", "process_notes"]
+__all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes"]
 
 
-def options_of(frame: Frame) -> dict[str, Any]:
-    """Return the options of the equation: numbers in its units, text and booleans."""
-    known, given = frame.equation.options, frame.spec.options
-    frame.only(given, known, "options")
-    values: dict[str, Any] = {}
-    for name, option in known.items():
-        key = f"options.{name}"
-        if name in given:
-            values[name] = _option(frame, option, given[name], key)
-        elif option.default is not None:
-            values[name] = option.default
-        else:
-            unit = f", in {option.unit}" if option.unit else ""
-            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
-            raise frame.missing(key, f"the {option.text}{unit}{choices}.")
-    return values
-
-
-def _option(frame: Frame, option: Option, value: Any, key: str) -> Any:
-    if option.kind is float and not isinstance(value, bool):
-        return frame.convert(value, option.unit, key)
-    if not isinstance(value, option.kind):
-        kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
-        raise frame.error(key, f"got {value!r}; expected {kind}.")
-    if option.choices:
-        frame.require(str(value), option.choices, key, f"got '{value}'")
-    return value
-
-
-def model_of(frame: Frame, mesh: Any, options: Mapping[str, Any]) -> Model:
+def model_of(case: CaseContent) -> Model:
     """Return the model of a case; raises `CaseError` on missing or superfluous parts."""
-    inputs = frame.roles("input")
-    frame.only(inputs, frame.equation.inputs, "channels (role input)")
-    constants = frame.constants
+    inputs = case.roles("input")
+    case.only(inputs, case.equation.inputs, "channels (role input)")
+    constants = case.constants
     given = {*inputs, *constants}
-    for name, variable in frame.equation.inputs.items():
+    for name, variable in case.equation.inputs.items():
         if name not in given and not variable.optional:
-            raise _without_input(frame, name, f"the {variable.text}")
-    unknowns = _unknowns(frame, mesh)
-    with frame.located("unknowns", NameClashError):
-        model = frame.equation.build(mesh, unknowns, _dirichlet(frame, mesh), **options)
-    _check_inputs(frame, model, given, constants)
+            raise _without_input(case, name, f"the {variable.text}")
+    unknowns = _unknowns(case)
+    with case.located("unknowns", NameClashError):
+        model = case.equation.build(case.mesh, unknowns, _dirichlet(case), **case.options)
+    _check_inputs(case, model, given, constants)
     model = model.with_constant_inputs(constants) if constants else model
-    own = unknowns_of(frame)
+    own = unknowns_of(case)
     if not own:
         return model
-    with frame.located("channels", ModelError):
+    with case.located("channels", ModelError):
         return model.with_unknowns(own)
 
 
-def _check_inputs(frame: Frame, model: Model, given: set[str], constants: Iterable[str]) -> None:
+def _check_inputs(
+    case: CaseContent, model: Model, given: set[str], constants: Iterable[str]
+) -> None:
     """Refuse inputs that the model reads and the case lacks, and constants that it does not read.
 
     Only the built model knows which optional inputs it reads with these unknowns.
     """
     for name in model.inputs:
         if name not in given:
-            known = frame.equation.inputs.get(name)
+            known = case.equation.inputs.get(name)
             raise _without_input(
-                frame, name, f"the {known.text}" if known else "the equation reads it"
+                case, name, f"the {known.text}" if known else "the equation reads it"
             )
     # A constant that nothing reads is refused, since it may be the one a user believes to act.
     for name in constants:
         if name not in model.inputs:
             text = "the equation does not read it with these unknowns; leave it out."
-            raise frame.error(f"inputs.{name}", text)
+            raise case.error(f"inputs.{name}", text)
 
 
-def _without_input(frame: Frame, name: str, what: str) -> CaseError:
+def _without_input(case: CaseContent, name: str, what: str) -> CaseError:
     text = f"{what}, with role = 'input'; or a constant, inputs.{name}."
-    return frame.missing(f"channels.{name}", text)
+    return case.missing(f"channels.{name}", text)
 
 
-def _dirichlet(frame: Frame, mesh: Any) -> dict[str, Any]:
+def _dirichlet(case: CaseContent) -> dict[str, Any]:
     # "boundary" is all of it, also of a mesh without named boundaries.
-    known = [*(mesh.boundaries or {}), "boundary"]
+    known = [*(case.mesh.boundaries or {}), "boundary"]
     values: dict[str, Any] = {}
-    for name, value in held(frame).items():
-        frame.require(name, known, "boundary", f"no boundary '{name}'")
+    for name, value in held(case).items():
+        case.require(name, known, "boundary", f"no boundary '{name}'")
         values[name] = value
-    for name, channel in frame.roles("boundary").items():
+    for name, channel in case.roles("boundary").items():
         key, at = f"channels.{name}.at", str(channel.at)
-        frame.require(at, known, key, f"no boundary '{at}'")
+        case.require(at, known, key, f"no boundary '{at}'")
         if at in values:
-            raise frame.error(key, f"the boundary '{at}' has a value already; keep one.")
+            raise case.error(key, f"the boundary '{at}' has a value already; keep one.")
         values[at] = Channel(name)
     return values
 
 
-def _unknowns(frame: Frame, mesh: Any) -> dict[str, Any]:
-    known, given = frame.equation.unknowns, frame.spec.unknowns
-    frame.only(given, known, "unknowns")
+def _unknowns(case: CaseContent) -> dict[str, Any]:
+    known, given = case.equation.unknowns, case.spec.unknowns
+    case.only(given, known, "unknowns")
     for name, variable in known.items():
         if name not in given and not variable.optional:
             text = f"the {variable.text}, with prior and std in {variable.unit or 'no unit'}."
-            raise frame.missing(f"unknowns.{name}", text)
-    return {name: _unknown(frame, mesh, name, spec) for name, spec in given.items()}
+            raise case.missing(f"unknowns.{name}", text)
+    return {name: _unknown(case, name, spec) for name, spec in given.items()}
 
 
-def _unknown(frame: Frame, mesh: Any, name: str, spec: UnknownSpec) -> Any:
+def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
     """Return an unknown with its prior in the model's unit; plain numbers are in `spec.unit`."""
-    key, unit = f"unknowns.{name}", frame.equation.unknowns[name].unit
-    with frame.located(key, SpaceError):
-        options = _options_of(frame, spec, unit, key)
+    key, unit = f"unknowns.{name}", case.equation.unknowns[name].unit
+    with case.located(key, SpaceError):
+        options = _options_of(case, spec, unit, key)
         if spec.field:
-            return _field(frame, mesh, spec, name, options)
+            return _field(case, spec, name, options)
         if spec.regions is None:
             return Scalar(**options)
         places = {region: item.over for region, item in spec.regions.items()}
-        regions = _regions(frame, mesh, places, f"{key}.regions")
+        regions = _regions(case, places, f"{key}.regions")
         # A region may state a prior of its own; the others share that of the unknown.
         own = {}
         for region, item in spec.regions.items():
             if (there := spec.at(item)) is not None:
                 where = f"{key}.regions.{region}"
-                with frame.located(where, SpaceError):
-                    own[region] = Scalar(**_options_of(frame, there, unit, where))
+                with case.located(where, SpaceError):
+                    own[region] = Scalar(**_options_of(case, there, unit, where))
         return Piecewise(regions, **options, own=own)
 
 
-def _options_of(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
+def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
     """Return prior, evolution and within in the model's unit, and that unit."""
-    prior = _prior(frame, spec, unit, key)
+    prior = _prior(case, spec, unit, key)
     options: dict[str, Any] = {"prior": prior, "unit": unit, "within": spec.within}
     if spec.evolution is not None:
-        options["evolution"] = _evolution(frame, spec, spec.evolution, unit, f"{key}.evolution")
+        options["evolution"] = _evolution(case, spec, spec.evolution, unit, f"{key}.evolution")
     return options
 
 
-def _prior(frame: Frame, spec: UnknownSpec, unit: str, key: str) -> Prior:
+def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> Prior:
     """Return the prior in the model's unit."""
-    rule = conversion(spec.unit or unit, unit, frame.where(f"{key}.unit"))
+    rule = conversion(spec.unit or unit, unit, case.where(f"{key}.unit"))
 
     def value(given: float | str, item: str) -> float:
         if isinstance(given, str):
             # An equation of the user's own may declare no unit, and then text cannot be converted.
-            if not unit and ":" in frame.spec.equation:
-                text = f"got '{given}'; '{frame.spec.equation}' has no units of its own: "
+            if not unit and ":" in case.spec.equation:
+                text = f"got '{given}'; '{case.spec.equation}' has no units of its own: "
                 text += f"say {key}.unit, too, or write numbers."
-                raise frame.error(f"{key}.{item}", text)
-            return frame.convert(given, unit, f"{key}.{item}")
+                raise case.error(f"{key}.{item}", text)
+            return case.convert(given, unit, f"{key}.{item}")
         return rule.factor * given + rule.offset
 
     prior = value(spec.prior, "prior")
     # A standard deviation is a difference, so the offset of a unit as degC does not apply.
     given = spec.std if isinstance(spec.std, str) else rule.factor * spec.std
-    std = frame.positive(given, unit, f"{key}.std")
+    std = case.positive(given, unit, f"{key}.std")
     low, high = -np.inf, np.inf
     if spec.bounds is not None:
         low, high = (value(bound, "bounds") for bound in spec.bounds)
         if not low < high:
             text = f"got [{low:g}, {high:g}] {unit}".rstrip()
-            raise frame.error(f"{key}.bounds", f"{text}; needs the lower one first.")
+            raise case.error(f"{key}.bounds", f"{text}; needs the lower one first.")
         if not low <= prior <= high:
             text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
-            raise frame.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
+            raise case.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
         return Normal(prior, std, (low, high))
-    return _transformed(frame, spec.transform, prior, std, (low, high), key)
+    return _transformed(case, spec.transform, prior, std, (low, high), key)
 
 
 def _transformed(
-    frame: Frame, transform: str, median: float, std: float, bounds: tuple[float, float], key: str
+    case: CaseContent,
+    transform: str,
+    median: float,
+    std: float,
+    bounds: tuple[float, float],
+    key: str,
 ) -> Prior:
     """Return the prior of an unknown with a transform; errors name the keys of the case."""
     low, high = bounds
     if transform == "log":
         if np.isfinite(high):
-            raise frame.error(key, "transform='log' knows no upper bound; take 'logit'.")
+            raise case.error(key, "transform='log' knows no upper bound; take 'logit'.")
         low = low if np.isfinite(low) else 0.0
     elif not np.isfinite(bounds).all():
-        raise frame.error(key, f"transform='logit' needs two finite bounds; got {bounds}.")
+        raise case.error(key, f"transform='logit' needs two finite bounds; got {bounds}.")
     if not low < median < high:
         text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
-        raise frame.error(key, text + "inside of the bounds.")
+        raise case.error(key, text + "inside of the bounds.")
     return (LogNormal if transform == "log" else LogitNormal)(median, std, (low, high))
 
 
 def _evolution(
-    frame: Frame, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
+    case: CaseContent, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
 ) -> Evolution:
     """Return the evolution of an unknown; a rate is a standard deviation after one unit of time."""
-    time = frame.equation.time_unit
+    time = case.equation.time_unit
     if spec.rate is not None:
         # A rate is a difference, of the logarithm under a transform; "degC" cannot be divided.
         moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
         per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
-        return RandomWalk(frame.positive(spec.rate, per, f"{key}.rate"))
+        return RandomWalk(case.positive(spec.rate, per, f"{key}.rate"))
     if spec.time is not None:
-        return MeanReverting(frame.positive(spec.time, time, f"{key}.time"))
-    return Periodic(frame.positive(spec.period, time, f"{key}.period"), spec.harmonics)
+        return MeanReverting(case.positive(spec.time, time, f"{key}.time"))
+    return Periodic(case.positive(spec.period, time, f"{key}.period"), spec.harmonics)
 
 
-def _field(
-    frame: Frame, mesh: Any, spec: UnknownSpec, name: str, given: Mapping[str, Any]
-) -> Field:
+def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, Any]) -> Field:
+    mesh = case.mesh
     # Default correlation length: a third of the extent along x.
     third, key = float(np.ptp(mesh.p[0])) / 3, f"unknowns.{name}.length"
-    length = frame.positive(spec.length, frame.equation.length_unit, key, third)
+    length = case.positive(spec.length, case.equation.length_unit, key, third)
 
     # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
     # pointwise variance of H^1 would be infinite, so that it takes H^2.
     dimension = len(mesh.p)
     inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
     # A transform acts on each coefficient, which in linear elements is the value at a node.
-    element = linear(mesh) if spec.transform else frame.equation.element(mesh)
+    element = linear(mesh) if spec.transform else case.equation.element(mesh)
     return Field(mesh, element, inner=inner, **given)
 
 
-def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
     """Return subdomains of the mesh by name, and predicates of layers and boxes.
 
     Every point has to lie in exactly one.
     """
+    mesh = case.mesh
     # Midpoints of cells decide, since a vertex on an interface would belong to two regions.
     middle = mesh.p[:, mesh.t].mean(axis=1)
     count = np.zeros(middle.shape[1])
@@ -259,36 +236,36 @@ def _regions(frame: Frame, mesh: Any, regions: Mapping[str, Any], key: str) -> d
     for name, given in regions.items():
         where = f"{key}.{name}"
         if isinstance(given, str):
-            found[name] = subdomain(frame, mesh, given, where)
+            found[name] = subdomain(case, mesh, given, where)
             count[mesh.subdomains[given]] += 1
             continue
-        found[name] = inside(frame, given, len(mesh.p), where)
+        found[name] = inside(case, given, len(mesh.p), where)
         here = found[name](middle)
         if not here.any():
-            raise _without_cells(frame, mesh, given, where)
+            raise _without_cells(case, given, where)
         count += here
     wrong = np.flatnonzero(count != 1)
     if len(wrong):
         x, times = middle[:, wrong[0]], int(count[wrong[0]])
         what = "layers" if len(x) == 1 else "regions"
-        point = f"{', '.join(f'{c:.4g}' for c in x)} {frame.equation.length_unit}"
+        point = f"{', '.join(f'{c:.4g}' for c in x)} {case.equation.length_unit}"
         text = f"{point} lies in {times} {what}; every point has to lie in exactly one."
-        raise frame.error(key, text)
+        raise case.error(key, text)
     return found
 
 
-def _without_cells(frame: Frame, mesh: Any, given: Any, key: str) -> CaseError:
+def _without_cells(case: CaseContent, given: Any, key: str) -> CaseError:
     """Return the error about a layer or box without a cell of the mesh."""
-    unit = frame.equation.length_unit
-    sides = sides_of(frame, given, len(mesh.p), key)
+    unit, mesh = case.equation.length_unit, case.mesh
+    sides = sides_of(case, given, len(mesh.p), key)
     spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
     limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
     ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
     text = f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}."
-    return frame.error(key, text)
+    return case.error(key, text)
 
 
-def drive_notes(frame: Frame, model: Model) -> list[str]:
+def drive_notes(case: CaseContent, model: Model) -> list[str]:
     """Return a note if only the initial state drives the process.
 
     Without values on boundaries and without inputs, a state that is the same everywhere neither
@@ -296,7 +273,7 @@ def drive_notes(frame: Frame, model: Model) -> list[str]:
     differences in the initial state depends on the unknowns. Left out are periodic states, which
     carry waves, and equations of the user's own, which need not be defined for any state.
     """
-    if ":" in frame.spec.equation:
+    if ":" in case.spec.equation:
         return []
     fields = [block.field for block in model.state_space.fields.values()]
     held = any(field.boundary_values or field.periodic for field in fields)
@@ -322,43 +299,44 @@ def _rests(model: Model) -> bool:
     return not (known or model.F().any() or (flat > 1e-9 * steep).any())
 
 
-def process_notes(frame: Frame, mesh: Any) -> list[str]:
+def process_notes(case: CaseContent) -> list[str]:
     """Return notes on allowed settings that may be mistakes."""
-    found, spec = [], frame.spec.mesh
-    graded = frame.equation.spacing == "geometric"
+    found, spec = [], case.spec.mesh
+    graded = case.equation.spacing == "geometric"
     if graded and spec.start is not None and spec.spacing == "uniform":
         found.append(
             "The mesh is uniform, with cells too large at the left end, where "
-            f"'{frame.equation.name}' changes most: mesh.spacing = 'geometric'."
+            f"'{case.equation.name}' changes most: mesh.spacing = 'geometric'."
         )
-    if len(mesh.p) == 1 and spec.file is None and (crossed := off_nodes(frame, mesh.p[0])):
+    line = len(case.mesh.p) == 1 and spec.file is None
+    if line and (crossed := off_nodes(case, case.mesh.p[0])):
         remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
         found.append(f"{names[0].upper()}{names[1:]} {end} inside of a cell: {remedy}.")
     return found
 
 
-def held(frame: Frame) -> dict[str, Any]:
+def held(case: CaseContent) -> dict[str, Any]:
     """Return boundary -> fixed value of the state."""
-    found, unit = {}, frame.equation.state.unit
-    for name, given in frame.spec.boundary.items():
+    found, unit = {}, case.equation.state.unit
+    for name, given in case.spec.boundary.items():
         if given.value is not None:
-            found[name] = frame.convert(given.value, unit, f"boundary.{name}")
+            found[name] = case.convert(given.value, unit, f"boundary.{name}")
     return found
 
 
-def conditioned(frame: Frame) -> Frame:
-    """Return the frame whose equation has the fluxes and sources of the case, and their names."""
-    spec, equation = frame.spec, frame.equation
+def conditioned(case: CaseContent) -> CaseContent:
+    """Return the case whose equation has the fluxes and sources of the case, and their names."""
+    spec, equation = case.spec, case.equation
     given = {name: item for name, item in spec.boundary.items() if item.passes}
     if not (given or spec.sources):
-        return frame
+        return case
     units = equation.fluxes
     if units is None:
         key = f"boundary.{next(iter(given))}" if given else f"sources.{next(iter(spec.sources))}"
         text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
-        raise frame.error(key, text + "'livepde equations' tells which ones do.")
-    names = _Names(frame)
+        raise case.error(key, text + "'livepde equations' tells which ones do.")
+    names = _ConditionNames(case)
     boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
     sources = {
         name: (names.amount(item.value, units.source, f"sources.{name}.value"), item.over)
@@ -374,22 +352,24 @@ def conditioned(frame: Frame) -> Frame:
         own = {name: item for name, item in unknowns.items() if name not in names.unknowns}
         more = {name: item for name, item in unknowns.items() if name in names.unknowns}
         for name in boundary:
-            frame.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
+            case.require(name, mesh.boundaries or {}, "boundary", f"no boundary '{name}'")
         placed = {
-            name: Source(amount, None if over is None else _place(frame, mesh, over, name))
+            name: Source(amount, None if over is None else _place(case, mesh, over, name))
             for name, (amount, over) in sources.items()
         }
         model = base(mesh, own, dirichlet, **options)
-        with frame.located("boundary", ModelError):
+        with case.located("boundary", ModelError):
             return with_conditions(model, boundary, placed, more)
 
     unknowns = {**equation.unknowns, **names.unknowns}
     inputs = {**equation.inputs, **names.inputs}
     changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
-    return replace(frame, equation=changed)
+    return replace(case, equation=changed)
 
 
-def _passing(names: _Names, units: Fluxes, name: str, given: BoundarySpec) -> list[Flux | Exchange]:
+def _passing(
+    names: _ConditionNames, units: Fluxes, name: str, given: BoundarySpec
+) -> list[Flux | Exchange]:
     """Return the flux through a boundary."""
     found: list[Flux | Exchange] = []
     key = f"boundary.{name}"
@@ -398,36 +378,36 @@ def _passing(names: _Names, units: Fluxes, name: str, given: BoundarySpec) -> li
     if given.transfer is not None and given.ambient is not None:
         # Robin condition: D u_n = h (ambient - u).
         h = names.amount(given.transfer, units.transfer, f"{key}.transfer")
-        unit = names.frame.equation.state.unit
+        unit = names.case.equation.state.unit
         found.append(Exchange(h, names.amount(given.ambient, unit, f"{key}.ambient")))
     return found
 
 
 @dataclass
-class _Names:
+class _ConditionNames:
     """Unknowns and channels that the conditions of a case name, with their units."""
 
-    frame: Frame
+    case: CaseContent
     unknowns: dict[str, Variable] = field(default_factory=dict)
     inputs: dict[str, Variable] = field(default_factory=dict)
 
     def amount(self, value: float | str, unit: str, key: str) -> Amount:
         """Return a number in the model's unit, a channel, or the name of an unknown."""
-        spec = self.frame.spec
+        spec = self.case.spec
         if isinstance(value, str) and value in spec.unknowns:
-            self._named(self.unknowns, self.frame.equation.unknowns, value, unit, key)
+            self._named(self.unknowns, self.case.equation.unknowns, value, unit, key)
             return value
         if isinstance(value, str) and value in spec.channels:
             if spec.channels[value].role != "input":
-                raise self.frame.error(key, f"the channel '{value}' has to be of role 'input'.")
-            self._named(self.inputs, self.frame.equation.inputs, value, unit, key)
+                raise self.case.error(key, f"the channel '{value}' has to be of role 'input'.")
+            self._named(self.inputs, self.case.equation.inputs, value, unit, key)
             return Channel(value)
         # Text without a digit is no quantity: a name was meant.
         if isinstance(value, str) and not any(letter.isdigit() for letter in value):
             text = f"there is no unknown and no channel '{value}'; "
             text += did_you_mean(value, [*spec.unknowns, *spec.channels])
-            raise self.frame.error(key, text)
-        return self.frame.convert(value, unit, key)
+            raise self.case.error(key, text)
+        return self.case.convert(value, unit, key)
 
     def _named(
         self,
@@ -442,16 +422,16 @@ class _Names:
         clash = own and found is self.unknowns
         if before is not None and (clash or before.unit != unit):
             text = f"'{name}' is the {before.text} [{before.unit}] already; take another name."
-            raise self.frame.error(key, text)
+            raise self.case.error(key, text)
         found.setdefault(name, Variable(unit, key.removeprefix("boundary.").replace(".", ", ")))
 
 
-def _place(frame: Frame, mesh: Any, over: Any, name: str) -> Any:
+def _place(case: CaseContent, mesh: Any, over: Any, name: str) -> Any:
     """Return the region of a source: the name of a subdomain, or a predicate on x."""
     key = f"sources.{name}.over"
     if isinstance(over, str):
-        return subdomain(frame, mesh, over, key)
-    place = inside(frame, over, len(mesh.p), key)
+        return subdomain(case, mesh, over, key)
+    place = inside(case, over, len(mesh.p), key)
     if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
-        raise frame.error(key, "holds no cell of the mesh.")
+        raise case.error(key, "holds no cell of the mesh.")
     return place

@@ -24,9 +24,6 @@ __all__ = [
     "BLANK",
     "apply",
     "beside",
-    "blanks_in",
-    "check_document",
-    "check_text",
     "did_you_mean",
     "is_blank",
     "key_path",
@@ -123,7 +120,7 @@ def _nearest(folder: Path, name: str) -> str:
 
 def read_toml(text: str, where: str) -> dict[str, Any]:
     """Return the document of a case file; raises `CaseError`."""
-    check_text(text, where)
+    _check_text(text, where)
     try:
         document = tomllib.loads(text)
     except RecursionError as error:
@@ -132,7 +129,7 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
         raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
     except ValueError as error:  # a number or a date that Python cannot hold
         raise CaseError(f"{where}: is not valid TOML: {error}.") from None
-    check_document(document, where)
+    _check_document(document, where)
     return document
 
 
@@ -147,7 +144,7 @@ def _line(text: str, reason: str) -> str:
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
-    if blanks := list(blanks_in(raw)):
+    if blanks := list(_blanks_in(raw)):
         raise CaseError(f"{where}: still to be filled in, where it says '?': {', '.join(blanks)}.")
     return spec_of(raw, where)
 
@@ -167,11 +164,11 @@ def is_blank(value: Any) -> bool:
     return isinstance(value, str) and value.split(" ")[0] == BLANK
 
 
-def blanks_in(value: Any, key: str = "") -> Iterator[str]:
+def _blanks_in(value: Any, key: str = "") -> Iterator[str]:
     """Yield the keys whose values `livepde init --data` has left open: '?', '? m'."""
     if isinstance(value, Mapping):
         for name, item in value.items():
-            yield from blanks_in(item, f"{key}.{name}" if key else name)
+            yield from _blanks_in(item, f"{key}.{name}" if key else name)
     elif is_blank(value):
         yield key
 
@@ -403,7 +400,7 @@ def _value(value: Any) -> str:
     return shown
 
 
-def check_text(text: str, where: str) -> None:
+def _check_text(text: str, where: str) -> None:
     """Refuse a document that would take long to read, before it is read."""
     if DOTTED.search(NAME.sub("a", text)):
         raise CaseError(f"{where}: a key has more than {DEPTH} parts; a case needs few.")
@@ -411,7 +408,7 @@ def check_text(text: str, where: str) -> None:
         raise CaseError(f"{where}: a number has 400 digits or more; write it shorter, as 2.5e9.")
 
 
-def check_document(document: Mapping[str, Any], where: str) -> None:
+def _check_document(document: Mapping[str, Any], where: str) -> None:
     """Refuse numbers and depths that no case needs."""
     for key, value, depth in _values(document, where):
         if depth > DEPTH:

@@ -35,18 +35,12 @@ __all__ = [
     "BoundarySpec",
     "CaseSpec",
     "ChannelSpec",
-    "CorrelatedSpec",
     "DataSpec",
     "EvolutionSpec",
     "GradientSpec",
-    "MeshSpec",
-    "RegionSpec",
     "SensitivitySpec",
-    "SourceSpec",
-    "StepsSpec",
     "TikhonovSpec",
     "UnknownSpec",
-    "VariantSpec",
 ]
 
 
@@ -55,6 +49,11 @@ def _quantity(value: Any) -> Any:
         message = 'expected a number, or text with a unit as "20 h"'
         raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value if isinstance(value, str) else float(value)
+
+
+def _short(key: str) -> BeforeValidator:
+    """Return the reading of a value that is no table as a table with this key only."""
+    return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
 def _limits(value: Any) -> Any:
@@ -222,12 +221,7 @@ class FileSpec(Spec):
     time_format: TimeFormat | None = None
 
 
-def _file(given: Any) -> Any:
-    """Wrap a value that is no table as the name of a file."""
-    return given if isinstance(given, Mapping) else {"file": given}
-
-
-File: TypeAlias = Annotated[FileSpec, BeforeValidator(_file)]
+File: TypeAlias = Annotated[FileSpec, _short("file")]
 
 
 class DataSpec(Spec):
@@ -320,10 +314,9 @@ class EvolutionSpec(Spec):
         return self
 
 
-class RegionSpec(Spec):
-    """A region, with values of the unknown that hold there instead of everywhere."""
+class PriorSpec(Spec):
+    """Keys of the prior of an unknown, also of a region that has one of its own."""
 
-    over: Pair | Box | Name
     prior: Quantity | None = None
     std: Quantity | None = None
     bounds: Pair | None = None
@@ -332,27 +325,25 @@ class RegionSpec(Spec):
     within: PositiveFloat | None = None
 
 
-def _over(given: Any) -> Any:
-    """Wrap a value that is no table as the place of a region."""
-    return given if isinstance(given, Mapping) else {"over": given}
+class RegionSpec(PriorSpec):
+    """A region, with values of the unknown that hold there instead of everywhere."""
+
+    over: Pair | Box | Name
 
 
-Region: TypeAlias = Annotated[RegionSpec, BeforeValidator(_over)]
+Region: TypeAlias = Annotated[RegionSpec, _short("over")]
 
 
-class UnknownSpec(Spec):
+class UnknownSpec(PriorSpec):
     """One unknown: a number, one number for each layer, or a field."""
 
     prior: Quantity
     std: Quantity
-    bounds: Pair | None = None
+    within: PositiveFloat = Scalar.within
     unit: str | None = None
     regions: dict[Name, Region] | None = None
     field: bool = False
     length: Quantity | None = None
-    transform: Literal["log", "logit"] | None = None
-    evolution: EvolutionSpec | None = None
-    within: PositiveFloat = Scalar.within
 
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:
@@ -604,12 +595,7 @@ class BoundarySpec(Spec):
         return self
 
 
-def _value(given: Any) -> Any:
-    """Wrap a value that is no table as the value of a boundary."""
-    return given if isinstance(given, Mapping) else {"value": given}
-
-
-Boundary: TypeAlias = Annotated[BoundarySpec, BeforeValidator(_value)]
+Boundary: TypeAlias = Annotated[BoundarySpec, _short("value")]
 
 
 class SourceSpec(Spec):

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from livepde.cli.options import names_in, option
-from livepde.cli.printing import named, print_table, terminal
+from livepde.cli.printing import extent, named, print_table, terminal
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -159,12 +159,10 @@ def _channel_row(item: FoundChannel, read: Measured, equation: Equation) -> tupl
     role, given = item.given["role"], item.given.get("unit", "")
     state = equation.inputs[item.name] if role == "input" else equation.state
     block = np.array([read.columns[name] for name in item.columns])
-    present = block[np.isfinite(block)]
-    ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
     first, *rest = item.columns or ("?",)
     columns = f"{first} ... {rest[-1]}" if rest else first
-    gaps = block.size - present.size if item.columns else ""
-    return columns, role, item.name, given or state.unit, *ends, gaps
+    *ends, gaps = extent(block)
+    return columns, role, item.name, given or state.unit, *ends, gaps if item.columns else ""
 
 
 def equations(

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
-from livepde.cli.printing import CHECK_FAILED, print_table, terminal
+from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
@@ -183,10 +183,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
     console.print(text + ".", soft_wrap=True)
     rows: list[tuple[Any, ...]] = []
     for name, values in list(zip(samples.names, samples.values.T, strict=True))[:MOST_CHANNELS]:
-        present = values[np.isfinite(values)]
-        least, largest = (
-            (f"{present.min():.4g}", f"{present.max():.4g}") if len(present) else ("–", "–")
-        )
+        least, largest, missing = extent(values)
         of = case.columns[name].noise_of
         rows.append(
             (
@@ -195,7 +192,7 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
                 least,
                 largest,
                 case.unit(of).replace("degC", "K") if of else case.unit(name),
-                len(values) - len(present),
+                missing,
                 _longest_gap(np.isfinite(values)),
             )
         )

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from livepde.runs import Outcome, RunWriter
 
-__all__ = ["conducted", "demo", "reproduce"]
+__all__ = ["demo", "reproduce", "run_experiment"]
 
 
 def demo(out: OutOption = None) -> None:
@@ -52,7 +52,7 @@ def demo(out: OutOption = None) -> None:
     console.print(f"[bold]Run directory: {escape(str(folder))}[/]", soft_wrap=True)
 
 
-def conducted(
+def run_experiment(
     run: Callable[[], Outcome], out: Path | None, command: Sequence[str], title: str
 ) -> Outcome:
     """Run an experiment, keep its outcome in a new run directory if one is named, and return it."""
@@ -114,7 +114,7 @@ def reproduce(
         return
     experiment = named(name, EXPERIMENTS, "experiment")
     command = ["livepde", "reproduce", name, *(["--truth", truth] if truth else [])]
-    outcome = conducted(
+    outcome = run_experiment(
         lambda: experiment.run(truth, progress=not as_json), out, command, experiment.summary
     )
     report_outcome(outcome, command, as_json)

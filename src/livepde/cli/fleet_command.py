@@ -16,7 +16,7 @@ from rich.markup import escape
 from livepde.cli.fleet_parts import Backend, in_parts
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
-from livepde.cli.run import batch, concluded, writer_of
+from livepde.cli.run import concluded, run_batch, writer_of
 from livepde.errors import ConfigurationError, DataError, LivepdeError, RunError
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.cases import Case, Prepared
-    from livepde.cases.members_together import MemberBlock
+    from livepde.cases.member_blocks import MemberBlock
     from livepde.runs import Check, Driven, Run, RunWriter, Table
 
 __all__ = ["fleet"]
@@ -55,7 +55,7 @@ class Member:
 
 
 @dataclass(frozen=True)
-class Ended:
+class MemberOutcome:
     """How the run of a member ended.
 
     Attributes
@@ -145,12 +145,16 @@ def fleet(
     folder = out or free_path(Path("runs") / name)
     for row in () if resume else rows:
         refuse_taken(folder / row.name)
-    run = Runs(case, folder, allow_code, tuple(settings or ()), resume, separately)
+    run = FleetRunner(case, folder, allow_code, tuple(settings or ()), resume, separately)
     _report(folder, *_each(run, rows, jobs, backend), as_json=as_json)
 
 
 def _report(
-    folder: Path, ended: Sequence[Ended], told: Sequence[str], summary: pd.DataFrame, as_json: bool
+    folder: Path,
+    ended: Sequence[MemberOutcome],
+    told: Sequence[str],
+    summary: pd.DataFrame,
+    as_json: bool,
 ) -> None:
     """Print the outcomes of all members; a member that failed ends the command with an error."""
     wrong = [item for item in ended if item.status == "failed" or item.failed]
@@ -204,13 +208,13 @@ def _member(content: Mapping[Hashable, str], path: Path) -> Member:
 
 
 def _each(
-    run: Runs, rows: Sequence[Member], jobs: int, backend: Backend | None
-) -> tuple[list[Ended], list[str], pd.DataFrame]:
+    run: FleetRunner, rows: Sequence[Member], jobs: int, backend: Backend | None
+) -> tuple[list[MemberOutcome], list[str], pd.DataFrame]:
     """Run all members; return their outcomes, notes on lost workers, and the summary.
 
     The summary is written also if an error or Ctrl-C ends the command.
     """
-    ended: dict[str, Ended] = {}
+    ended: dict[str, MemberOutcome] = {}
     told: list[str] = []
 
     def summed_up() -> pd.DataFrame:
@@ -229,7 +233,7 @@ def _each(
         raise
     except RunError as error:  # workers died again and again
         given_up = f"{error} Go on with --resume."
-        lost = {row.name: Ended(row.name, "failed", error=given_up) for row in rows}
+        lost = {row.name: MemberOutcome(row.name, "failed", error=given_up) for row in rows}
         ended = lost | run.left(rows, ended, "failed", given_up) | ended
     except (Exception, KeyboardInterrupt) as error:
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -239,14 +243,14 @@ def _each(
     return _in_order(rows, ended), told, summed_up()
 
 
-def _in_order(rows: Sequence[Member], ended: Mapping[str, Ended]) -> list[Ended]:
+def _in_order(rows: Sequence[Member], ended: Mapping[str, MemberOutcome]) -> list[MemberOutcome]:
     """Return the outcomes that there are, in the order of the table."""
     return [ended[row.name] for row in rows if row.name in ended]
 
 
 @dataclass(frozen=True)
-class Runs:
-    """Runs the members of one process.
+class FleetRunner:
+    """Runner of the members of one process.
 
     Attributes
     ----------
@@ -264,7 +268,7 @@ class Runs:
     separately: bool = False
     home: Path = Path()
 
-    def __call__(self, rows: Sequence[Member]) -> list[Ended]:
+    def __call__(self, rows: Sequence[Member]) -> list[MemberOutcome]:
         """Run members as `livepde run` would, as blocks where they can."""
         members = {row.name: row for row in rows}
         ready, ended = self._prepared(rows)
@@ -276,9 +280,11 @@ class Runs:
                 ended[name] = replace(self._alone(members[name], ready[name]), apart=why)
         return _in_order(rows, ended)
 
-    def _prepared(self, rows: Sequence[Member]) -> tuple[dict[str, Prepared], dict[str, Ended]]:
+    def _prepared(
+        self, rows: Sequence[Member]
+    ) -> tuple[dict[str, Prepared], dict[str, MemberOutcome]]:
         """Return the members whose case and data could be read, and how the others ended."""
-        ended: dict[str, Ended] = {}
+        ended: dict[str, MemberOutcome] = {}
         ready: dict[str, Prepared] = {}
         # Members with the same settings share a case, which is then read and checked only once.
         loaded: dict[tuple[str, ...], Case] = {}
@@ -290,12 +296,12 @@ class Runs:
                 self._refuse_other(row, case)
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
             except LivepdeError as error:
-                ended[row.name] = Ended(row.name, "failed", error=str(error))
+                ended[row.name] = MemberOutcome(row.name, "failed", error=str(error))
         return ready, ended
 
     def _plan(self, ready: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str, str]]:
         """Return the blocks to step together, and why each other member runs on its own."""
-        from livepde.cases.members_together import blocks
+        from livepde.cases.member_blocks import blocks
         from livepde.runs import JOURNAL
 
         begun = {name for name in ready if (self._target(name) / JOURNAL).exists()}
@@ -304,8 +310,8 @@ class Runs:
         return found, apart | dict.fromkeys(begun, GOES_ON)
 
     def left(
-        self, rows: Sequence[Member], ended: Mapping[str, Ended], status: str, why: str
-    ) -> dict[str, Ended]:
+        self, rows: Sequence[Member], ended: Mapping[str, MemberOutcome], status: str, why: str
+    ) -> dict[str, MemberOutcome]:
         """Return how runs ended that no process follows any more, marked so in their records.
 
         Parameters
@@ -330,11 +336,11 @@ class Runs:
                     writer = runs.RunWriter(target, run.record)
                     writer.finish(status=status, dataset=dataset, notes=[why])
                     run = runs.open(target)
-                found[name] = Ended(name, run.status, error=why)
+                found[name] = MemberOutcome(name, run.status, error=why)
                 if dataset is not None:
-                    found[name] = replace(_ended(name, run, dataset, run.checks), error=why)
+                    found[name] = replace(_outcome_of(name, run, dataset, run.checks), error=why)
             except LivepdeError as error:
-                found[name] = Ended(name, status, error=str(error))
+                found[name] = MemberOutcome(name, status, error=str(error))
         return found
 
     def _load(self, member: Member) -> Case:
@@ -365,7 +371,9 @@ class Runs:
         target, command = self._target(member.name), self._command(member)
         return writer_of(case, target, self._own(member), self.resume, command)
 
-    def _together(self, block: MemberBlock, members: Mapping[str, Member]) -> dict[str, Ended]:
+    def _together(
+        self, block: MemberBlock, members: Mapping[str, Member]
+    ) -> dict[str, MemberOutcome]:
         """Run members as a block."""
         from livepde.runs import JOURNAL
 
@@ -379,13 +387,13 @@ class Runs:
                 with block.ended(k) as (identifier, driven):
                     one = (block.members[name], identifier, driven, writer)
                     dataset, _, checks, _ = concluded(*one, draw=False)
-                ended[name] = _ended(name, driven, dataset, checks)
+                ended[name] = _outcome_of(name, driven, dataset, checks)
         except LivepdeError as error:  # no room, say: it concerns all that are not through
             for name in block.members.keys() - ended.keys():
-                ended[name] = Ended(name, "failed", error=str(error))
+                ended[name] = MemberOutcome(name, "failed", error=str(error))
         return ended
 
-    def _alone(self, member: Member, prepared: Prepared) -> Ended:
+    def _alone(self, member: Member, prepared: Prepared) -> MemberOutcome:
         """Run one member, or find that it is through."""
         case, name = prepared.case, member.name
         target = self._target(name)
@@ -395,14 +403,14 @@ class Runs:
                 return through
             with ExitStack() as stack:
                 write = partial(self._writer, member, case)
-                writer, (_, driven) = batch(prepared, target, write, stack, quiet=True)
+                writer, (_, driven) = run_batch(prepared, target, write, stack, quiet=True)
                 one = (prepared, prepared.identifier, driven, writer)
                 dataset, _, checks, _ = concluded(*one, draw=False)
         except LivepdeError as error:
-            return Ended(name, "failed", error=str(error))
-        return _ended(name, driven, dataset, checks)
+            return MemberOutcome(name, "failed", error=str(error))
+        return _outcome_of(name, driven, dataset, checks)
 
-    def _through(self, member: Member, prepared: Prepared) -> Ended | None:
+    def _through(self, member: Member, prepared: Prepared) -> MemberOutcome | None:
         """Return how a run ended that has taken all of its samples before; None if it has not."""
         from livepde import runs
         from livepde.streams import DataTable
@@ -413,15 +421,17 @@ class Runs:
         run = runs.open(target)
         if run.status != "finished" or run.record.get("samples") != len(table):
             return None
-        return _ended(member.name, run, run.dataset, run.checks)
+        return _outcome_of(member.name, run, run.dataset, run.checks)
 
 
-def _interrupted(ended: Mapping[str, Ended]) -> bool:
+def _interrupted(ended: Mapping[str, MemberOutcome]) -> bool:
     """Return whether Ctrl-C has ended a run, and with it all."""
     return any(item.status == "interrupted" for item in ended.values())
 
 
-def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]) -> Ended:
+def _outcome_of(
+    name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]
+) -> MemberOutcome:
     from livepde.records import STATUS_CODES
 
     unknowns = {
@@ -433,10 +443,12 @@ def _ended(name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[C
     error = getattr(run, "error", None)
     samples = dataset.sizes["time"]
     lost = dict(Counter(STATUS_CODES[code] for code in dataset["status"].values.tolist() if code))
-    return Ended(name, run.status, samples, unknowns, failed, lost, str(error) if error else "")
+    return MemberOutcome(
+        name, run.status, samples, unknowns, failed, lost, str(error) if error else ""
+    )
 
 
-def _complaints(ended: Sequence[Ended]) -> list[str]:
+def _complaints(ended: Sequence[MemberOutcome]) -> list[str]:
     """Return sentences on what went wrong: errors first, then failed steps, then failed checks."""
     steps = [(item, why, count) for item in ended for why, count in item.lost.items()]
     return [
@@ -446,7 +458,7 @@ def _complaints(ended: Sequence[Ended]) -> list[str]:
     ]
 
 
-def _how(ended: Sequence[Ended]) -> list[str]:
+def _how(ended: Sequence[MemberOutcome]) -> list[str]:
     """Return a sentence, if any, on members stepped together, and on reasons of the others."""
     apart = Counter(item.apart for item in ended if item.apart)
     count = sum(apart.values())
@@ -457,7 +469,7 @@ def _how(ended: Sequence[Ended]) -> list[str]:
     return [f"Of {len(ended)} members {', '.join(parts)}."] if parts else []
 
 
-def _summary(ended: Sequence[Ended]) -> pd.DataFrame:
+def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
     """Return a row for each run: status, number of samples and final estimates."""
     import pandas as pd
 

@@ -22,12 +22,12 @@ from livepde.errors import DataError
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
-    from livepde.cases.live_case import Wiring
+    from livepde.cases.live_case import LiveCase
     from livepde.result import Estimate
     from livepde.runs import Driven, RunWriter
     from livepde.runs.live_loop import Live, Sink
 
-__all__ = ["Beside", "beside"]
+__all__ = ["LiveOptions", "run_live"]
 
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
@@ -35,7 +35,7 @@ METRICS_PORT = 9100
 
 
 @dataclass(frozen=True)
-class Beside:
+class LiveOptions:
     """How a run goes on beside a process.
 
     Attributes
@@ -71,8 +71,8 @@ class Beside:
         return 1.0 if self.speed is None else self.speed
 
 
-def beside(
-    case: Case, how: Beside, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
+def run_live(
+    case: Case, how: LiveOptions, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case in its run directory until its source ends or a signal comes.
 
@@ -93,10 +93,10 @@ def beside(
     Exit
         The run was interrupted before the first sample.
     """
-    from livepde.cases.live_case import Wiring
+    from livepde.cases.live_case import LiveCase
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
-    wiring = stack.enter_context(Wiring(case, how.data, path=folder / JOURNAL, pace=how.pace))
+    wiring = stack.enter_context(LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace))
     health, stopping = _LiveHealth(wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
@@ -118,7 +118,7 @@ def beside(
 class _LiveHealth:
     """Content of /health, also before the first sample."""
 
-    def __init__(self, wiring: Wiring) -> None:
+    def __init__(self, wiring: LiveCase) -> None:
         self.live: Live | None = None
         self._wiring = wiring
 
@@ -155,7 +155,7 @@ class _Heartbeat:
 
 
 def _observers(
-    case: Case, how: Beside, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
+    case: Case, how: LiveOptions, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
 ) -> list[Sink]:
     """Start servers and outputs of a live run, and return their sinks."""
     from livepde.runs.web import Address

@@ -23,6 +23,7 @@ __all__ = [
     "CHECK_FAILED",
     "INTERRUPTED",
     "can_draw",
+    "extent",
     "figures_of",
     "named",
     "present",
@@ -127,6 +128,15 @@ def show(
     _print_checks(console, list(checks))
     for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
+
+
+def extent(values: Any) -> tuple[str, str, int]:
+    """Return the least and the largest of the values that are present, and how many are not."""
+    import numpy as np
+
+    present = values[np.isfinite(values)]
+    ends = (f"{present.min():.4g}", f"{present.max():.4g}") if present.size else ("–", "–")
+    return *ends, values.size - present.size
 
 
 def print_table(console: Console, table: Table) -> None:

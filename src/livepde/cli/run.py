@@ -15,7 +15,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.live import Beside, beside
+from livepde.cli.live import LiveOptions, run_live
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from livepde.identifier import Identifier
     from livepde.runs import Check, Driven, RunWriter, Table
 
-__all__ = ["batch", "concluded", "run", "writer_of"]
+__all__ = ["concluded", "run", "run_batch", "writer_of"]
 
 
 class LogKind(StrEnum):
@@ -128,16 +128,16 @@ def run(
     goes_on = own or source is sys.stdin
     # What is sent to a run that is gone on with begins anywhere: times count from the first start.
     live = own or realtime or (resume and source is sys.stdin)
-    how = Beside(source, goes_on, speed, listen, watch, token, estimates)
+    how = LiveOptions(source, goes_on, speed, listen, watch, token, estimates)
     folder = _run_directory(loaded, out, resume)
     _refuse(how, live, as_json)
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
     with ExitStack() as stack:
         if live:
             configure(log.value)
-            writer, taken = beside(loaded, how, folder, write, stack)
+            writer, taken = run_live(loaded, how, folder, write, stack)
         else:
-            writer, taken = batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
+            writer, taken = run_batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
         prepared, driven = taken
         found = concluded(prepared, prepared.identifier, driven, writer)
     if driven.error is not None:
@@ -171,7 +171,7 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
     return out
 
 
-def _refuse(how: Beside, live: bool, as_json: bool) -> None:
+def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
     """Refuse options that do not belong together, before anything is read."""
     beside_only = {
         "--speed": how.speed is not None,
@@ -227,7 +227,7 @@ def writer_of(
     )
 
 
-def batch(
+def run_batch(
     prepared: Prepared,
     folder: Path,
     write: Callable[[], RunWriter],

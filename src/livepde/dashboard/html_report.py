@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from livepde import runs
-from livepde.errors import ConfigurationError, RunError
+from livepde.errors import RunError, optional
 from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL
 from livepde.runs.exported import into_place
@@ -50,13 +50,9 @@ def write_report(run: Run, target: Path, *, force: bool = False) -> None:
 
 def page_of(run: Run) -> str:
     """Return the report of a run as HTML; see `write_report`."""
-    try:
+    with optional("dashboard", "A report as HTML needs Plotly and Jinja2"):
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
-    except ImportError:
-        raise ConfigurationError(
-            "A report as HTML needs Plotly and Jinja2: pip install 'livepde[dashboard]'."
-        ) from None
     from livepde.dashboard.canvas import CONFIG, when_axis
     from livepde.dashboard.panels import SECTIONS, panels
 

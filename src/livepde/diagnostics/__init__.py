@@ -15,7 +15,7 @@ from livepde.diagnostics.identifiability import (
 )
 from livepde.diagnostics.law_checks import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
-from livepde.diagnostics.observation import check_observation
+from livepde.diagnostics.observation_checks import check_observation
 from livepde.diagnostics.space_checks import check_space
 from livepde.diagnostics.stopping import (
     OnlineStopping,

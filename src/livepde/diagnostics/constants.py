@@ -10,9 +10,8 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
-from scipy.sparse.linalg import LinearOperator, eigsh
 
-from livepde.diagnostics.state_parts import DENSE, Border, Images, Part
+from livepde.diagnostics.state_parts import DENSE, Border, Images, Part, lanczos
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
 from livepde.laws.damping_bounds import Constants
@@ -354,11 +353,8 @@ def _norm_of_A(model: Model, u: Array, moment: Moment) -> tuple[float, Array]:
     if len(free) <= DENSE:
         values, vectors = eigh(image(np.eye(len(free))), gram.toarray())
     else:
-        shape = (len(free), len(free))
-        inverse = LinearOperator(shape, matvec=HilbertSpace(sp.csr_array(gram)).riesz, dtype=float)
-        start = np.random.default_rng(0).standard_normal(len(free))
-        operator = LinearOperator(shape, matvec=image, dtype=float)
-        values, vectors = eigsh(operator, k=1, M=gram, Minv=inverse, v0=start)
+        space = HilbertSpace(sp.csr_array(gram))
+        values, vectors = lanczos(image, space.dual, space.riesz, len(free))
     q = np.zeros(Q.dim)
     q[free] = vectors[:, -1]
     return float(np.sqrt(max(values[-1], 0.0))), q

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
-from scipy.sparse.linalg import LinearOperator, eigsh
 
 from livepde.diagnostics.constants import Spaces
+from livepde.diagnostics.state_parts import lanczos
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
@@ -118,6 +118,8 @@ class Excitation:
         so it should be shorter than the periods of the excitation.
     gain
         Gain of the law.
+    count
+        Number of modes that are computed for more than 1000 parameters.
 
     Examples
     --------
@@ -137,7 +139,7 @@ class Excitation:
     spaces: Spaces
     window: float
     gain: float = 1.0
-    count: int | None = field(default=None)
+    count: int = 20
 
     def __post_init__(self) -> None:
         if not self.window > 0:
@@ -200,8 +202,8 @@ class Excitation:
     def spectrum(self, state: ExcitationState, *, latest: bool = False) -> Spectrum:
         """Return the spectrum of all whole windows so far, or of the latest one.
 
-        All modes are computed up to 1000 parameters; beyond, the 20 strongest of the latest window
-        by Lanczos.
+        All modes are computed up to 1000 parameters; beyond, the `count` strongest of the latest
+        window by Lanczos.
 
         Raises
         ------
@@ -217,7 +219,7 @@ class Excitation:
         # Strengths squared are the eigenvalues of S* S in the gain-scaled inner product of Q.
         Q = self.spaces.model.Q
         free = np.flatnonzero(Q.free)
-        gram = sp.csr_array(Q.tangent_gram[free][:, free]) / self.gain
+        gram = sp.csr_array(Q.tangent_gram[free][:, free] / self.gain)
         if state.gram is not None:
             m = Q.dim
             total = self._gramian(integral, np.eye(m)) if latest else state.gram
@@ -232,16 +234,8 @@ class Excitation:
                 result: Array = self._gramian(integral, full)[free]
                 return result
 
-            shape = (len(free), len(free))
-            inverse = HilbertSpace(sp.csr_array(gram)).riesz
-            start = np.random.default_rng(0).standard_normal(len(free))
-            values, vectors = eigsh(
-                LinearOperator(shape, matvec=apply, dtype=float),
-                k=self.count or 20,
-                M=gram,
-                Minv=LinearOperator(shape, matvec=inverse, dtype=float),
-                v0=start,
-            )
+            space = HilbertSpace(gram)
+            values, vectors = lanczos(apply, space.dual, space.riesz, len(free), self.count)
             windows = 1
         modes = np.zeros((Q.dim, len(values)))
         order = np.argsort(values)[::-1]

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import Check, CheckReport
-from livepde.diagnostics.space_checks import definite, largest, relative
+from livepde.diagnostics.space_checks import definite, largest, relative, relative_to
 from livepde.errors import LinearAlgebraError, ModelError
 from livepde.fem import Composed, Form, Inputs, Moment
 from livepde.linalg import Array, Pattern, analyse
@@ -204,7 +204,7 @@ def _linear(model: Model, at: _TestPoint) -> list[Check]:
         lines.append(
             Check.at_most(
                 f"{name} linear in {slot}",
-                error / size if size else error,
+                relative_to(error, size),
                 LINEARITY,
                 f"{name} is not linear in {slot}: {remedy}",
             )
@@ -229,7 +229,7 @@ def _agreement(model: Model, at: _TestPoint) -> list[Check]:
         lines.append(
             Check.at_most(
                 f"{name} assembled = quadrature",
-                error / size if size else error,
+                relative_to(error, size),
                 LINEARITY,
                 f"{name} {remedy}",
             )
@@ -252,7 +252,7 @@ def _adjoint(model: Model, at: _TestPoint) -> list[Check]:
         ),
         Check.at_most(
             "(A(u)* r, xi)_Q = <A(u) xi, r>",
-            float(error / size if size else error),
+            relative_to(float(error), size),
             ROUNDING,
             "The inner product of the parameter is close to singular: use inner='H1', or fix "
             "boundary values.",
@@ -344,8 +344,8 @@ def _taylor(
         remainders.append(largest(remainder))
     size = largest(start) + largest(slope)
     if remainders[0] <= FLOOR * size:
-        relative_size = remainders[0] / size if size else remainders[0]
-        return Check.at_most(f"{name}: affine, remainder", relative_size, FLOOR, remedy)
+        value = relative_to(remainders[0], size)
+        return Check.at_most(f"{name}: affine, remainder", value, FLOOR, remedy)
     small = np.array(remainders[1:])
     above = small > FLOOR * size
     rates = np.log2(small[:-1] / np.maximum(small[1:], 1e-300))[above[:-1] & above[1:]]

@@ -82,8 +82,11 @@ def definite(space: HilbertSpace) -> Check:
 
 def relative(difference: sp.csr_array | Array, reference: sp.csr_array | Array) -> float:
     """Return the largest entry of a difference relative to the largest entry of a reference."""
-    size = largest(reference)
-    error = largest(difference)
+    return relative_to(largest(difference), largest(reference))
+
+
+def relative_to(error: float, size: float) -> float:
+    """Return an error relative to a size; the error itself if the size is zero."""
     return error / size if size > 0 else error
 
 

@@ -16,7 +16,7 @@ from livepde.laws.damping_bounds import Norms
 from livepde.linalg import Array, IntArray
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Border", "Images", "Part", "largest"]
+__all__ = ["Border", "Images", "Part", "lanczos"]
 
 Map: TypeAlias = Callable[[Array], Array]
 Images: TypeAlias = Sequence[tuple[HilbertSpace, sp.csr_array]]  # regions of X, operators there
@@ -36,16 +36,32 @@ def _columns(apply: Map) -> Map:
     return mapped
 
 
-def largest(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
-    """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
+def lanczos(
+    top: Map, bottom: Map, bottom_inverse: Map, size: int, count: int = 1, tolerance: float = 0.0
+) -> tuple[Array, Array]:
+    """Return the largest eigenvalues of top x = lambda bottom x, ascending, and their vectors.
 
-    A dense solver is used for small problems, else Lanczos from a fixed start vector, so that every
-    run gives the same number.
+    Both are symmetric, bottom > 0. Lanczos starts from a fixed vector, so that every run gives the
+    same numbers.
+    """
+    operators = [
+        LinearOperator((size, size), matvec=f, dtype=float) for f in (top, bottom, bottom_inverse)
+    ]
+    start = np.random.default_rng(0).standard_normal(size)
+    values, vectors = eigsh(
+        operators[0], k=count, M=operators[1], Minv=operators[2], v0=start, tol=tolerance
+    )
+    return values, vectors
+
+
+def largest_eigenvalue(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
+    """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
 
     Parameters
     ----------
     top, bottom, bottom_inverse
-        Functions of vectors and of matrices; the inverse is needed for Lanczos only.
+        Functions of vectors and of matrices; the inverse is needed for Lanczos only, which large
+        problems are solved by.
     """
     if size == 0:
         return 0.0
@@ -53,22 +69,9 @@ def largest(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> flo
         one = np.eye(size)
         A, B = top(one), bottom(one)
         values = eigh(0.5 * (A + A.T), 0.5 * (B + B.T), eigvals_only=True)
-        return max(float(values[-1]), 0.0)
-    shape = (size, size)
-    operators = [
-        LinearOperator(shape, matvec=f, dtype=float) for f in (top, bottom, bottom_inverse)
-    ]
-    start = np.random.default_rng(0).standard_normal(size)
-    found = eigsh(
-        operators[0],
-        k=1,
-        M=operators[1],
-        Minv=operators[2],
-        v0=start,
-        tol=1e-8,
-        return_eigenvectors=False,
-    )
-    return max(float(found[0]), 0.0)
+    else:
+        values, _ = lanczos(top, bottom, bottom_inverse, size, tolerance=1e-8)
+    return max(float(values[-1]), 0.0)
 
 
 def _root(x: Array, y: Array) -> float:
@@ -272,7 +275,7 @@ class Part:
 
     def embedding_V_VX(self) -> float:
         """Constant C of ||v||_VX <= C ||v||_V."""
-        top = largest(lambda x: self.gram_VX @ x, self.gram_V, self.inverse_V, self.size)
+        top = self._largest(lambda x: self.gram_VX @ x, self.gram_V, self.inverse_V)
         return float(np.sqrt(top))
 
     def embedding_VX_X(self) -> float:
@@ -287,7 +290,7 @@ class Part:
         """Constant C of ||R M v||_X <= C ||v||_V; 1 if V is the norm of M itself."""
         if not self.size:
             return 1.0
-        return float(np.sqrt(largest(self.image, self.gram_V, self.inverse_V, self.size)))
+        return float(np.sqrt(self._largest(self.image, self.gram_V, self.inverse_V)))
 
     def lipschitz(self, images: Images) -> float:
         """Largest ||J v||_X / ||v||_V for the Jacobian J of C(q, .).
@@ -306,7 +309,7 @@ class Part:
             result: Array = self.basis.T @ total
             return result
 
-        return float(np.sqrt(largest(image, self.gram_V, self.inverse_V, self.size)))
+        return float(np.sqrt(self._largest(image, self.gram_V, self.inverse_V)))
 
     def ratio(self) -> float:
         """Upper bound of ||v||_V ||v||_X / ||v||_VX^2, which is 1/c_int of (interpol).
@@ -323,21 +326,24 @@ class Part:
             result: Array = self.basis.T @ self.space.riesz(self.basis @ x)
             return result
 
-        top = largest(lambda x: self.operator @ x, self.schur, inverse_schur, self.size)
-        least = 1.0 / largest(self.schur, lambda x: self.operator @ x, own.riesz, self.size)
-        coupling = largest(lambda x: self.gram_X @ x, self.schur, inverse_schur, self.size)
+        top = self._largest(lambda x: self.operator @ x, self.schur, inverse_schur)
+        least = 1.0 / self._largest(self.schur, lambda x: self.operator @ x, own.riesz)
+        coupling = self._largest(lambda x: self.gram_X @ x, self.schur, inverse_schur)
         bound = np.sqrt(coupling) * (least + top) / (2.0 * np.sqrt(least * top))
         if self._V is not None:
             image_inverse = _columns(lambda x: own.riesz(self.schur(own.riesz(x))))
-            bound *= np.sqrt(largest(self.gram_V, self.image, image_inverse, self.size))
+            bound *= np.sqrt(self._largest(self.gram_V, self.image, image_inverse))
         return float(bound / self.coercivity_reversed())
 
     def coercivity_reversed(self) -> float:
         """Least quotient ||v||_VX^2 / (M v, v)_X."""
         return 1.0 / self._sparse(self.operator, self.gram_VX)
 
+    def _largest(self, top: Map, bottom: Map, bottom_inverse: Map | None) -> float:
+        return largest_eigenvalue(top, bottom, bottom_inverse, self.size)
+
     def _sparse(self, top: sp.csr_array, bottom: sp.csr_array) -> float:
         inverse = HilbertSpace(bottom) if self.size else None
-        return largest(
-            lambda x: top @ x, lambda x: bottom @ x, inverse.riesz if inverse else None, self.size
+        return self._largest(
+            lambda x: top @ x, lambda x: bottom @ x, inverse.riesz if inverse else None
         )

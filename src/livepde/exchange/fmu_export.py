@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from livepde.cases import Case, load
-from livepde.errors import ConfigurationError, RunError
+from livepde.errors import ConfigurationError, RunError, optional
 from livepde.exchange.recipe import Recipe, recipe_of
 from livepde.exchange.slave import FOLDER
 from livepde.runs.exported import refuse_file
@@ -114,12 +114,8 @@ def write_unit(
     """Write a unit, and return its path; for parameters see `export_fmu`."""
     if fmi not in EXPORTERS:
         raise ConfigurationError(f"fmi: got {fmi!r}; expected 2 (FMI 2.0) or 3 (FMI 3.0).")
-    try:
+    with optional("fmu", f"A unit for FMI {fmi}.0 needs {EXPORTERS[fmi]}"):
         builder = importlib.import_module(f"{EXPORTERS[fmi]}.builder").FmuBuilder
-    except ImportError:
-        raise ConfigurationError(
-            f"A unit for FMI {fmi}.0 needs {EXPORTERS[fmi]}: pip install 'livepde[fmu]'."
-        ) from None
     name = re.sub(r"\W", "_", recipe.process.name, flags=re.ASCII)
     path = Path(target) if target is not None else Path(f"{name}.fmu")
     if path.suffix != ".fmu":

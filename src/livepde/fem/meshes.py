@@ -36,7 +36,7 @@ from skfem.element import (
     ElementTriP2,
 )
 
-from livepde.errors import SpaceError
+from livepde.errors import SpaceError, optional
 from livepde.fem.fields import Predicate
 from livepde.linalg import Array
 
@@ -204,13 +204,9 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
         raise SpaceError(f"read_mesh: scale must be a positive number; got {scale}.")
     if not path.is_file():
         raise SpaceError(f"read_mesh: there is no file '{path}'.")
-    try:
+    with optional("mesh", "read_mesh needs meshio, which is not installed", SpaceError):
         import meshio
         from skfem.io.meshio import from_meshio
-    except ImportError as error:
-        raise SpaceError(
-            "read_mesh needs meshio, which is not installed: pip install 'livepde[mesh]'."
-        ) from error
     with _quiet():
         mesh = _loaded(path, meshio, from_meshio)
     if type(mesh) in LINEAR:  # centres of arcs and the like belong to no cell

@@ -37,8 +37,8 @@ class FleetEstimate:
         Time of the sample.
     members
         Names of the members.
-    beliefs
-        Coefficients of parameter and state, and their covariances.
+    read
+        Function that returns the beliefs; see `beliefs`.
     innovation, withheld_error
         As for `Estimate`, shapes (members, sensors) and (members, withheld).
     statuses
@@ -57,7 +57,7 @@ class FleetEstimate:
 
     t: float
     members: tuple[str, ...]
-    beliefs: Beliefs
+    read: Callable[[], Beliefs]
     innovation: Array
     withheld_error: Array
     statuses: tuple[Status, ...]
@@ -66,6 +66,11 @@ class FleetEstimate:
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
+
+    @cached_property
+    def beliefs(self) -> Beliefs:
+        """Coefficients of parameter and state, and their covariances: computed when first read."""
+        return self.read()
 
     @property
     def q(self) -> Array:

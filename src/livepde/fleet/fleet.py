@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -21,7 +21,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engines import BlockEngine, FleetEngine, SeparateEngine
+from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
@@ -294,15 +294,16 @@ class Fleet:
         report: MemberReports,
         held: dict[str, Array],
     ) -> FleetEstimate:
-        state = self._state
-        beliefs = self._engine.beliefs(state)
-        error = withheld
+        state, engine, error = self._state, self._engine, withheld
+        read: Callable[[], Beliefs] = lambda: engine.beliefs(state)  # noqa: E731
         if self.withheld is not None:
+            beliefs = read()
+            read = lambda: beliefs  # noqa: E731
             error = withheld - self._shown(self.withheld, beliefs.u, beliefs.q, span)
         return FleetEstimate(
             t=span.t1,
             members=self.members,
-            beliefs=beliefs,
+            read=read,
             innovation=measured - report.predicted,
             withheld_error=error,
             statuses=report.statuses,
@@ -324,9 +325,9 @@ class Fleet:
 
     def settled(self, estimate: FleetEstimate) -> FleetEstimate:
         """Return the last estimate, settled as that of an identifier; see `Identifier.settled`."""
-        state = self._engine.settled(self._state)
-        beliefs = self._engine.beliefs(state)
-        return replace(estimate, beliefs=beliefs, belief=lambda k: self._believed(state, k))
+        engine, state = self._engine, self._engine.settled(self._state)
+        read, belief = lambda: engine.beliefs(state), lambda k: self._believed(state, k)
+        return replace(estimate, read=read, belief=belief)
 
     def identifier(self, member: str | int) -> Identifier:
         """Return an identifier that goes on from the state of a member, by name or number.
@@ -400,9 +401,9 @@ class Fleet:
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = self._column(name, values)
-        return measured, own_noise(noise), withheld, named
+        return measured, None if noise is None else own_noise(noise), withheld, named
 
-    def _by_name(self, z: Any) -> tuple[Array, Array, Array, dict[str, Array]]:
+    def _by_name(self, z: Any) -> tuple[Array, Array | None, Array, dict[str, Array]]:
         hidden = self.withheld.names if self.withheld else ()
         channels, sensors = self._one.channels, (*self.observed.names, *hidden)
         noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
@@ -422,28 +423,24 @@ class Fleet:
         named = {name: columns[name] for name in self.inputs if name in columns}
         return table(self.observed.names), noise, table(hidden), named
 
-    def _by_place(self, z: Any) -> tuple[Array, Array, Array, dict[str, Array]]:
-        array = _numbers("z", z)
-        noise = np.full((len(self), self.observed.size), np.nan)
-        if array.shape == (*noise.shape, 2):
+    def _by_place(self, z: Any) -> tuple[Array, Array | None, Array, dict[str, Array]]:
+        array, noise = _numbers("z", z), None
+        expected, names = (len(self), self.observed.size), self.observed.names
+        if array.shape == (*expected, 2):
             array, noise = array[:, :, 0], array[:, :, 1]
-        measured = self._measured(array)
-        for name, column in zip(self.observed.names, noise.T, strict=True):
-            _check_positive(name, column)
-        # Without names a sample has no withheld values.
-        withheld = np.full((len(self), len(self.withheld.names) if self.withheld else 0), np.nan)
-        return measured, noise, withheld, {}
-
-    def _measured(self, array: Array) -> Array:
-        expected = (len(self), self.observed.size)
+            for name, column in zip(names, noise.T, strict=True):
+                _check_positive(name, column)
         if array.shape != expected:
             raise SampleError(
                 f"z has shape {array.shape}; {expected[0]} members with {expected[1]} sensors each "
                 f"need {expected}, NaN where a sample is missing."
             )
-        for name, column in zip(self.observed.names, array.T, strict=True):
-            self._refuse_infinite(name, column)
-        return array
+        if np.isinf(array).any():
+            for name, column in zip(names, array.T, strict=True):
+                self._refuse_infinite(name, column)
+        # Without names a sample has no withheld values.
+        withheld = np.full((len(self), len(self.withheld.names) if self.withheld else 0), np.nan)
+        return array, noise, withheld, {}
 
     def _column(self, name: str, values: ArrayLike) -> Array:
         """Return a value of a channel for each member."""
@@ -566,7 +563,8 @@ def _named(members: int | Sequence[str]) -> tuple[str, ...]:
 
 def _check_positive(name: str, noise: Array) -> None:
     """Refuse a standard deviation of readings that is not positive and not NaN."""
-    for value in noise.tolist():
+    good = np.isnan(noise) | (noise > 0.0) & np.isfinite(noise)
+    for value in noise[~good].tolist():
         check_noise(name, value)
 
 

@@ -214,9 +214,10 @@ class Shard:
             for row in rows:
                 self._take(items, [row], estimates)
             return
+        # Estimates are read before the states, of which they are made, are written in place.
+        estimates.put(rows, estimate)
         self._states.put(which, self._fleet.adopt(which, block))
         self._taken[which] += 1
-        estimates.put(rows, estimate)
 
     def _subset(self, which: IntArray) -> Fleet:
         """Return a fleet of some members that have taken as many samples, or begun."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from livepde.errors import ConfigurationError
+from livepde.errors import optional
 from livepde.fem import FunctionSpace
 from livepde.fleet.estimate import FleetEstimate
 from livepde.linalg import Array
@@ -107,12 +107,8 @@ class ShardEstimates:
         ConfigurationError
             pyarrow is not installed.
         """
-        try:
+        with optional("parquet", "Arrow tables need pyarrow"):
             import pyarrow as pa
-        except ImportError:
-            raise ConfigurationError(
-                "Arrow tables need pyarrow: pip install 'livepde[parquet]'."
-            ) from None
         columns: dict[str, Any] = {
             "offset": np.arange(self.offset, self.offset + len(self.t)),
             "member": list(self.member),

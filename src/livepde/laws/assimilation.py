@@ -141,7 +141,8 @@ def absorb(
 
     Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
     """
-    predicted, Y = filter_.sensors.observe(x, span.end)
+    at = span.end
+    predicted, Y = filter_.sensors.observe(x, at)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
     whole, measured = np.count_nonzero(used) == used.size, None
@@ -163,7 +164,7 @@ def absorb(
     shadows, off = filter_.shadows, None
     told, shift = d, np.zeros_like(d)
     if shadows is not None:
-        off = shadows.in_readings(x, span.end)
+        off = shadows.in_readings(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         shift = off[:, shadows.counted].sum(axis=1) / noise
@@ -179,28 +180,29 @@ def absorb(
             whole = bool(used.all())
             e = np.where(used, e, np.nan)
     if not whole:  # missing values take part as zeros, which carry no information
-        Y = np.where(used[:, None], Y, 0.0)
         d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
-        if off is not None:
-            off = np.where(used[:, None], off, 0.0)
+        Y = np.where(used[:, None], Y, 0.0)
+        off = None if off is None else np.where(used[:, None], off, 0.0)
     if filter_.judge is not None:
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     parts["innovations"] = x.innovations.add(e, measured, newest)
     new, made = filter_.update(x, Y, d, **parts)
-    if options.adaptive:
-        new = changed(new, **_learned(x, used, d, noise, made))
+    learned: dict[str, Any] = _learned(x, used, d, noise, made) if options.adaptive else {}
     if shadows is not None and off is not None:
-        followed = shadows.update(x, new, made.left, used / noise, off, span.t1)
-        new = changed(new, shadows=followed)
+        learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
+    new = changed(new, **learned) if learned else new
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
-    finite = x.member >= 0  # all of them
     squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
-    if not squares + worst * worst < math.inf:
-        sums = (new.u + new.du).sum(axis=1) + new.da.sum(axis=1)
-        finite = np.isfinite(sums + np.fmax.reduce(sizes, axis=1, initial=0.0) ** 2)
-    return new, Assimilation(predicted, steps, OK, finite, dropped, worst)
+    good = x.member >= 0 if squares + worst * worst < math.inf else _finite(new, sizes)
+    return new, Assimilation(predicted, steps, OK, good, dropped, worst)
+
+
+def _finite(x: FilterState, sizes: Array) -> Mask:
+    """Return which members are finite, with the squares of their innovations, (members,)."""
+    sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
+    return np.asarray(np.isfinite(sums + np.fmax.reduce(sizes, axis=1, initial=0.0) ** 2))
 
 
 def _judged(

@@ -18,13 +18,13 @@ from livepde.laws.bank import (
     WIDE,
     AutoState,
     Bank,
+    first_guess,
     normalised,
     numbered,
     say_the_same,
     scaled,
 )
 from livepde.laws.filter_state import FilterState
-from livepde.laws.guess import first_guess
 from livepde.laws.history import (
     added,
     empty_log,

@@ -1,9 +1,10 @@
-"""A bank of filters: the hypothesis of each member, and its weight given the samples."""
+"""A bank of filters: hypothesis and weight of each member, and the first guess of the noise."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import comb
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -15,11 +16,14 @@ from livepde.linalg import Array, IntArray, Mask, Memo
 
 __all__ = [
     "CANDIDATES",
+    "GUESSED",
+    "PATIENCE",
     "STAYS",
     "WIDE",
     "AutoState",
     "Bank",
     "Candidate",
+    "first_guess",
     "normalised",
     "numbered",
     "say_the_same",
@@ -27,6 +31,12 @@ __all__ = [
 ]
 
 STAYS, WIDE = 0, 1  # the first two candidates
+ORDERS = (1, 2, 3, 4, 5)  # of differences
+MEDIAN = 0.6745  # of the absolute value of a normal variable of standard deviation 1
+NOISELESS = 1e-12  # of the size of readings: no noise
+SCATTER = 0.5  # of the logarithm of such a guess
+GUESSED = 12  # samples from which the noise is guessed where nobody states it
+PATIENCE = 48  # samples after which a sensor that shows nothing new is guessed by the others
 MOST_FILTERS = 16  # times between samples for which the filters are kept: usually one
 SAME = 0.01  # divergence per coordinate, in nats, of members that say the same
 
@@ -217,3 +227,44 @@ def say_the_same(work: Bank, state: AutoState, j: int, k: int) -> bool:
     # The mean of both Kullback-Leibler divergences: [tr(P_j^-1 P_k) + tr(P_k^-1 P_j) - 2 size +
     # shift^T (P_j^-1 + P_k^-1) shift]/4.
     return 0.25 * (traces - 2 * size + distance) < SAME * size
+
+
+def first_guess(z: Array) -> Array | None:
+    """Return a first guess of the noise of each sensor, or None as long as there is none.
+
+    Differences of order p of white noise of size 1 have the size sqrt(binomial(2 p, p)), while
+    those of a smooth signal fade with the order: the order with the smallest result counts. Medians
+    are taken, because signals change most at the start. The remainder of the signal makes the guess
+    too large, which the law corrects.
+
+    Parameters
+    ----------
+    z
+        Samples, shape (samples, sensors), NaN where missing.
+    """
+    if len(z) <= GUESSED:
+        return None
+    guesses = []
+    rounding = NOISELESS * np.nanmax(np.abs(z), axis=0, initial=0.0)
+    for order in ORDERS:
+        bends = np.abs(np.diff(z, order, axis=0))
+        seen = np.isfinite(bends).sum(axis=0) >= GUESSED // 2
+        bends = np.where(seen, bends, 0.0)
+        size = np.nanmedian(bends, axis=0) / MEDIAN
+        if len(z) >= PATIENCE:  # readings of a coarse resolution repeat most of the time
+            size = np.where(size > rounding, size, np.sqrt(np.nanmean(bends**2, axis=0)))
+        guesses.append(np.where(size > rounding, size / np.sqrt(comb(2 * order, order)), np.inf))
+    # Orders are compared by the sensors for which each of them has a result.
+    known = np.isfinite(guesses).all(axis=0)
+    sizes = [float(np.log(guess[known]).sum()) for guess in guesses]
+    noise: Array = guesses[int(np.argmin(sizes))].copy()
+    good = np.isfinite(noise)
+    if not good.any() or not (good.all() or len(z) >= PATIENCE):
+        return None
+    # Sensors that differ by chance alone are alike.
+    logs, usual = np.log(noise[good]), float(np.median(np.log(noise[good])))
+    # Logarithms shrink to their median by the share of their scatter that chance explains.
+    chance = min(1.0, SCATTER**2 / max(float(((logs - usual) ** 2).mean()), SCATTER**2))
+    noise[good] = np.exp(usual + (1.0 - chance) * (logs - usual))
+    noise[~good] = np.exp(usual)
+    return noise

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from livepde.laws.filter_state import FilterState, along
+from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed
@@ -151,12 +151,12 @@ class Filter:
         grown = end.C.shape[1] - x.C.shape[1]
         if not grown:
             return end
-        U, past, causes = (_extended(part, grown) for part in (x.U, x.past, x.causes))
+        U, past, causes = (extended(part, grown) for part in (x.U, x.past, x.causes))
         return changed(end, U=U, past=past, causes=causes)
 
     def unknowns_after(self, x: FilterState, h: float) -> FilterState:
         """Return q, da, C and the shifts by shadows after a time h; all else is that of before."""
-        if not self.moves or h == 0.0:
+        if h == 0.0:
             return x
         drifts = self.drifts(x.member)
         if not (self.reduction.moves or drifts.any()):  # members of a bank, of which others drift
@@ -165,7 +165,8 @@ class Filter:
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
         # A coordinate that gains in one member has a row in all of them: members share one array.
-        (grows,) = (gained > 0.0).any(axis=0).nonzero()
+        gains: Mask = np.asarray((gained > 0.0).any(axis=0))
+        (grows,) = gains.nonzero()
         members, r, k = x.C.shape
         C = np.zeros((members, r + len(grows), k))
         C[:, :r] = x.C @ F.T
@@ -211,11 +212,11 @@ class Filter:
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept = self.predict_unknowns(x, stop - start), x.kept
+        end, kept = self.predict_unknowns(x, stop - start) if self.moves else x, x.kept
         deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
-        off = np.zeros(len(x.member), dtype=bool)
+        off: Mask = np.zeros(len(x.member), dtype=bool)
         if deviates:
-            off = x.da.any(axis=1) | x.du.any(axis=1)
+            off = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
         shadows = x.shadows.u.shape[1]
 
         def directions(at: FilterState) -> Array:
@@ -301,7 +302,7 @@ class Filter:
         the linear filter: an excess beyond them stays in da and du, so that no information of the
         data is lost.
         """
-        estimate = self.estimate(x)
+        estimate = x.q + x.da.dot(self.reduction.Phi.T)
         within = self.reduction.bounded(estimate)
         da, du, u = np.zeros(x.da.shape), np.zeros(x.du.shape), x.u + x.du
         if within is not estimate:
@@ -327,13 +328,12 @@ class Filter:
         coordinate; the covariance of u stays as it is. With `chosen`, shape (k,), to these
         coordinates only.
         """
-        members, _, k = x.C.shape
+        members, k = x.da.shape
         # The added rows are zero in U, which makes the added error independent of the state.
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
-        C = np.concatenate([x.C, np.broadcast_to(rows, (members, *rows.shape))], axis=1)
-        U, past, causes = (_extended(part, len(rows)) for part in (x.U, x.past, x.causes))
-        new = changed(x, U=U, C=C, past=past, causes=causes)
-        return self._compressed(new) if C.shape[1] > self.rank else new
+        U = np.zeros((members, len(rows), x.u.shape[1]))
+        new = with_rows(x, U, np.broadcast_to(rows, (members, *rows.shape)))
+        return self._compressed(new) if new.C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
@@ -358,7 +358,8 @@ class Filter:
         """
         k = x.C.shape[2]
         rotation, root = np.linalg.qr(x.C, mode="complete")
-        rotated = rotation.transpose(0, 2, 1) @ x.U
+        turned = rotation.transpose(0, 2, 1)
+        rotated, past, causes = (turned @ part for part in (x.U, x.past, x.causes))
         alone = rotated[:, k:]
         weighted = alone * self.scale
         # The Gram matrix of the rows is small however fine the mesh is; halved digits do not matter
@@ -367,21 +368,11 @@ class Filter:
         square[~np.isfinite(square).all(axis=(1, 2))] = 0.0  # reported by the caller
         _, vectors = np.linalg.eigh(square)
         leading = vectors[:, :, ::-1][:, :, : self.rank - k].transpose(0, 2, 1)
-        C = _extended(root[:, :k], leading.shape[1])
+        C = extended(root[:, :k], leading.shape[1])
         U = np.concatenate([rotated[:, :k], leading @ alone], axis=1)
-        past = rotation.transpose(0, 2, 1) @ x.past
         past = np.concatenate([past[:, :k], leading @ past[:, k:]], axis=1)
-        causes = rotation.transpose(0, 2, 1) @ x.causes
         causes = np.concatenate([causes[:, :k], leading @ causes[:, k:]], axis=1)
         return changed(x, U=U, C=C, past=past, causes=causes)
-
-
-def _extended(rows: Array, count: int) -> Array:
-    """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
-    members, r, size = rows.shape
-    longer = np.zeros((members, r + count, size))
-    longer[:, :r] = rows
-    return longer
 
 
 def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:

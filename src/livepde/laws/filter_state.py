@@ -13,7 +13,7 @@ from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["NO_LEDGER", "FilterState", "along", "unaccompanied"]
+__all__ = ["NO_LEDGER", "FilterState", "along", "extended", "unaccompanied", "with_rows"]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -90,6 +90,21 @@ def along(x: FilterState, k: int, shift: Array) -> Array:
     weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
     moved: Array = weights @ x.U[k]
     return moved
+
+
+def extended(rows: Array, count: int) -> Array:
+    """Return rows of a square root, (members, r, ...), and so many rows of zeros."""
+    members, r, size = rows.shape
+    longer = np.zeros((members, r + count, size))
+    longer[:, :r] = rows
+    return longer
+
+
+def with_rows(x: FilterState, U: Array, C: Array) -> FilterState:
+    """Return a filter state with more rows [U C], independent of the past and of all causes."""
+    past, causes = (extended(part, U.shape[1]) for part in (x.past, x.causes))
+    U, C = np.concatenate([x.U, U], axis=1), np.concatenate([x.C, C], axis=1)
+    return changed(x, U=U, C=C, past=past, causes=causes)
 
 
 def unaccompanied(x: FilterState) -> FilterState:

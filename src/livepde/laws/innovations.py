@@ -68,14 +68,14 @@ class Innovations:
         # all of them.
         seen, before = np.isfinite(e), self.sensors
         newest = e if newest is None else newest
-        if seen.all():
+        if np.count_nonzero(seen) == seen.size:
             counted = sensors = DECAY * before + (SHARE * e[:, None] + GAINED)
         else:
             sensors = DECAY * before + (SHARE * np.where(seen, e, 0.0)[:, None] + GAINED)
             sensors = np.where(seen[:, None], sensors, before)
             counted = sensors * seen[:, None]
         products = counted @ np.concatenate([sensors, before], axis=1).transpose(0, 2, 1)
-        sums = FADES * self.sums + products.reshape(len(e), -1)[:, TERMS]
+        sums = FADES * self.sums + products.reshape(len(e), -1).take(TERMS, axis=1)
         if measured is not None and not measured.all():
             sums = np.where(measured[:, None], sums, self.sums)
             newest = np.where(measured[:, None], newest, self.newest)

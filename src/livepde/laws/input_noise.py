@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from livepde.fem import Moment
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, with_rows
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
@@ -67,12 +67,7 @@ def with_input_noise(
         if failure is not None:
             return end, failure
         rows.append(off.u - end.u)
-    U = np.concatenate([end.U, np.stack(rows, axis=1)], axis=1)
-    C = np.concatenate([end.C, np.zeros((members, len(rows), k))], axis=1)
-    past = np.concatenate([end.past, np.zeros((members, len(rows), end.past.shape[2]))], axis=1)
-    more = np.zeros((members, len(rows), end.causes.shape[2]))
-    causes = np.concatenate([end.causes, more], axis=1)
-    return changed(end, U=U, C=C, past=past, causes=causes), None
+    return with_rows(end, np.stack(rows, axis=1), np.zeros((members, len(rows), k))), None
 
 
 def _moved(span: Span, name: str, change: float) -> Span:

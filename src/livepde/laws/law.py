@@ -286,7 +286,7 @@ def finite(*arrays: Array | None) -> bool:
     """Return whether products of the squares of some arrays are finite; None counts as empty."""
     total = 0.0  # NaN with any of its terms, which a maximum need not be
     for a in arrays:
-        total += 0.0 if a is None else np.vdot(a, a)
+        total += 0.0 if a is None else float(np.vdot(a, a))
     return bool(total <= LARGEST)
 
 

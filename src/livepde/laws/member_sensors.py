@@ -41,7 +41,7 @@ class MemberSensors:
         Linear about the linearisation point.
         """
         if self.fixed:
-            return (self._G @ (x.u + x.du).T).T, self.rows(x, x.U, x.C, at)
+            return self._G.dot((x.u + x.du).T).T, self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
@@ -59,7 +59,7 @@ class MemberSensors:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
         if self.fixed:
             members, r, n = U.shape
-            return np.asarray((self._G @ U.reshape(-1, n).T).T.reshape(members, r, -1))
+            return np.asarray(self._G.dot(U.reshape(-1, n).T).T.reshape(members, r, -1))
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 

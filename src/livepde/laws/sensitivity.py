@@ -149,40 +149,30 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     graded_start: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.drift) and self.drift >= 0):
-            raise LawError(f"SensitivityLaw: drift must be a number >= 0; got {self.drift}.")
-        if not self.memory > 0:
-            raise LawError(f"SensitivityLaw: memory must be positive; got {self.memory}.")
-        if self.replay is not None and np.isfinite(self.memory):
+        stated = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
+        kinds = (("replay", Replay), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
+        parts = [(getattr(self, name), name, kind) for name, kind in kinds]
+        for holds, name, rule in (
+            (np.isfinite(self.drift) and self.drift >= 0, "drift", "a number >= 0"),
+            (self.memory > 0, "memory", "positive"),
+            (self.noise in (None, "auto") or stated, "noise", "a positive number or 'auto'"),
+            *(
+                (part is None or isinstance(part, kind), name, f"a {kind.__name__}, or None")
+                for part, name, kind in parts
+            ),
+            (self.gate > 0, "gate", "positive"),
+            (self.start_window >= 0, "start_window", ">= 0"),
+            (self.gate_patience >= 1, "gate_patience", ">= 1"),
+            (self.verdict in (True, False, "cheap"), "verdict", "True, 'cheap' or False"),
+        ):
+            if not holds:
+                raise LawError(
+                    f"SensitivityLaw: {name} must be {rule}; got {getattr(self, name)!r}."
+                )
+        if self.replay is not None and self.fades:
             raise LawError(
                 "SensitivityLaw: replay keeps all of the past, memory fades it; choose one."
             )
-        number = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
-        if not (self.noise in (None, "auto") or number):
-            raise LawError(
-                f"SensitivityLaw: noise must be a positive number or 'auto'; got {self.noise!r}."
-            )
-        self._check_parts()
-        if self.verdict not in (True, False, "cheap"):
-            raise LawError(
-                f"SensitivityLaw: verdict must be True, 'cheap' or False; got {self.verdict!r}."
-            )
-
-    def _check_parts(self) -> None:
-        """Refuse parts that are of another kind, and gates that let nothing through."""
-        kinds = (("replay", Replay), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
-        for name, kind in kinds:
-            value = getattr(self, name)
-            if not (value is None or isinstance(value, kind)):
-                raise LawError(
-                    f"SensitivityLaw: {name} must be a {kind.__name__}, or None; got {value!r}."
-                )
-        if not self.gate > 0:
-            raise LawError(f"SensitivityLaw: gate must be positive; got {self.gate}.")
-        if self.start_window < 0:
-            raise LawError(f"SensitivityLaw: start_window must be >= 0; got {self.start_window}.")
-        if self.gate_patience < 1:
-            raise LawError(f"SensitivityLaw: gate_patience must be >= 1; got {self.gate_patience}.")
 
     @property
     def fades(self) -> bool:

@@ -289,7 +289,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = told.steps + np.zeros(members, dtype=np.int64)
+    steps = np.array([told.steps] * members)
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
 
 

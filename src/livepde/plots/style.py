@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from livepde.errors import ConfigurationError
+from livepde.errors import optional
 from livepde.plots.dataset import time_label
 
 if TYPE_CHECKING:
@@ -38,12 +38,8 @@ PANEL = (5.4, 3.4)
 
 def figure_class() -> type[Figure]:
     """Return Matplotlib's figure class; raise `ConfigurationError` without Matplotlib."""
-    try:
+    with optional("plots", "Figures need Matplotlib, which is not installed"):
         from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigurationError(
-            "Figures need Matplotlib, which is not installed: pip install 'livepde[plots]'."
-        ) from None
     return Figure
 
 

@@ -36,7 +36,6 @@ from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, track
 from livepde.result import Result
 from livepde.runs.outcome import Check, Outcome, Table
-from livepde.stepping import ImplicitEuler
 from livepde.streams import RelativeNoise, Twin
 
 __all__ = ["BOIGER2016", "Ensemble", "NoisyTwin"]
@@ -215,17 +214,8 @@ def paper_case(q_true: Any = seed.q_true) -> NoisyTwin:
 
 def excited_case() -> NoisyTwin:
     """Return the excited twin, all of the state observed, to t = 75."""
-    model, full = seed_excited.build()
     times = 0.1 * np.arange(round(END / 0.1) + 1)
-    twin = Twin(
-        scheme=ImplicitEuler(),
-        model=model,
-        observation=full,
-        q_true=seed_excited.q_true,
-        u_true=seed_excited.u_true,
-        times=times,
-    )
-    return NoisyTwin(twin, lambda x: seed_excited.u_true(x, 0.0))
+    return NoisyTwin(seed_excited.twin_of(times=times), seed_excited.start)
 
 
 # --- first figure --------------------------------------------------------------------------------

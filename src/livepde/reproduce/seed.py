@@ -81,11 +81,12 @@ def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[M
     return model, Subdomain(lambda x: (x[0] > OMEGA[0]) & (x[0] < OMEGA[1]))
 
 
-def twin_of(clamped: bool, **options: Any) -> Twin:
-    """Return the paper's process in one of the two spaces; `options` of `Twin`."""
-    model, omega = build(clamped=clamped)
-    given = {"q_true": q_true, "u_true": u_true, "times": TIMES, **options}
-    return Twin(model=model, observation=omega, scheme=ImplicitEuler(), **given)
+def twin_of(std: float = 1.0, *, clamped: bool = False, **options: Any) -> Twin:
+    """Return the twin of `build`; `options` of `Twin` replace what it states."""
+    model, omega = build(std, clamped=clamped)
+    truth = {"q_true": q_true, "u_true": u_true, "times": TIMES}
+    given = {"model": model, "observation": omega, "scheme": ImplicitEuler(), **truth, **options}
+    return Twin(**given)
 
 
 def identify(twin: Twin, gain: float, c1: float, progress: bool = False) -> Track:

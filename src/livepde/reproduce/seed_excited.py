@@ -70,20 +70,23 @@ def build(std: float = 1.0) -> tuple[Model, Full]:
     return model, Full()
 
 
+def twin_of(std: float = 1.0, **options: Any) -> Twin:
+    """Return the twin of `build`; `options` of `Twin` replace what it states."""
+    model, full = build(std)
+    truth = {"q_true": q_true, "u_true": u_true, "times": TIMES}
+    given = {"model": model, "observation": full, "scheme": ImplicitEuler(), **truth, **options}
+    return Twin(**given)
+
+
+def start(x: Any) -> Any:
+    """The exact state at t = 0, the initial state of all runs."""
+    return u_true(x, 0.0)
+
+
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run both laws and return their errors with checks and figures."""
-    model, full = build()
-    twin = Twin(
-        scheme=ImplicitEuler(),
-        model=model,
-        observation=full,
-        q_true=q_true,
-        u_true=u_true,
-        times=TIMES,
-        truth=truth,  # type: ignore[arg-type]
-        fine_dt=0.005,
-    )
-    start = lambda x: u_true(x, 0.0)  # noqa: E731
+    twin = twin_of(truth=truth, fine_dt=0.005)
+    model, full = twin.model, twin.observation
     identifiers = {
         "gradient": paper.identifier(
             model, full, gain=1000.0, damping=ResidualDamping(1.0), D=D, u0=start

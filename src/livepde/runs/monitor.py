@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from livepde.errors import RunError
+from livepde.errors import RunError, optional
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 from livepde.runs.web import Address, Server
@@ -36,12 +36,8 @@ class Metrics(Sink):
     """
 
     def __init__(self, sensors: Iterable[str]) -> None:
-        try:
+        with optional("service", "Metrics need prometheus-client", RunError):
             from prometheus_client import CollectorRegistry, Counter, Gauge
-        except ImportError:
-            raise RunError(
-                "Metrics need prometheus-client: pip install 'livepde[service]'."
-            ) from None
         self.registry = CollectorRegistry()
 
         def gauge(name: str, about: str, *labels: str) -> Gauge:

@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from typing import TextIO
 
-from livepde.errors import RunError
+from livepde.errors import RunError, optional
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 
@@ -37,12 +37,8 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     if kind == "json":
-        try:
+        with optional("service", "A log in JSON needs python-json-logger", RunError):
             from pythonjsonlogger.json import JsonFormatter
-        except ImportError:
-            raise RunError(
-                "A log in JSON needs python-json-logger: pip install 'livepde[service]'."
-            ) from None
         names = "%(asctime)s %(levelname)s %(name)s %(message)s"
         renamed = {"asctime": "time", "levelname": "level", "name": "logger"}
         lines = JsonFormatter(names, datefmt="%Y-%m-%dT%H:%M:%SZ", rename_fields=renamed)

@@ -15,7 +15,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
-from livepde.errors import RunError
+from livepde.errors import RunError, optional
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
@@ -115,10 +115,8 @@ class Server:
     """
 
     def __init__(self, application: WSGIApplication, address: Address) -> None:
-        try:
+        with optional("service", "Serving needs waitress", RunError):
             from livepde.runs.visitors import listener
-        except ImportError:
-            raise RunError("Serving needs waitress: pip install 'livepde[service]'.") from None
         host, port = address.host, address.port
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:

@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from itertools import combinations, zip_longest
 from typing import TYPE_CHECKING, Any
 
-from livepde.errors import DataError
+from livepde.errors import DataError, optional
 from livepde.result import Estimate
 from livepde.streams.sources import LONGEST, Row, RowSource, drained, json_row
 
@@ -77,11 +77,9 @@ class Broker:
 
     def client(self, suffix: str = "") -> Client:
         """Return a client that is not connected yet."""
-        try:
+        with optional("mqtt", "MQTT needs paho-mqtt", DataError):
             from paho.mqtt.client import Client, MQTTv5
             from paho.mqtt.enums import CallbackAPIVersion
-        except ImportError:
-            raise DataError("MQTT needs paho-mqtt: pip install 'livepde[mqtt]'.") from None
         # Acknowledged by hand: the broker keeps a message until its sample is in the journal.
         client = Client(
             CallbackAPIVersion.VERSION2,

@@ -13,7 +13,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from typing import Any
 
-from livepde.errors import DataError
+from livepde.errors import DataError, optional
 from livepde.streams.sources import Row, RowSource, drained
 
 __all__ = ["OpcuaSource"]
@@ -67,10 +67,8 @@ class OpcuaSource(RowSource):
         username: str | None = None,
         password: str | None = None,
     ) -> None:
-        try:
+        with optional("opcua", "OPC UA needs asyncua", DataError):
             import asyncua  # noqa: F401
-        except ImportError:
-            raise DataError("OPC UA needs asyncua: pip install 'livepde[opcua]'.") from None
         if "@" in url:
             raise DataError("OPC UA: a url with a password is written down: use username instead.")
         if not interval > 0.0:

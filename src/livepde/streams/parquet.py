@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from livepde.errors import DataError, SampleError
+from livepde.errors import DataError, SampleError, optional
 from livepde.linalg import Array
 from livepde.streams.clock import Clock
 from livepde.streams.table import (
@@ -42,11 +42,9 @@ def read_parquet(
         No such file or column, or it is not Parquet; text in a channel; times that do not increase.
         The message names file, sample and column.
     """
-    try:
+    with optional("parquet", "Parquet files need pyarrow", DataError):
         import pyarrow as pa
         from pyarrow.parquet import ParquetFile
-    except ImportError:
-        raise DataError("Parquet files need pyarrow: pip install 'livepde[parquet]'.") from None
 
     where = str(path)
     names = decimal_marks(columns)

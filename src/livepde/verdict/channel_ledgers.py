@@ -53,8 +53,9 @@ class InputLedger:
 
         The interval in which a channel has a value again is no gap: there the value changes.
         """
-        # The first count is of all samples.
-        counts = self.counts + np.append(1, missing).astype(np.int64)
+        counts = self.counts.copy()
+        counts[0] += 1  # of all samples
+        counts[1:] += missing > 0.0
         return InputLedger(counts, (self.held + length) * missing)
 
     def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:

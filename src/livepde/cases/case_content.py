@@ -1,0 +1,341 @@
+"""Content of a case: file, specification, equation, units, mesh, regions, options."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.cases.read import did_you_mean
+from livepde.cases.schema import CaseSpec, ChannelSpec
+from livepde.cases.units import LARGEST, SMALLEST, conversion, convert
+from livepde.errors import CaseError, SpaceError
+from livepde.fem import (
+    grid,
+    interval,
+    line,
+    read_mesh,
+    rectangle,
+)
+from livepde.linalg import Array
+from livepde.models import Equation, Option
+
+__all__ = ["CaseContent", "inside", "off_nodes", "sides_of", "subdomain"]
+
+CELLS = 2_000_000  # of a mesh that a case describes itself
+
+
+@dataclass(frozen=True, eq=False)
+class CaseContent:
+    """A case file's specification and its equation.
+
+    Attributes
+    ----------
+    path
+        The case file.
+    spec
+        Its content, checked key by key.
+    equation
+        The PDE it names.
+    reader
+        The function that reads its data, if it names one.
+    """
+
+    path: Path
+    spec: CaseSpec
+    equation: Equation
+    reader: Callable[..., Any] | None
+
+    @property
+    def name(self) -> str:
+        """Name of the case: that of its file, or of its folder if the file is 'case.toml'."""
+        path = self.path.absolute()
+        return path.stem if path.stem != "case" else path.parent.name or "case"
+
+    @property
+    def constants(self) -> dict[str, float]:
+        """The inputs of the equation that are constants, in its units."""
+        known, given = self.equation.inputs, self.spec.inputs
+        self.only(given, known, "inputs")
+        for name in given:
+            if name in self.spec.channels:
+                raise self.error(f"inputs.{name}", f"there is a channel '{name}', too; keep one.")
+        return {
+            name: self.convert(value, known[name].unit, f"inputs.{name}")
+            for name, value in given.items()
+        }
+
+    @cached_property
+    def mesh(self) -> Any:
+        """The mesh."""
+        return _mesh_of(self)
+
+    @cached_property
+    def options(self) -> dict[str, Any]:
+        """Options of the equation: numbers in its units, text and booleans."""
+        return _options_of(self)
+
+    def error(self, key: str, text: str) -> CaseError:
+        """Return an error that names file and key."""
+        return CaseError(f"{self.path}: {key}: {text}")
+
+    def missing(self, key: str, text: str) -> CaseError:
+        """Return an error about a key that is missing."""
+        return CaseError(f"{self.path}: {key} is missing: {text}")
+
+    @contextmanager
+    def located(self, key: str, kind: type[Exception]) -> Iterator[None]:
+        """Raise errors of one kind within the block as errors that name file and key."""
+        try:
+            yield
+        except kind as error:
+            raise self.error(key, str(error)) from None
+
+    def where(self, key: str) -> str:
+        """Return file and key for a message."""
+        return f"{self.path}: {key}"
+
+    def convert(self, value: Any, unit: str, key: str, *, difference: bool = False) -> float:
+        """Return a quantity in the model's unit."""
+        return convert(value, unit, self.where(key), difference=difference)
+
+    def positive(self, value: Any, unit: str, key: str, default: float = np.nan) -> float:
+        """Return a difference or duration in the model's unit, > 0; a default if there is none."""
+        if value is None:
+            return default
+        number = self.convert(value, unit, key, difference=True)
+        if not number > 0:
+            raise self.error(key, f"got {value!r}; expected more than 0.")
+        if not SMALLEST <= number <= LARGEST:
+            text = f"got {value!r}; expected a number from {SMALLEST:g} to {LARGEST:g}."
+            raise self.error(key, text)
+        return number
+
+    def pair(self, pair: tuple[Any, Any], unit: str, key: str) -> tuple[float, float]:
+        """Return an increasing pair in the model's unit."""
+        low, high = (self.convert(value, unit, key) for value in pair)
+        if not low < high:
+            raise self.error(key, f"got [{low:g}, {high:g}] {unit}; needs the lower one first.")
+        return low, high
+
+    def only(self, given: Iterable[str], known: Iterable[str], key: str) -> None:
+        """Raise unless every name given is known to the equation."""
+        for name in given:
+            self.require(
+                name, known, key, f"the equation '{self.equation.name}' has no '{name}' here"
+            )
+
+    def require(self, name: str, known: Iterable[str], key: str, text: str) -> None:
+        """Raise an error that begins with `text` unless a name is one of `known`."""
+        if name not in known:
+            raise self.error(key, f"{text}; {did_you_mean(name, known)}")
+
+    def roles(self, *roles: str) -> dict[str, ChannelSpec]:
+        """Return the channels of some roles."""
+        return {name: item for name, item in self.spec.channels.items() if item.role in roles}
+
+    def unit(self, channel: str) -> str:
+        """Return the model's unit of a channel."""
+        if self.spec.channels[channel].role == "input":
+            return self.equation.inputs[channel].unit
+        if self.spec.channels[channel].role == "position":
+            return self.equation.length_unit
+        return self.equation.state.unit
+
+
+def _mesh_of(case: CaseContent) -> Any:
+    """Return the mesh of a case: from a file, or a line or rectangle of nodes or cells."""
+    spec, unit = case.spec.mesh, case.equation.length_unit
+    if spec.file is not None:
+        scale = conversion(spec.unit or unit, unit, case.where("mesh.unit")).factor
+        with case.located("mesh.file", SpaceError):
+            return read_mesh(case.path.parent / spec.file, scale)
+    if spec.nodes is not None:
+        nodes = [case.convert(node, unit, "mesh.nodes") for node in spec.nodes]
+        with case.located("mesh.nodes", SpaceError):
+            return line(nodes)
+    if spec.x is not None and spec.y is not None:
+        return _rectangle(case, spec.x, spec.y)
+    return _interval(case)
+
+
+def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
+    """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
+    spec, unit = case.spec.mesh, case.equation.length_unit
+    sides = (
+        [case.convert(node, unit, "mesh.x") for node in x],
+        [case.convert(node, unit, "mesh.y") for node in y],
+    )
+    if not isinstance(spec.cells, tuple):
+        _check_cells(float(len(sides[0])) * len(sides[1]), case.where("mesh"))
+        with case.located("mesh", SpaceError):
+            return grid(*sides)
+    _check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
+    with case.located("mesh", SpaceError):
+        if isinstance(spec.spacing, tuple):
+            return _graded(case, sides, spec.cells, [one == "geometric" for one in spec.spacing])
+        (x0, x1), (y0, y1) = sides
+        return rectangle((x0, x1), (y0, y1), spec.cells)
+
+
+def _interval(case: CaseContent) -> Any:
+    """Return an interval of cells, with nodes at the ends of layers."""
+    spec, unit = case.spec.mesh, case.equation.length_unit
+    cells: Any = spec.cells  # the schema allows only a number here
+    _check_cells(cells, case.where("mesh.cells"))
+    start = case.convert(spec.start, unit, "mesh.from")
+    stop = case.convert(spec.stop, unit, "mesh.to")
+    if not start < stop:
+        raise case.error("mesh", f"got from {start:g} to {stop:g} {unit}; needs from < to.")
+    geometric = spec.spacing == "geometric"
+    _check_graded(case, start, geometric)
+    # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
+    # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
+    plain = interval(start, stop, cells, geometric=geometric)
+    edges = [edge for _, edge in _layer_edges(case)]
+    through = _fitted(plain.p[0], edges)
+    mesh = interval(start, stop, cells, geometric=geometric, through=through)
+    own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
+    return line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
+
+
+def _graded(
+    case: CaseContent,
+    sides: Iterable[Sequence[float]],
+    cells: Iterable[int],
+    graded: Iterable[bool],
+) -> Any:
+    """Return a rectangle with geometric or uniform spacing along each side."""
+    nodes = []
+    for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
+        _check_graded(case, start, geometric)
+        nodes.append(interval(start, stop, number, geometric=geometric).p[0])
+    return grid(*nodes)
+
+
+def _check_graded(case: CaseContent, start: float, geometric: bool) -> None:
+    if geometric and not start > 0:
+        raise case.error("mesh.spacing", "'geometric' needs from > 0.")
+
+
+def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
+    """Return the ends of layers of an interval, of unknowns and of sources, each with its name."""
+    given: list[tuple[str, str, Any]] = [
+        (f"layer '{layer}' of {name}", f"unknowns.{name}.regions.{layer}", item.over)
+        for name, unknown in case.spec.unknowns.items()
+        for layer, item in (unknown.regions or {}).items()
+    ]
+    given += [
+        (f"source '{name}'", f"sources.{name}.over", item.over)
+        for name, item in case.spec.sources.items()
+    ]
+    unit = case.equation.length_unit
+    return [
+        (what, edge)
+        for what, key, over in given
+        if isinstance(over, tuple) and len(over) == 2
+        for edge in case.pair(over, unit, key)
+    ]
+
+
+def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
+    """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
+    # The ends of the mesh stay where they are.
+    inner = nodes[1:-1]
+    found: dict[int, float] = {}
+    for edge in edges:
+        if len(inner) and _inside(nodes, edge):
+            found.setdefault(int(np.abs(inner - edge).argmin()), edge)
+    return list(found.values())
+
+
+def _inside(nodes: Array, edge: float) -> bool:
+    """Return whether an edge lies between the ends of a mesh, and not on them."""
+    # Conversion of units rounds, so that an end of the mesh may seem to lie just inside of it.
+    slack = 1e-6 * float(np.ptp(nodes))
+    return bool(nodes.min() + slack < edge < nodes.max() - slack)
+
+
+def _check_cells(number: float, where: str) -> None:
+    """Refuse a mesh that is too large to be built here."""
+    if number > CELLS:
+        raise CaseError(
+            f"{where}: got {number:.3g} cells; a mesh of a case has at most {CELLS}: take a file "
+            "(mesh.file) for a larger one."
+        )
+
+
+def off_nodes(case: CaseContent, nodes: Array) -> list[str]:
+    """Return the names of layers and sources with an end inside of a cell."""
+    within = 1e-6 * np.ptp(nodes)
+    crossed = dict.fromkeys(
+        what
+        for what, edge in _layer_edges(case)
+        if _inside(nodes, edge) and np.abs(nodes - edge).min() > within
+    )
+    return list(crossed)
+
+
+def subdomain(case: CaseContent, mesh: Any, name: str, key: str) -> str:
+    """Return the name of a subdomain, which the mesh has to have."""
+    text = f"the mesh has no subdomain '{name}'"
+    if not mesh.subdomains:
+        remedy = "it has none: name them in its file, or give the sides of this one."
+        raise case.error(key, f"{text}; {remedy}")
+    case.require(name, mesh.subdomains, key, text)
+    return name
+
+
+def inside(
+    case: CaseContent, given: Any, dimension: int, key: str, *, closed: bool = False
+) -> Callable[[Any], Any]:
+    """Return whether points x lie in a layer or box; its upper sides belong to it if `closed`."""
+    sides, below = sides_of(case, given, dimension, key), np.less_equal if closed else np.less
+    return lambda x: np.logical_and.reduce(
+        [(x[k] >= low) & below(x[k], high) for k, (low, high) in enumerate(sides)]
+    )
+
+
+def sides_of(case: CaseContent, given: Any, dimension: int, key: str) -> list[tuple[float, float]]:
+    """Return (low, high) for each coordinate."""
+    if len(given) != 2 * dimension:
+        expected = {1: "[from, to]", 2: "[x0, x1, y0, y1]"}.get(
+            dimension, "the name of a subdomain"
+        )
+        raise case.error(key, f"got {list(given)}; expected {expected}.")
+    unit = case.equation.length_unit
+    return [case.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
+
+
+def _options_of(case: CaseContent) -> dict[str, Any]:
+    """Return the options of the equation: numbers in its units, text and booleans."""
+    known, given = case.equation.options, case.spec.options
+    case.only(given, known, "options")
+    values: dict[str, Any] = {}
+    for name, option in known.items():
+        key = f"options.{name}"
+        if name in given:
+            values[name] = _option(case, option, given[name], key)
+        elif option.default is not None:
+            values[name] = option.default
+        else:
+            unit = f", in {option.unit}" if option.unit else ""
+            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
+            raise case.missing(key, f"the {option.text}{unit}{choices}.")
+    return values
+
+
+def _option(case: CaseContent, option: Option, value: Any, key: str) -> Any:
+    if option.kind is float and not isinstance(value, bool):
+        return case.convert(value, option.unit, key)
+    if not isinstance(value, option.kind):
+        kind = {float: "a number", str: "text", bool: "true or false"}[option.kind]
+        raise case.error(key, f"got {value!r}; expected {kind}.")
+    if option.choices:
+        case.require(str(value), option.choices, key, f"got '{value}'")
+    return value
