@@ -545,6 +545,7 @@ REFUSED = [
     ('time_unit = "s"', 'time_format = "%d.%m.%Y %"', "expected year, month, day and time"),
     ("replay = true", "guards = { reech = 1 }", "no key 'law.guards.reech'; did you mean 'reach'?"),
     ("replay = true", "guards = { reach = 0 }", "law.guards: reach must be a positive number; got"),
+    ("replay = true", "shadows = { mesh = 1 }", "law.shadows: mesh: got 1; expected true or false"),
     ('std = "3e-5 m^2/s"', "std = 0.0", "unknowns.alpha.std: got 0.0; expected more than 0"),
     ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field takes no regions"),
     ('bounds = ["1e-6', 'length = 1\nbounds = ["1e-6', "length belongs to a field"),

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 6  # of the checkpoint
+FORMAT = 7  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 

@@ -56,6 +56,15 @@ def _short(key: str) -> BeforeValidator:
     return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
+def _strict_switches(value: Any) -> Any:
+    """Refuse 1, "no" and other values that pydantic takes for true or false."""
+    for key, given in value.items() if isinstance(value, Mapping) else ():
+        if isinstance(getattr(Shadows, key, None), bool) and not isinstance(given, bool):
+            message = f"{key}: got {given!r}; expected true or false"
+            raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
+    return value
+
+
 def _limits(value: Any) -> Any:
     """[low, high], "<= number" or ">= number" -> (sense, bound)."""
     if isinstance(value, list) and len(value) == 2:
@@ -472,7 +481,7 @@ class FilterSpec(Spec):
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat = SensitivityLaw.gate
-    shadows: StrictBool | Shadows = True
+    shadows: StrictBool | Annotated[Shadows, BeforeValidator(_strict_switches)] = True
 
 
 class SensitivitySpec(FilterSpec):

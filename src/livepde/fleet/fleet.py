@@ -34,7 +34,7 @@ from livepde.stepping import Advance, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 5  # of the checkpoint
+FORMAT = 6  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
