@@ -192,9 +192,9 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     # A misspelt key makes two errors, one extra and one missing: the extra one says it better. And
-    # where true, false or a table may stand, a table is not wrong for being no boolean.
+    # where true, false, a list or a table may stand, a table is not wrong for being another.
     def rank(item: Any) -> tuple[bool, bool]:
-        table = item["type"] == "bool_type" and isinstance(item["input"], dict)
+        table = item["type"] in ("bool_type", "tuple_type") and isinstance(item["input"], dict)
         return item["type"] not in UNKNOWN_KEY, table
 
     found = min(error.errors(), key=rank)
