@@ -148,7 +148,9 @@ class Program:
             name, flag = option.name or "", max(option.opts, key=len)
             value = context.params.get(name)
             told = _is_given(context, name) or not context.params["quick"]
-            if name == "as_json" or value is None or isinstance(value, Path) or not told:
+            # Typer before 0.16 has paths as text here.
+            path = getattr(option.type, "name", "") in ("path", "file", "directory")
+            if name == "as_json" or value is None or path or not told:
                 continue
             if isinstance(value, bool):
                 words += [flag] if value else []
