@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, TypeAlias, get_args
 
 import typer
 
@@ -124,7 +124,7 @@ class Program:
                     if shared["quick"] and not _is_given(context, key):
                         given[key] = count.quick
                 given |= {key: shared[key] for key in shared if key in parameters}
-                words = self._words(context)
+                words = self._words(context, hidden)
                 title = (inspect.getdoc(function) or "").split("\n")[0].rstrip(".")
                 outcome = run_experiment(lambda: function(**given), shared["out"], words, title)
                 report_outcome(outcome, words, shared["as_json"])
@@ -135,22 +135,22 @@ class Program:
                 **({"out": (Out, None)} if self.keeps else {}),
             }
             _declare(run, parameters, shared, counts)
+            options = inspect.signature(run).parameters.items()
+            hidden = {"as_json", *(key for key, item in options if _takes_path(item))}
             run.__doc__ = function.__doc__
             self.app.command(name or function.__name__)(run)
             return function
 
         return add
 
-    def _words(self, context: typer.Context) -> list[str]:
-        """Return the command in words: with all numbers, those of --quick aside; no paths."""
+    def _words(self, context: typer.Context, hidden: Collection[str]) -> list[str]:
+        """Return the command in words: with all numbers, those of --quick aside."""
         words = [*self.words.split(), context.command.name or ""]
         for option in context.command.params:
             name, flag = option.name or "", max(option.opts, key=len)
             value = context.params.get(name)
             told = _is_given(context, name) or not context.params["quick"]
-            # Typer before 0.16 has paths as text here.
-            path = getattr(option.type, "name", "") in ("path", "file", "directory")
-            if name == "as_json" or value is None or path or not told:
+            if name in hidden or value is None or not told:
                 continue
             if isinstance(value, bool):
                 words += [flag] if value else []
@@ -164,6 +164,12 @@ def _count(parameter: inspect.Parameter) -> Count | None:
     """Return the declaration of a parameter that is a `Count`."""
     found = getattr(parameter.annotation, "__metadata__", ())
     return next((item for item in found if isinstance(item, Count)), None)
+
+
+def _takes_path(parameter: inspect.Parameter) -> bool:
+    """Return whether a parameter is `Annotated[Path, ...]`, or that or None."""
+    kind, *_ = get_args(parameter.annotation) or (parameter.annotation,)
+    return Path in (kind, *get_args(kind))
 
 
 def _declare(
