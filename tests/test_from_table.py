@@ -379,6 +379,7 @@ def test_options_for_what_the_table_does_not_tell(here):
         "law.nose": "there is no key 'law.nose'; did you mean 'noise'?",
         "channels.X.at": "the case has no 'channels.X'",
         "a b": "'a b' is no key",
+        "title.x": "title: got {'x': 1}; expected text in quotes",
     }.items():
         error = runner.invoke(app, [*begin, "--set", f"{key}=1"]).exception
         assert told in str(error)

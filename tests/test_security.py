@@ -22,6 +22,7 @@ import pytest
 from live_rod import identifier, live, rows
 from patience import PATIENCE
 from typer.testing import CliRunner
+from waitress import parser
 
 import livepde as lp
 from livepde import cases, checkpoint, runs
@@ -464,6 +465,29 @@ def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
     assert answer.status == 403
     assert "token" in answer.read().decode()
     connection.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("chunked", [False, True])
+def test_bodies_of_who_may_not_ask_are_not_kept(serving, monkeypatch, chunked):
+    """Those of many strangers would fill memory and disk."""
+    kept: list[int] = []
+
+    class Counting(parser.OverflowableBuffer):
+        def append(self, data: bytes) -> None:
+            kept.append(len(data))
+            super().append(data)
+
+    monkeypatch.setattr(parser, "OverflowableBuffer", Counting)
+    server, body = serving(token=TOKEN), b"a" * 200_000
+    for token, status, expected in (("wrong", 403, 0), (TOKEN, 200, len(body))):
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
+        header = {"Authorization": f"Bearer {token}"}
+        content = iter([body]) if chunked else body
+        connection.request("POST", "/", content, header, encode_chunked=chunked)
+        assert connection.getresponse().status == status
+        assert sum(kept) == expected
+        connection.close()
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def _with(text: str, path: Sequence[str], value: Any) -> str:
             rest = ".".join(map(toml_key, path[k + 1 :]))
             name, value = part, apply(inner.unwrap(), {rest: value}, "")
             break
-        if part not in here:
+        if not isinstance(inner, Mapping) or part not in here:
             here[part] = tomlkit.table()
         here = here[part]
     if value is None:

@@ -79,9 +79,12 @@ EXPECTED = {
     "model_type": "a table",
     "model_attributes_type": "a table",
     "tuple_type": "a list",
+    "sequence_str": "a list",
+    "is_instance_of": "a list",
     "too_short": "at least one entry",
     "string_too_short": "a name",
 }
+CLASS = re.compile(r"[A-Z][a-z]\w*: ")  # how a message of options begins
 UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")  # of a model, of a dataclass
 
 
@@ -203,6 +206,8 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
     key = ".".join(path)
     if kind in UNKNOWN_KEY:
         return f"there is no key '{key}'; {did_you_mean(path[-1], _keys(path[:-1], raw))}"
+    if kind == "missing" and isinstance(found["loc"][-1], int):
+        return f"{'.'.join(path[:-1])}: got {_short(got)}; expected more entries."
     if kind == "missing":
         return f"the key '{key}' is missing."
     context = found.get("ctx", {})
@@ -213,8 +218,7 @@ def _sentence(error: ValidationError, raw: Mapping[str, Any]) -> str:
         return f"{key}: got {_short(got)}; {did_you_mean(str(got), _choices(context['expected']))}"
     if kind == "value_error":
         # Options of a law refuse a value themselves: "Guards: reach must be a positive number."
-        *_, last = "", *found["loc"]
-        message = str(context["error"]).removeprefix(f"{last}: ").removesuffix(".")
+        message = CLASS.sub("", str(context["error"]), count=1).removesuffix(".")
         shown = "" if isinstance(got, dict) else f"got {_short(got)}; "
         return f"{key}: {shown}{message}."
     expected = EXPECTED.get(kind)

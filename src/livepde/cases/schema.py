@@ -60,7 +60,7 @@ def _strict_switches(value: Any) -> Any:
     """Refuse 1, "no" and other values that pydantic takes for true or false."""
     for key, given in value.items() if isinstance(value, Mapping) else ():
         if isinstance(getattr(Shadows, key, None), bool) and not isinstance(given, bool):
-            message = f"{key}: got {given!r}; expected true or false"
+            message = f"{key} must be true or false; got {given!r}"
             raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value
 

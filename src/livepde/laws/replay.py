@@ -52,7 +52,10 @@ class Replay:
 
     def __post_init__(self) -> None:
         if not 1 <= self.first <= self.window:
-            raise LawError("Replay: needs 1 <= first <= window.")
+            raise LawError(
+                f"Replay: needs 1 <= first <= window; got first = {self.first}, "
+                f"window = {self.window}."
+            )
         if self.iterations < 1:
             raise LawError(f"Replay: iterations must be at least 1; got {self.iterations}.")
         if self.slice <= self.iterations:

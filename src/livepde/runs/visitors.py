@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import socket
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from waitress import wasyncore
 from waitress.channel import HTTPChannel
+from waitress.parser import HTTPRequestParser
 from waitress.server import TcpWSGIServer
 
 if TYPE_CHECKING:
     from wsgiref.types import WSGIApplication
 
 __all__ = ["listener"]
+
+Refusal: TypeAlias = Callable[[Mapping[str, Any]], str]  # of a header, as WSGI has it
 
 THREADS = 16  # answers that are computed at a time
 ROOM = 256  # connections at a time; of more the oldest idle one is closed
@@ -24,10 +29,44 @@ DEADLINE = 10  # seconds within which a request has to be there as a whole
 LONGEST = 30  # seconds within which its answer has to be taken
 
 
+class Discarded(io.BytesIO):
+    """A body that is not kept."""
+
+    def append(self, data: bytes) -> None:
+        """Take a piece."""
+
+    def getfile(self) -> io.BytesIO:
+        """Return an empty file."""
+        return self
+
+    def __len__(self) -> int:
+        return 0
+
+
+class Request(HTTPRequestParser):  # type: ignore[misc]
+    """A request whose body is not kept if its header is refused: strangers fill no disk."""
+
+    def __init__(self, adj: Any, refusal: Refusal) -> None:
+        super().__init__(adj)
+        self._refusal = refusal
+
+    def parse_header(self, header_plus: bytes) -> None:
+        """Read the header."""
+        super().parse_header(header_plus)
+        if self.body_rcv is not None:
+            header = {f"HTTP_{name}": value for name, value in self.headers.items()}
+            if self._refusal({"QUERY_STRING": self.query, **header}):
+                self.body_rcv.buf = Discarded()
+
+
 class Visitor(HTTPChannel):  # type: ignore[misc]
     """A connection that remembers when its last request began."""
 
     begun = 0.0
+
+    def parser_class(self, adj: Any) -> Request:
+        """Return a request that is to be read."""
+        return Request(adj, self.server.refusal)
 
     def received(self, data: bytes) -> Any:
         """Take received bytes; bytes that come one by one do not move the deadline."""
@@ -46,6 +85,7 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
     """A server that closes connections after a deadline, and the oldest idle ones for new ones."""
 
     channel_class = Visitor
+    refusal: Refusal
 
     def maintenance(self, now: float) -> None:
         """Close connections that are idle, ask too slowly, or take their answer too slowly."""
@@ -78,9 +118,15 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
         self.trigger.pull_trigger(end)
 
 
-def listener(application: WSGIApplication, place: socket.socket) -> Listener:
-    """Return a server that listens at a bound socket; its `run` serves."""
-    return Listener(
+def listener(application: WSGIApplication, place: socket.socket, refusal: Refusal) -> Listener:
+    """Return a server that listens at a bound socket; its `run` serves.
+
+    Parameters
+    ----------
+    refusal
+        Function of a header that returns why the application will refuse it; empty if it will not.
+    """
+    server = Listener(
         application,
         _sock=place,
         bind_socket=False,
@@ -96,3 +142,5 @@ def listener(application: WSGIApplication, place: socket.socket) -> Listener:
         log_socket_errors=False,
         asyncore_use_poll=True,
     )
+    server.refusal = refusal
+    return server

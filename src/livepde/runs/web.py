@@ -128,7 +128,8 @@ class Server:
             ) from error
         # It warns of each request that waits for one of the threads.
         logging.getLogger("waitress.queue").setLevel(logging.ERROR)
-        self._server = listener(_headed(application, address), place)
+        served = _headed(application, address)
+        self._server = listener(served, place, lambda header: _why_not(header, address))
         # What a daemon starts is one: no thread that serves keeps a program from its end.
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
