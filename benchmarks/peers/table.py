@@ -23,10 +23,11 @@ from benchmarks.peers.filters import ensemble, unscented
 from benchmarks.peers.horizon import moving_horizon
 from benchmarks.peers.network import network
 from benchmarks.problems import PROBLEMS as ALL
-from benchmarks.problems import Problem
+from benchmarks.problems import Data, Problem
 from benchmarks.problems.rod import ROD, ROD_SOURCE
 from benchmarks.scoring import Contender, Found, Score, scored
 from livepde.errors import LivepdeError
+from livepde.laws import SensitivityLaw
 from livepde.progress import watched
 from livepde.runs.outcome import Check, Outcome, Table
 
@@ -60,7 +61,14 @@ class Peer:
         return tuple(name for name in self.packages if find_spec(name) is None)
 
 
+def _filter_alone(data: Data) -> Score | None:
+    law = SensitivityLaw(modes=data.modes, start_window=0, shadows=None, verdict=False)
+    return accuracy.run_law(data, data.observation, law)
+
+
 PEERS: dict[str, Peer] = {
+    # Does as much as the filters below it: no verdict, no iterated start, no discretisation errors.
+    "sensitivity, filter alone": Peer((), _filter_alone),
     **{
         f"EnKF as arrays, {members} members": Peer((), partial(arrays.ensemble, members))
         for members in (20, 50)
