@@ -54,8 +54,10 @@ class MemberReports:
 
     def member(self, k: int) -> Report:
         """Return the report of one member."""
-        found = lambda: self.diagnostics.member(k)  # noqa: E731
-        return Report(self.statuses[k], self.predicted[k], int(self.steps[k]), found)
+        steps = int(self.steps[k])
+        return Report(
+            self.statuses[k], self.predicted[k], steps, lambda: self.diagnostics.member(k)
+        )
 
     def updated(self, more: Diagnostics[Array]) -> MemberReports:
         """Return the reports with all that other diagnostics know among their own."""
