@@ -81,11 +81,11 @@ class BandedStage(MemberStage):
 
         def load(moment: Moment) -> Array:
             known = (model.form_F.vector("v", moment) - model.B(zero, moment)) * free
-            return known - rest_edge @ boundary(moment)
+            return np.asarray(known - rest_edge @ boundary(moment))
 
         def offset(moment: Moment) -> Array:
             at_zero = [form.vector("v", moment, q=q, u=zero) * free for q in units]
-            return np.concatenate(at_zero) + slope_edge @ boundary(moment)
+            return np.asarray(np.concatenate(at_zero) + slope_edge @ boundary(moment))
 
         def driven(vector: Callable[[Moment], Array], *forms: Form) -> DrivenVector:
             def timed() -> bool:
