@@ -6,6 +6,7 @@ import io
 import socket
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from waitress import wasyncore
@@ -94,8 +95,11 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
             since = now - visitor.begun
             asking, answered = visitor.request is not None, visitor.total_outbufs_len > 0
             if (asking and since > DEADLINE) or (answered and since > LONGEST):
-                # With `will_close` it would be closed only once it has taken more of its answer.
-                visitor.handle_close()
+                # With `will_close` it would be closed only once it has taken more of its answer. A
+                # socket that is closed here is polled once more, when a new connection may have
+                # its number already and would be closed in its place.
+                with suppress(OSError):
+                    visitor.socket.shutdown(socket.SHUT_RDWR)
 
     def handle_accept(self) -> None:
         """Accept a connection."""
