@@ -600,5 +600,6 @@ def test_a_visitor_goes_from_the_table_to_a_run(several):
     with served(several) as url, chromium() as page:
         page.get(url)
         wait(page, lambda p: "±" in text(p, "#runs"))
-        page.find_element("link text", "east").click()
+        # The table is drawn anew now and then, maybe between finding the link and the click.
+        wait(page, lambda p: p.find_element("link text", "east").click() is None)
         wait(page, lambda p: count(p) == 4)
