@@ -283,7 +283,9 @@ class Identifier:
                 gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
-        self._state, report = self._stepped(interval)
+        # Not as a decorator: with NumPy 1 one object would keep the old state of all threads.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # seen in the result
+            self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
             if names:
@@ -322,7 +324,6 @@ class Identifier:
             )
         self._state, self._inputs = state, inputs
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # seen in the result
     def _stepped(self, interval: Interval) -> tuple[Any, Report]:
         """Return state and report after a sample; the state before it after a numerical failure.
 
