@@ -110,9 +110,9 @@ def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, exp
 
     smoothed = iterated_smoother.iterated_smoother
 
-    def counted(work, state):
+    def counted(samples):
         begun.append(0)
-        return smoothed(work, state)
+        return smoothed(samples)
 
     monkeypatch.setattr(iterated_smoother, "_descended", watched)
     monkeypatch.setattr(iterated_smoother, "iterated_smoother", counted)
@@ -170,7 +170,7 @@ def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
 
 @pytest.mark.slow
 def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch):
-    monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda work, state: None)
+    monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda samples: None)
     model = sourced()
     samples = list(readings(model, [1.5]))
     plain = ends(model, lp.SensitivityLaw(start_window=0), samples)[-1]

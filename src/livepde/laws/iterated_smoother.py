@@ -36,9 +36,6 @@ CONVERGED = 0.3  # standard deviations that a step moves the trajectory by, at t
 HOLDS = 0.1  # the same in each direction, of the first step, for a linearisation that holds
 ENOUGH = 16  # samples that no other trajectory explains as well as one that is found, and with
 # which the start ends where the linearisation holds: what follows moves the estimate less
-# Unknowns up to which the first pass was the last one in 65 of 66 iterations on rods of layers
-# whose samples the filter had explained; with 6 to 10 of them it was in half of 110.
-FEW = 4
 STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
@@ -56,15 +53,12 @@ class _Pass:
         The filter after the last sample.
     misfit
         Minus twice the logarithm of the probability of the trajectory, up to a constant.
-    work
-        Parts of the law that took the samples.
     """
 
     trajectory: Array
     smoothed: Array
     x: FilterState
     misfit: float
-    work: SensitivityWork
 
 
 def iterate_starts(
@@ -87,64 +81,59 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
     the variance of constant unknowns in all directions, and an iteration hardly moves the estimate.
     """
     count, moved, shares = int(state.assimilated[0]), math.nan, _shares(state.start, state.now)
+    holds = HOLDS * math.sqrt(len(shares))
     # While all directions keep most of their variance, no estimate has moved far enough for its
     # linearisation to matter.
     if shares[0] < HALF:
-        found = iterated_smoother(work, state)
-        moved = math.inf if found is None else _apart(work.filter, found, state.now)
-        if found is not None:
-            state = changed(state, now=work.filter.relinearised(found))
+        samples = _Samples.of(work, state)
+        # A search needs neither the ledger nor the errors of the discretisation, which cost twice
+        # as much again.
+        searched = samples.unaccompanied
+        best = iterated_smoother(searched)
+        moved = math.inf if best is None else _apart(work.filter, best.x, state.now)
+        # An error of the linearisation never grows, measured in the standard deviations that later
+        # samples leave: within `HOLDS` the filter stays as it is.
+        if best is not None and (moved > holds or not _usual(state.now)):
+            found = best if searched is samples else samples.about(best.trajectory)
+            if found is not None:
+                state = changed(state, now=work.filter.relinearised(_without_past(found.x)))
         stays = shares[-1] < HALF and not work.filter.moves
-        if stays and count >= ENOUGH and moved <= HOLDS * math.sqrt(len(shares)):
+        if stays and count >= ENOUGH and moved <= holds:
             return changed(state, start_due=np.array([NEVER])), moved
     if count >= work.start_window:
         return new_window(work, state.now, state), moved
     return changed(state, start_due=2 * state.assimilated), moved
 
 
-def iterated_smoother(work: SensitivityWork, state: SensitivityState) -> FilterState | None:
-    """Return the filter of one member after its samples, about their most probable trajectory.
-
-    None if no trajectory could be followed to its end.
-    """
-    problem = work.filter.problem
-    log = state.log[:, int(state.window[0]) :]
-    opening = first_interval(log, problem.channels)
-    intervals = intervals_since(log, problem.channels)
-    whole = bare = _Samples(work, state, opening, intervals)
-    # A search needs neither the ledger nor the errors of the discretisation, which cost as much
-    # again: the last pass alone follows them, and the first one where it is likely the last.
-    if work.filter.judge is not None or work.filter.shadows is not None:
-        bare = _Samples(work.unaccompanied, state.unaccompanied, opening, intervals)
-    samples = whole if _ends_at_once(state.now) else bare
+def iterated_smoother(samples: _Samples) -> _Pass | None:
+    """Return the pass about the most probable trajectory; None if none could be followed."""
     ends: list[_Pass] = []
-    for trajectory in _beginnings(bare, (1 + len(intervals), state.now.C.shape[2])):
-        one, samples = samples.about(trajectory), bare
+    for trajectory in _beginnings(samples):
+        one = samples.about(trajectory)
         if one is None:
             continue
-        ends.append(_descended(bare, one))
+        ends.append(_descended(samples, one))
         # Gauss-Newton steps end in a local minimum: other beginnings are spared only if this one
         # explains the samples, and either these are many or its first linearisation held.
-        if bare.explained(ends[-1]) and (len(intervals) >= ENOUGH or _holds(one)):
+        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or _holds(one)):
             break
-    if not ends:
-        return None
-    best = min(ends, key=lambda one: one.misfit)
-    found = best if best.work is work else whole.about(best.trajectory)
-    if found is None:
-        return None
-    # Only the search needs earlier values, which would cost columns in each later update.
-    return changed(found.x, past=found.x.past[:, :, :0], dpast=found.x.dpast[:, :0])
+    return min(ends, key=lambda one: one.misfit, default=None)
 
 
-def _ends_at_once(x: FilterState) -> bool:
-    """True if the first pass is likely the last: few unknowns, innovations no larger than usual."""
+def _without_past(x: FilterState) -> FilterState:
+    """Return a filter without earlier values, which would cost columns in each later update."""
+    return changed(x, past=x.past[:, :, :0], dpast=x.dpast[:, :0])
+
+
+def _usual(x: FilterState) -> bool:
+    """True if the innovations of one member are no larger than their noise makes usual."""
     count, squares = x.innovations.sums[0, 0], x.innovations.sums[0, 2]
-    return bool(x.C.shape[2] <= FEW and squares <= count + 3.0 * math.sqrt(2.0 * count))
+    return bool(squares <= count + 3.0 * math.sqrt(2.0 * count))
 
 
-def _beginnings(samples: _Samples, shape: tuple[int, ...]) -> Iterator[Array]:
+def _beginnings(samples: _Samples) -> Iterator[Array]:
     """Return trajectories to begin at, the most promising one first."""
+    shape = 1 + len(samples.intervals), samples.state.now.C.shape[2]
     if not samples.work.filter.moves:  # where the filter has come to, with its safeguards
         yield np.broadcast_to(samples.reached, shape)
     plain = samples.about(None)
@@ -215,6 +204,20 @@ class _Samples:
     opening: Interval
     intervals: Sequence[Interval]
 
+    @classmethod
+    def of(cls, work: SensitivityWork, state: SensitivityState) -> _Samples:
+        """Return the samples of the window of one member."""
+        log, channels = state.log[:, int(state.window[0]) :], work.filter.problem.channels
+        opening = first_interval(log, channels)
+        return cls(work, state, opening, intervals_since(log, channels))
+
+    @property
+    def unaccompanied(self) -> _Samples:
+        """The same samples, assimilated without ledger and discretisation errors."""
+        if self.work.filter.judge is None and self.work.filter.shadows is None:
+            return self
+        return replace(self, work=self.work.unaccompanied, state=self.state.unaccompanied)
+
     def explained(self, one: _Pass) -> bool:
         """True if a pass misses the samples by no more than their noise makes usual.
 
@@ -268,7 +271,7 @@ class _Samples:
                 misfit += moved(filter_, followed[-2], followed[-1], h, gained)
         x = x if filter_.moves else filter_.remembered(x)  # what stays is now as it always was
         smoothed = np.broadcast_to(x.dpast[0].reshape(-1, x.C.shape[2]), np.shape(followed))
-        return _Pass(np.array(followed), smoothed, x, misfit, self.work)
+        return _Pass(np.array(followed), smoothed, x, misfit)
 
     def _remembered(self, x: FilterState) -> FilterState:
         return self.work.filter.remembered(x) if self.work.filter.moves else x
