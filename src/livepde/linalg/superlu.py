@@ -29,10 +29,14 @@ class SuperLUFactor:
     """LU factors of the transpose: a CSR matrix read as CSC is its transpose, without a copy."""
 
     lu: Any
+    symmetric: bool = False
 
     def solve(self, b: Array) -> Array:
         """Return x with K x = b."""
-        x: Array = self.lu.solve(b, trans="T")
+        # SuperLU solves the transposed system column by column; the other one takes all columns at
+        # once, which is up to 1.5 times faster, but slower for a single column.
+        several = b.ndim > 1 and b.shape[1] > 1
+        x: Array = self.lu.solve(b, trans="N" if self.symmetric and several else "T")
         return x
 
 
@@ -73,7 +77,7 @@ class SuperLUSolver:
             "time step."
         )
         try:
-            factor = SuperLUFactor(splu(transpose, **options))
+            factor = SuperLUFactor(splu(transpose, **options), self.symmetric)
         except RuntimeError as error:
             raise LinearAlgebraError(message) from error
         if self.symmetric:
