@@ -251,7 +251,7 @@ def test_where_sensors_are_many_kinds_of_causes_are_left_out(sensors: int, kinds
 @pytest.mark.slow
 def test_a_kept_verdict_holds_no_responses_of_the_process():
     identifier, _ = run(shown() + errors())
-    cells = identifier.law.judge(identifier._work, identifier._state).__closure__ or ()
+    cells = identifier.law.deferred(identifier._work, identifier._state).verdict.__closure__ or ()
     (x,) = (cell.cell_contents for cell in cells if hasattr(cell.cell_contents, "ledger"))
     assert identifier._state.now.ledger.process.size
     assert x.ledger.process.size == 0

@@ -396,7 +396,8 @@ class Identifier:
     ) -> Estimate:
         # Estimates that are kept hold the small state of the law; mean and factors are computed
         # when read.
-        latent, problem, error = self.law.reader(self._work, self._state), self.problem, withheld
+        (latent, judge), problem = self.law.deferred(self._work, self._state), self.problem
+        error = withheld
         read = latent if self.model.latent.plain else lambda: problem.physical(latent())
         if self.withheld is not None:
             belief = read()
@@ -416,7 +417,7 @@ class Identifier:
             diagnose=lambda: report.diagnostics,
             held=held,
             space=self.model.parameter_space,
-            judge=self._judge(self._state, lambda: report.diagnostics),
+            judge=self._judge(judge, lambda: report.diagnostics),
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
@@ -431,10 +432,10 @@ class Identifier:
         return found
 
     def _judge(
-        self, state: Any, diagnose: Callable[[], Diagnostics[float]]
+        self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return a function that gives the verdict on the run so far."""
-        judge, withheld, gaps = self.law.judge(self._work, state), self._withheld, self._gaps
+        """Return the verdict of the law with the findings on withheld sensors and gaps."""
+        withheld, gaps = self._withheld, self._gaps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
         if not names and not np.count_nonzero(gaps.counts[1:]):
@@ -474,8 +475,9 @@ class Identifier:
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
-        belief = self.problem.physical(self.law.belief(self._work, state))
-        return replace(estimate, belief=belief, judge=self._judge(state, estimate.diagnose))
+        latent, judge = self.law.deferred(self._work, state)
+        belief = self.problem.physical(latent())
+        return replace(estimate, belief=belief, judge=self._judge(judge, estimate.diagnose))
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return predicted readings if nothing more is measured; nothing is learned.

@@ -33,7 +33,7 @@ from livepde.laws.history import (
     opened,
 )
 from livepde.laws.jumps import Jumps
-from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report
+from livepde.laws.law import Belief, Deferred, FixedInterval, Law, Problem, Report
 from livepde.laws.member_arrays import changed, join, take
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
@@ -44,6 +44,7 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
     without_factors,
+    without_ledger,
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
@@ -51,7 +52,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.verdict import judged
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Alexander2, Interval, Scheme
-from livepde.verdict import Verdict
 
 __all__ = ["AutoLaw"]
 
@@ -448,19 +448,17 @@ class AutoLaw(Law[Bank, AutoState]):
         return self.member.finite(work.work, state.members)
 
     def belief(self, work: Bank, state: AutoState) -> Belief:
-        return self.reader(work, state)()
+        return self.deferred(work, state).belief()
 
-    def reader(self, work: Bank, state: AutoState) -> Callable[[], Belief]:
+    def deferred(self, work: Bank, state: AutoState) -> Deferred:
         noise = state.noise if state.known else np.ones_like(state.noise)
-        tick, now = state.tick, without_factors(state.members.now)
+        filters, now = work.filters(state.tick, noise), without_factors(state.members.now)
         weights = np.exp(state.weights[now.member])
-        return lambda: self._mixture(work.filters(tick, noise), now, weights)
-
-    def judge(self, work: Bank, state: AutoState) -> Callable[[], Verdict]:
-        if not state.known:
-            return super().judge(work, state)
-        filters = work.filters(state.tick, state.noise)
-        return judged(filters.filter, state.members.now, state.at(state.leader))
+        verdict = self.unjudged
+        if state.known:
+            verdict = judged(filters.filter, now, state.at(state.leader))
+        alone = without_ledger(now)
+        return Deferred(lambda: self._mixture(filters, alone, weights), verdict)
 
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""

@@ -21,6 +21,7 @@ from livepde.verdict import Verdict
 
 __all__ = [
     "Belief",
+    "Deferred",
     "FixedInterval",
     "InitialReading",
     "Law",
@@ -154,6 +155,13 @@ class Problem:
             prior_factor=None if prior is None else latent.tangent(q, prior),
             rest=None if rest is None or not rest.any() else latent.deviation(q, rest),
         )
+
+
+class Deferred(NamedTuple):
+    """Functions that compute belief and verdict when they are read; the numbers never change."""
+
+    belief: Callable[[], Belief]
+    verdict: Callable[[], Verdict]
 
 
 @dataclass(frozen=True, eq=False)
@@ -437,22 +445,19 @@ class Law(ABC, Generic[Work, State]):
     def belief(self, work: Work, state: State) -> Belief:
         """Return estimates and, if the law has them, covariances."""
 
-    def reader(self, work: Work, state: State) -> Callable[[], Belief]:
-        """Return a function that gives `belief` when an estimate is read; here it is found at once.
+    def deferred(self, work: Work, state: State) -> Deferred:
+        """Return belief and verdict, to be computed when an estimate is read.
 
-        Estimates are kept, and with them the data that such a function holds: a law overrides this
-        where these data are not much larger than the belief itself and never change afterwards.
+        Here the belief is found at once, and innovations are not judged. Estimates are kept, and
+        with them the data that such functions hold: a law overrides this where these data are not
+        much larger than the belief itself and never change afterwards.
         """
         belief = self.belief(work, state)
-        return lambda: belief
+        return Deferred(lambda: belief, self.unjudged)
 
-    def judge(self, work: Work, state: State) -> Callable[[], Verdict]:
-        """Return a function that gives the verdict on a run so far; it never changes afterwards.
-
-        Here that of a law whose innovations are not judged.
-        """
-        name = type(self).__name__
-        return lambda: Verdict.of((), (f"innovations: {name} says nothing of their size",))
+    def unjudged(self) -> Verdict:
+        """Return the verdict where no innovation is judged."""
+        return Verdict.of((), (f"innovations: {type(self).__name__} says nothing of their size",))
 
 
 AnyLaw = Law[Any, Any]

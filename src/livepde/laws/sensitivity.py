@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -27,7 +27,7 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
-from livepde.laws.law import Belief, FixedInterval, Law, Problem, Report, finite
+from livepde.laws.law import Belief, Deferred, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
@@ -58,7 +58,6 @@ from livepde.stepping import (
     Span,
     member_stage,
 )
-from livepde.verdict import Verdict
 
 __all__ = ["SensitivityLaw"]
 
@@ -503,13 +502,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)
 
-    def reader(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Belief]:
+    def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
-        now = without_ledger(without_factors(state.now))
-        return lambda: self.member_belief(work, now, 0)
-
-    def judge(self, work: SensitivityWork, state: SensitivityState) -> Callable[[], Verdict]:
-        return judged(work.filter, without_factors(state.now), 0)
+        now = without_factors(state.now)
+        alone = without_ledger(now)
+        return Deferred(lambda: self.member_belief(work, alone, 0), judged(work.filter, now, 0))
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""
