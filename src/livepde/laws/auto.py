@@ -44,7 +44,6 @@ from livepde.laws.sensitivity_state import (
     new_window,
     restarted,
     without_factors,
-    without_ledger,
 )
 from livepde.laws.shadows import Shadows
 from livepde.laws.smoother import evidence, smoothed
@@ -457,8 +456,7 @@ class AutoLaw(Law[Bank, AutoState]):
         verdict = self.unjudged
         if state.known:
             verdict = judged(filters.filter, now, state.at(state.leader))
-        alone = without_ledger(now)
-        return Deferred(lambda: self._mixture(filters, alone, weights), verdict)
+        return Deferred(lambda: self._mixture(filters, now, weights), verdict)
 
     def _mixture(self, filters: SensitivityWork, now: FilterState, weights: Array) -> Belief:
         """Return the mean and covariance of all members."""
