@@ -167,7 +167,7 @@ def _rescued(
 
     A restart does not use the last samples again: the older state is propagated without them.
     """
-    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise_of(interval)
+    noise = work.filter.noise_of(state.now, interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
 
