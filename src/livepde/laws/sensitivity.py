@@ -426,7 +426,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if np.count_nonzero(far):
                 near = ~far.any(axis=1)
                 usual = usual & (near if replays is None else replays | near)
-            parts["scale"] = scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            parts["scale"] = state.scale.kept(scale, x.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:
