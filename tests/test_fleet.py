@@ -268,6 +268,33 @@ def test_a_member_that_fails_does_not_disturb_the_others():
     assert estimates[8].steps[2] == 0
 
 
+class Singular(lp.GradientLaw):
+    """A law that solves no sample of 9."""
+
+    def step(self, work, state, interval):
+        if interval.z1[0] == 9.0:
+            raise np.linalg.LinAlgError("Singular matrix")
+        return super().step(work, state, interval)
+
+
+def test_a_law_that_raises_or_overflows_for_a_member_is_a_status_of_it():
+    fleet = lp.Fleet(rod(), SENSORS, Singular(), 2)
+    inputs, good = {"T_0": 1.0, "ambient": 0.0}, [0.3, 0.2, 0.1]
+    for k, (first, code) in enumerate([(0.3, "ok"), (9.0, "singular"), (1e200, "not_finite")]):
+        found = fleet.step(0.1 * (k + 1), [good, [first, 0.2, 0.1]], inputs)
+        assert [status.code for status in found.statuses] == ["ok", code]
+    assert fleet.step(0.4, [good, good], inputs).ok.all()
+    assert fleet.t.tolist() == [0.4, 0.4]
+
+
+@pytest.mark.parametrize("law", [lp.SensitivityLaw(), Singular()], ids=["together", "apart"])
+def test_inputs_that_give_no_finite_start_are_refused(law):
+    fleet, z = lp.Fleet(rod(), SENSORS, law, ["a", "b"]), [[0.3, 0.2, 0.1]] * 2
+    with pytest.raises(lp.errors.SampleError, match="member 'b' gets no finite initial state"):
+        fleet.step(0.1, z, {"T_0": [0.0, 1.7e308], "ambient": 0.0})
+    assert fleet.step(0.1, z, {"T_0": 0.0, "ambient": 0.0}).ok.all()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("law", "why"),

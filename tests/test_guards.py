@@ -13,6 +13,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde.laws.excitation_gate import ExcitationLevel, Probes, pairs
 from livepde.laws.history import added, empty_log, opened
+from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import Scale
 from livepde.reproduce import seed_excited
 from livepde.runs import doubts
@@ -159,6 +160,20 @@ def test_a_failure_that_nothing_helps_against_is_a_status():
     assert bad.status.remedy
     assert np.array_equal(bad.q, good.q)
     assert identifier.step(0.2, [0.0, 0.0, 0.0], {"T": 0.0}).status.ok
+
+
+@pytest.mark.slow
+def test_a_wild_reading_does_not_let_a_later_runaway_pass():
+    """The range that a prediction has to miss by far is that of readings that the gate lets in."""
+    stream = samples(rod(), 0.3, 64)
+    stream[20][1][0] = -9999.0
+    identifier = lp.Identifier(rod(), POINTS, filter_alone(), u0=0.0)
+    for k, (t, z) in enumerate(stream):
+        if k == 60:
+            now = identifier._state.now
+            identifier._state = changed(identifier._state, now=changed(now, u=1e3 * now.u))
+        estimate = identifier.step(t, z)
+        assert (estimate.diagnostics.restarted == 1.0) == (k == 60)
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import driven_rod, line, readings
+from factories import driven_rod, filter_alone, line, readings
 
 import livepde as lp
 from livepde.laws.jumps import Jumps
@@ -85,6 +85,30 @@ def test_a_sample_without_a_measurement_is_no_evidence():
     mixed[500] = (t, z + 2.5 * NOISE)  # by chance: once is no alarm
     found = run(lp.SensitivityLaw(jumps=Jumps()), mixed)
     assert not any(estimate.diagnostics.jump > 0.0 for estimate in found)
+
+
+@pytest.mark.parametrize(
+    ("law", "after"), [(filter_alone(jumps=Jumps(settle=20)), 0.24), (lp.AutoLaw(), 0.2)]
+)
+def test_samples_without_a_measurement_are_taken_again_with_those_since_the_jump(
+    law: Any, after: float
+):
+    """Their number counts all of them, back to the first measurement after it."""
+    nothing = np.full(len(POINTS), np.nan)
+    stream = samples(lambda t: 0.3 if t < 10.0 else after, 220, 0)
+    found = run(law, [(t, z if k % 2 else nothing) for k, (t, z) in enumerate(stream)])
+    alarms = [k for k, one in enumerate(found) if one.diagnostics.jump > 0.0 and k > 199]
+    assert alarms[0] - found[alarms[0]].diagnostics.jump_samples + 1 == 201
+
+
+def test_values_that_the_gate_refuses_at_first_do_not_hide_a_later_jump():
+    """They would make a usual size beside which any jump is small."""
+    stream = samples(lambda t: 0.3 if t < 7.5 else 0.15, 180, 0)
+    for k in (15, 16):
+        stream[k][1][0] = -9999.0
+    found = run(filter_alone(jumps=Jumps()), stream)
+    assert sum(one.diagnostics.refused for one in found) == 2.0
+    assert any(one.diagnostics.jump > 0.0 for one in found[149:])
 
 
 def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():

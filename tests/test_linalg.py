@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.util import find_spec
+from threading import Event, Thread
 
 import hypothesis.strategies as st
 import numpy as np
@@ -25,6 +26,7 @@ from livepde.linalg import (
     choose,
     conjugate_gradients,
     gmres,
+    nonfinite_allowed,
     positive_definite,
     sandwich,
 )
@@ -332,3 +334,26 @@ def test_units_spare_the_banded_engine_its_exchanges_of_rows():
         expected = x[:, 0] if b.ndim == 1 else x
         for solver in (scaled, plain):  # rounding is relative to the norm, not to each entry
             np.testing.assert_allclose(solver.solve(b), expected, rtol=0, atol=1e-11)
+
+
+def test_the_error_state_of_a_thread_is_its_own():
+    """As a decorator, `np.errstate` gives a thread the state of another one with NumPy 1."""
+    entered, left = Event(), Event()
+
+    @nonfinite_allowed()
+    def waits():
+        if entered.is_set():  # the second one, while the first one waits
+            left.set()
+        entered.set()
+        assert left.wait(10.0)
+
+    def other():
+        assert entered.wait(10.0)
+        waits()
+
+    thread = Thread(target=other)
+    with np.errstate(over="raise"):
+        thread.start()
+        waits()
+        assert np.geterr()["over"] == "raise"
+    thread.join()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,10 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from livepde.fem import Inputs, Moment
+from livepde.laws.assimilation import absorb
 from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.linalg import Array
-from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, StageOfMembers
+from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, Span, StageOfMembers
 from livepde.stepping.banded_stage import DrivenVector
 from livepde.stepping.member_stage import SeparateStages
 
@@ -264,3 +265,23 @@ def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
     assert state.since_newer[0] == state.log.shape[1] - 1
     np.testing.assert_array_equal(state.newer.q, state.now.q)
     np.testing.assert_array_equal(state.newer.da, state.now.da)
+
+
+def test_each_member_has_its_own_noise_level_and_is_finite_by_itself():
+    law = lp.SensitivityLaw(start_window=0, shadows=None, verdict=False)
+    fleet = lp.Fleet(rod({"left": 0.0}), lp.Points([0.5], noise=0.1), law, 2)
+    for k in range(1, 4):
+        fleet.step(0.1 * k, [[0.2]] * 2)
+    work, x = fleet._work, fleet._state.now
+
+    def absorbed(x: Any, z: float, scale: float = 1.0) -> Any:
+        t, values, nothing = np.full(len(x), 0.3), np.full((len(x), 1), z), np.zeros((1, 0))
+        span = Span(t, 0.3, (), nothing, nothing, values, values)
+        return absorb(replace(work.filter, noise=scale * work.filter.noise), x, span, work.options)
+
+    louder, _ = absorbed(changed(x, level=np.array([1.0, 4.0])), 0.5)
+    for k, scale in enumerate((1.0, 2.0)):  # of four times the variance
+        alone, _ = absorbed(take(x, k), 0.5, scale)
+        np.testing.assert_allclose(louder.da[k], alone.da[0], rtol=1e-12)
+    unsound = changed(x, da=x.da + np.array([[0.0], [np.nan]]))
+    assert absorbed(unsound, np.nan)[1].finite.tolist() == [True, False]

@@ -11,6 +11,7 @@ import pytest
 from factories import driven_rod, readings
 
 import livepde as lp
+from livepde.laws.member_arrays import changed
 from livepde.models import heat
 from livepde.runs.run_verdict import doubts
 from livepde.stepping import Alexander2, ImplicitEuler
@@ -299,6 +300,46 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert ran(given, samples()[:10]).diagnostics.mesh_unfollowed == 1.0
     few = lp.SensitivityLaw(shadows=lp.laws.Shadows(largest=10))
     assert ran(identifier(8, few), samples()[:10]).diagnostics.mesh_unfollowed == 1.0
+
+
+def test_a_shadow_that_is_not_finite_begins_anew() -> None:
+    """Neither gate nor verdict take its part, and no number of the filter moves."""
+    law = lp.SensitivityLaw(start_window=0)
+    spoiled, whole = identifier(8, law), identifier(8, law)
+    ran(spoiled, samples()[:15]), ran(whole, samples()[:15])
+    now = spoiled._state.now
+    wrong = changed(now.shadows, u=np.full_like(now.shadows.u, np.nan))
+    spoiled._state = changed(spoiled._state, now=changed(now, shadows=wrong))
+    found, expected = ran(spoiled, samples()[15:60]), ran(whole, samples()[15:60])
+    assert found.q.tolist() == expected.q.tolist()
+    assert found.diagnostics.shadow_failed == 3.0
+    assert found.diagnostics.refused == expected.diagnostics.refused == 0.0
+    assert set(found.diagnostics.shifts.sizes) == {"step", "mesh", "input"}
+    told = [[item.what for item in one.verdict.findings] for one in (found, expected)]
+    assert told[0] == told[1]
+    assert np.isfinite(spoiled._state.now.ledger.sums).all()
+
+
+@pytest.mark.slow
+def test_a_mesh_whose_initial_state_is_not_finite_is_followed_later() -> None:
+    """A function that fails at a single point of the halved mesh; its stages keep factors."""
+    calls = []
+
+    def initial(x: Any) -> Any:
+        calls.append(x)
+        u = np.sin(np.pi * x[0]) * np.sin(np.pi * x[1])
+        if len(calls) > 1:
+            u.flat[99] = np.nan
+        return u
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (24, 24))
+    model = heat(mesh, lp.Normal(0.05, 0.03), {"boundary": 0.0})
+    sensors, law = lp.Points([[0.3, 0.4], [0.7, 0.6]], noise=0.05), lp.SensitivityLaw(verdict=False)
+    given = lp.Identifier(model, sensors, law, u0=initial)
+    estimates = [given.step(0.05 * k, [0.8 * np.exp(-0.06 * k)] * 2) for k in range(1, 20)]
+    assert len(calls) == 2
+    assert estimates[2].diagnostics.shifts.sizes["mesh"] != 0.0
+    assert estimates[1].diagnostics.shadow_failed == estimates[-1].diagnostics.shadow_failed > 0.0
 
 
 @pytest.mark.long

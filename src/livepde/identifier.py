@@ -27,9 +27,19 @@ from livepde.errors import (
 from livepde.fem import Inputs, Moment
 from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
-from livepde.laws import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status, numerical
+from livepde.laws import (
+    AnyLaw,
+    Belief,
+    InitialReading,
+    Law,
+    Problem,
+    Report,
+    Status,
+    numerical,
+    stepped,
+)
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array
+from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
@@ -283,9 +293,8 @@ class Identifier:
                 gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
-        # Not as a decorator: with NumPy 1 one object would keep the old state of all threads.
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # seen in the result
-            self._state, report = self._stepped(interval)
+        before = self._state
+        self._state, report = stepped(self.law, self._work, self.problem, before, interval)
         self._samples += 1
         if report.status.taken:
             if names:
@@ -310,7 +319,7 @@ class Identifier:
     def _begun_by(self, inputs: Inputs, t: float) -> None:
         """Begin with the inputs of the first sample, unless no finite state comes of them."""
         try:
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            with nonfinite_allowed():
                 state = self._start(inputs)
                 finite = self.law.finite(self._work, state)
         except Exception as error:
@@ -323,34 +332,6 @@ class Identifier:
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
         self._state, self._inputs = state, inputs
-
-    def _stepped(self, interval: Interval) -> tuple[Any, Report]:
-        """Return state and report after a sample; the state before it after a numerical failure.
-
-        A numerical failure is an operation that raises, or a belief of the law that is not finite,
-        be it only the squares of its numbers.
-        """
-        before = self._state
-        try:
-            if interval.t1 > interval.t0:
-                state, report = self.law.step(self._work, before, interval)
-            else:
-                state = self.law.begin(self._work, before, interval)
-                report = Report(Status(), self._expected(interval))
-            if not report.status.taken or self.law.finite(self._work, state):
-                return state, report
-            failure = Status("not_finite", "what the law believes after it is not finite")
-        except Exception as error:
-            found = numerical(error)
-            if found is None:
-                raise
-            failure = found
-        return before, Report(failure, np.full(self.observed.size, np.nan))
-
-    def _expected(self, interval: Interval) -> Array:
-        """Return the predicted readings of the current estimate."""
-        belief = self._belief()
-        return self.observed.predict(belief.u, belief.q, interval.end)
 
     @property
     def place(self) -> tuple[Any, ...]:

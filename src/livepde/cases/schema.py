@@ -14,9 +14,6 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
     StrictBool,
     model_validator,
 )
@@ -56,13 +53,26 @@ def _short(key: str) -> BeforeValidator:
     return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
-def _strict_switches(value: Any) -> Any:
-    """Refuse 1, "no" and other values that pydantic takes for true or false."""
-    for key, given in value.items() if isinstance(value, Mapping) else ():
-        if isinstance(getattr(Shadows, key, None), bool) and not isinstance(given, bool):
-            message = f"{key} must be true or false; got {given!r}"
-            raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
+def _number(value: Any) -> Any:
+    """Refuse true and false, which pydantic takes for 1 and 0."""
+    if isinstance(value, bool):
+        raise ValueError("expected a number")  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value
+
+
+def _options(kind: type) -> BeforeValidator:
+    """Return a check that options of a law have numbers for numbers, true or false for switches."""
+
+    def checked(value: Any) -> Any:
+        for key, given in value.items() if isinstance(value, Mapping) else ():
+            usual = getattr(kind, key, None)
+            switch = isinstance(usual, bool)
+            if isinstance(usual, int | float) and switch != isinstance(given, bool):
+                rule = "true or false" if switch else "a number"
+                raise ValueError(f"{key} must be {rule}; got {given!r}")
+        return value
+
+    return BeforeValidator(checked)
 
 
 def _limits(value: Any) -> Any:
@@ -115,6 +125,10 @@ def _flat(value: Any) -> Any:
 
 
 Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
+Number: TypeAlias = Annotated[float, BeforeValidator(_number)]
+PositiveFloat: TypeAlias = Annotated[Number, Field(gt=0)]
+PositiveInt: TypeAlias = Annotated[int, Field(gt=0), BeforeValidator(_number)]
+NonNegativeInt: TypeAlias = Annotated[int, Field(ge=0), BeforeValidator(_number)]
 Pair: TypeAlias = tuple[Quantity, Quantity]
 Point: TypeAlias = Quantity | tuple[Quantity, ...]
 Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
@@ -481,7 +495,7 @@ class FilterSpec(Spec):
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat = SensitivityLaw.gate
-    shadows: StrictBool | Annotated[Shadows, BeforeValidator(_strict_switches)] = True
+    shadows: StrictBool | Annotated[Shadows, _options(Shadows)] = True
 
 
 class SensitivitySpec(FilterSpec):
@@ -490,9 +504,13 @@ class SensitivitySpec(FilterSpec):
     kind: Literal["sensitivity"]
     drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
-    replay: StrictBool | Replay = False
-    jumps: StrictBool | Annotated[tuple[Name, ...], Field(min_length=1)] | Jumps = False
-    guards: StrictBool | Guards = True
+    replay: StrictBool | Annotated[Replay, _options(Replay)] = False
+    jumps: (
+        StrictBool
+        | Annotated[tuple[Name, ...], Field(min_length=1)]
+        | Annotated[Jumps, _options(Jumps)]
+    ) = False
+    guards: StrictBool | Annotated[Guards, _options(Guards)] = True
     verdict: StrictBool | Literal["cheap"] = True
 
 
@@ -514,11 +532,11 @@ class GradientSpec(Spec):
     """The paper's law, for observed subdomains and averages."""
 
     kind: Literal["gradient"]
-    gain: float | Literal["auto"] = GradientLaw.gain
-    c1: float | None = None
-    mu: float | None = None
-    nu: float = GradientLaw.nu
-    sigma: float = GradientLaw.sigma
+    gain: Number | Literal["auto"] = GradientLaw.gain
+    c1: Number | None = None
+    mu: Number | None = None
+    nu: Number = GradientLaw.nu
+    sigma: Number = GradientLaw.sigma
     tikhonov: bool | TikhonovSpec = False
 
     @model_validator(mode="after")

@@ -12,10 +12,19 @@ import numpy as np
 
 from livepde import checkpoint
 from livepde.fem import Moment
-from livepde.laws import AnyLaw, Belief, InitialReading, MemberReports, Problem, Status
+from livepde.laws import (
+    AnyLaw,
+    Belief,
+    InitialReading,
+    MemberReports,
+    Problem,
+    Report,
+    Status,
+    stepped,
+)
 from livepde.laws.member_arrays import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.stepping import Span
 
 __all__ = ["Beliefs", "BlockEngine", "Factors", "FleetEngine", "SeparateEngine", "State"]
@@ -86,6 +95,10 @@ class FleetEngine(ABC):
         """Return the state at the end of a span, with that before it for members that failed."""
 
     @abstractmethod
+    def finite(self, state: State) -> bool:
+        """Return whether the beliefs about all members together are finite; see `Law.finite`."""
+
+    @abstractmethod
     def settled(self, state: State) -> State:
         """Return the state after the work that the law spreads over samples; see `Law.settled`."""
 
@@ -127,15 +140,22 @@ class SeparateEngine(FleetEngine):
         return tuple(self.law.start(self.work, q, u, moment) for q, u, moment in each)
 
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
-        return tuple(self.law.begin(self.work, one, span.member(k)) for k, one in enumerate(state))
+        return tuple(one for one, _ in self._stepped(state, span))
 
     def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], MemberReports]:
-        taken = [self.law.step(self.work, one, span.member(k)) for k, one in enumerate(state)]
+        taken = self._stepped(state, span)
         members, sensors = len(taken), len(taken[0][1].predicted)
         blank = np.zeros((members, sensors)), np.zeros(members, dtype=int)
         reports = MemberReports((Status(),) * members, *blank)
         each = {k: report for k, (_, report) in enumerate(taken)}
         return tuple(new for new, _ in taken), reports.with_members(each)
+
+    def _stepped(self, state: tuple[Any, ...], span: Span) -> list[tuple[Any, Report]]:
+        parts = self.law, self.work, self.problem
+        return [stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
+
+    def finite(self, state: tuple[Any, ...]) -> bool:
+        return all(self.law.finite(self.work, one) for one in state)
 
     def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(self.law.settled(self.work, one) for one in state)
@@ -203,6 +223,10 @@ class BlockEngine(FleetEngine):
         found = self.law.step_members(self.work, state, span)
         return found
 
+    def finite(self, state: SensitivityState) -> bool:
+        finite: bool = self.law.finite(self.work, state)
+        return finite
+
     def settled(self, state: SensitivityState) -> SensitivityState:
         settled: SensitivityState = self.law.settled(self.work, state)
         return settled
@@ -211,7 +235,7 @@ class BlockEngine(FleetEngine):
         belief: Belief = self.law.member_belief(self.work, state.now, k)
         return belief
 
-    @np.errstate(over="ignore", invalid="ignore")  # of members whose step has failed
+    @nonfinite_allowed()  # of members whose step has failed
     def beliefs(self, state: SensitivityState) -> Beliefs:
         now, reduction = state.now, self.work.filter.reduction
         latent = self.work.filter.problem.model.latent

@@ -25,7 +25,7 @@ from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEng
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import MOST_SUBSTEPS, Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import layout_of
@@ -191,13 +191,21 @@ class Fleet:
 
     def _begin(self, inputs: Array) -> None:
         moments, u0 = self._moments(self._t, inputs), self._u0
-        if self.model.form_initial is None:
-            starts = [self.model.impose(u, at) for u, at in zip(u0, moments, strict=True)]
-        else:
-            pairs = zip(self._q0, moments, strict=True)
-            starts = [self.model.initial_state(q, at) for q, at in pairs]
-        self._state = self._engine.start(self._q0, starts, moments)
-        self._inputs = inputs
+        with nonfinite_allowed():  # refused below
+            if self.model.form_initial is None:
+                starts = [self.model.impose(u, at) for u, at in zip(u0, moments, strict=True)]
+            else:
+                pairs = zip(self._q0, moments, strict=True)
+                starts = [self.model.initial_state(q, at) for q, at in pairs]
+            state = self._engine.start(self._q0, starts, moments)
+        if self.inputs and not self._engine.finite(state):
+            for k, name in enumerate(self.members):
+                if not self.law.finite(self._work, self._engine.member(state, k)):
+                    raise SampleError(
+                        f"member '{name}' gets no finite initial state: check the values of its "
+                        f"inputs {list(self.inputs)}; the run begins with the next sample."
+                    )
+        self._state, self._inputs = state, inputs
 
     def step(
         self, t: float, z: Values, inputs: Mapping[str, ArrayLike] | None = None

@@ -28,6 +28,7 @@ from livepde.laws.law import (
     Report,
     Status,
     numerical,
+    stepped,
 )
 from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
@@ -67,5 +68,6 @@ __all__ = [
     "Status",
     "diffusion_operator",
     "numerical",
+    "stepped",
     "unobserved_damping",
 ]

@@ -152,11 +152,10 @@ def absorb(
         measured = np.asarray(used.any(axis=1))
         if not measured.any():
             none = np.zeros(len(d))
-            finite: Mask = np.isfinite((x.u + x.du).sum(axis=1) + x.U.sum(axis=(1, 2)))
+            sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
+            finite: Mask = np.isfinite(sums + x.U.sum(axis=(1, 2)) + x.C.sum(axis=(1, 2)))
             return x, Assimilation(predicted, steps, OK, finite, none, 0.0)
-    noise = filter_.noise_of(span)
-    if options.adaptive or x.level[0] != 1.0:
-        noise = np.sqrt(x.level)[:, None] * noise
+    noise = filter_.noise_of(x, span)
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
     sizes = np.abs(d)
@@ -166,7 +165,7 @@ def absorb(
     shadows, off = filter_.shadows, None
     told, shift = d, np.zeros_like(d)
     if shadows is not None:
-        off = shadows.in_readings(x, at)
+        x, off = shadows.in_readings(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
         shift = off[:, shadows.counted].sum(axis=1) / noise

@@ -31,6 +31,7 @@ from livepde.laws.history import (
     first_interval,
     intervals_since,
     opened,
+    reaching,
 )
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, FixedInterval, Law, Problem, Report
@@ -289,10 +290,16 @@ class AutoLaw(Law[Bank, AutoState]):
             return state, 0
         leader = state.leader
         at = state.at(leader)
-        innovations = state.members.now.innovations.newest[at : at + 1]
-        watch, alarms = JUMPS.add(state.watch, innovations)
+        now = state.members.now
+        innovations = now.innovations.newest[at : at + 1]
+        watch, alarms = JUMPS.add(state.watch, innovations, now.refused[at : at + 1])
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
-        onset = JUMPS.onset(before.watch, innovations) if alarm else 0
+        onset = 0
+        if alarm:
+            log = state.members.log[at, 1:]
+            readings = log[np.isfinite(log[:, 0]), 1 : 1 + len(state.noise)]
+            shown = np.asarray(np.isfinite(readings).any(axis=1))
+            onset = reaching(shown, JUMPS.onset(before.watch, innovations))
         stayed = work.candidates[before.leader].drift == 0.0
         # A member that drifts takes the lead from one that does not: the process has changed, and
         # those that sleep are to be compared again soon.

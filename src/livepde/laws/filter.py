@@ -127,15 +127,15 @@ class Filter:
         """Return the interval of one process as that of its one member."""
         return Span.of(self.problem.control.over(interval), self.problem.channels)
 
-    def noise_of(self, z: Span | Interval) -> Array:
-        """Return the standard deviation of each reading at the end, shape (members or 1, sensors).
+    def noise_of(self, x: FilterState, z: Span | Interval) -> Array:
+        """Return the standard deviation of each reading at the end, shape (members, sensors).
 
-        That of the reading where it has one, else that of the sensor.
+        That of the reading where it has one, else that of the sensor; at the level of each member.
         """
-        if z.noise is None:
-            return self.noise[None]
-        noise: Array = np.where(np.isnan(z.noise), self.noise, z.noise)
-        return np.atleast_2d(noise)
+        noise: Array = self.noise
+        if z.noise is not None:
+            noise = np.where(np.isnan(z.noise), noise, z.noise)
+        return np.asarray(np.sqrt(x.level)[:, None] * noise)
 
     def estimate(self, x: FilterState) -> Array:
         """Return the estimated latent parameters, not yet bounded, shape (members, m)."""

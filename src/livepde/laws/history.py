@@ -6,6 +6,7 @@ that of the sensor) and inputs. Rows of a member that did not take a sample have
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ __all__ = [
     "following",
     "intervals_since",
     "opened",
+    "reaching",
     "skipped",
     "span_between",
     "trimmed",
@@ -126,6 +128,18 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
         Interval(first.t, last.t, first.inputs, last.inputs, first.z, last.z, last.noise)
         for first, last in pairwise(_rows(log, channels))
     ]
+
+
+def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
+    """Return how many samples, from the last one back, hold so many with a reading; all if fewer.
+
+    Parameters
+    ----------
+    shown
+        Whether a sample has a reading, in time order; one does at least.
+    """
+    places = np.flatnonzero(shown)
+    return len(shown) - int(places[max(len(places) - readings, 0)])
 
 
 def following(log: Array, row: int) -> int:

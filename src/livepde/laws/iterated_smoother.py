@@ -288,8 +288,7 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
     """Return the squared misfit of the linearisation point at the end of an interval."""
     alone = changed(x, du=np.zeros_like(x.du), da=np.zeros_like(x.da))
     predicted, _ = filter_.sensors.observe(alone, filter_.span(interval).end)
-    noise = np.sqrt(x.level[0]) * filter_.noise_of(interval)[0]
-    e = np.abs((interval.z1 - predicted[0]) / noise)
+    e = np.abs((interval.z1 - predicted) / filter_.noise_of(x, interval))
     # Beyond `OUTLIER` the cost grows like a logarithm, so that no wrong reading chooses the
     # trajectory.
     beyond = 2.0 * OUTLIER**2 * np.log(np.maximum(e / OUTLIER, 1.0))

@@ -41,7 +41,7 @@ class Watch:
     resting: IntArray
     usual: Innovations
 
-    def add(self, e: Array, opening: Mask) -> Watch:
+    def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
 
         Parameters
@@ -49,6 +49,9 @@ class Watch:
         opening
             Members that still have to find the usual size, shape (members,): there any innovation
             counts, while those after an alarm, which learn anew, are left out.
+        refused
+            How many values in a row of each sensor a gate has refused, (members, sensors); None: it
+            refuses none. They may be wild, and do not count for the usual size before it is found.
         """
         seen = np.isfinite(e)
         square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)
@@ -56,8 +59,11 @@ class Watch:
         count = seen.sum(axis=1).astype(float)
         counts = np.concatenate([count[:, None], self.counts[:, :-1]], axis=1)
         most = LARGEST * np.sqrt(np.where(opening, np.inf, self.usual.ratio))[:, None]
-        counted = seen.any(axis=1) & (opening | (self.resting == 0))
         usual = self.usual
+        if refused is not None and np.count_nonzero(refused):
+            e = np.where(opening[:, None] & (refused > 0), np.nan, e)
+            seen = np.isfinite(e)
+        counted = seen.any(axis=1) & (opening | (self.resting == 0))
         if counted.any():
             new = usual.add(np.minimum(np.maximum(e, -most), most))
             usual = new if counted.all() else where(counted, new, usual)
@@ -130,15 +136,17 @@ class Jumps:
         usual = Innovations.start(sensors, members)
         return Watch(zero, zero, none, none + self.settle, usual)
 
-    def add(self, watch: Watch, e: Array) -> tuple[Watch, Mask]:
+    def add(self, watch: Watch, e: Array, refused: IntArray | None = None) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
         Parameters
         ----------
         e
             Normalised innovations, shape (members, sensors), NaN where missing.
+        refused
+            As for `Watch.add`.
         """
-        new = watch.add(e, watch.seen < self.settle)
+        new = watch.add(e, watch.seen < self.settle, refused)
         early = watch.resting > 0  # the first linearisations are poor: what they miss is no jump
         if early.any():
             kept = early[:, None]

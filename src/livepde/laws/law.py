@@ -13,7 +13,7 @@ import numpy as np
 from livepde.errors import LawError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array
+from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
@@ -30,6 +30,7 @@ __all__ = [
     "Status",
     "finite",
     "numerical",
+    "stepped",
 ]
 
 LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
@@ -461,3 +462,29 @@ class Law(ABC, Generic[Work, State]):
 
 
 AnyLaw = Law[Any, Any]
+
+
+@nonfinite_allowed()  # seen in the result
+def stepped(
+    law: Law[Work, State], work: Work, problem: Problem, before: State, interval: Interval
+) -> tuple[State, Report]:
+    """Return state and report after a sample; the state before it after a numerical failure.
+
+    A numerical failure is an operation that raises, or a belief of the law that is not finite, be
+    it only the squares of its numbers. A sample at the initial time is an interval without length.
+    """
+    try:
+        if interval.t1 > interval.t0:
+            state, report = law.step(work, before, interval)
+        else:
+            state, belief = law.begin(work, before, interval), law.belief(work, before)
+            report = Report(Status(), problem.predict(belief.u, belief.q, interval.end))
+        if not report.status.taken or law.finite(work, state):
+            return state, report
+        failure = Status("not_finite", "what the law believes after it is not finite")
+    except Exception as error:
+        found = numerical(error)
+        if found is None:
+            raise
+        failure = found
+    return before, Report(failure, np.full(problem.observed.size, np.nan))

@@ -22,7 +22,7 @@ from livepde.laws.gauss_newton import (
     placed,
 )
 from livepde.laws.guards import Guards
-from livepde.laws.history import intervals_since
+from livepde.laws.history import intervals_since, reaching
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
@@ -167,7 +167,7 @@ def _rescued(
 
     A restart does not use the last samples again: the older state is propagated without them.
     """
-    noise = np.sqrt(state.now.level)[:, None] * work.filter.noise_of(interval)
+    noise = work.filter.noise_of(state.now, interval)
     z = interval.z1[None]
     scale = state.scale.add(z, z - report.predicted)
 
@@ -176,7 +176,7 @@ def _rescued(
         return not report.status.ok or bool(beyond[0] > guards.runaway)
 
     if not astray(report):
-        return changed(new, scale=scale), report
+        return changed(new, scale=state.scale.kept(scale, new.now.refused)), report
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]
@@ -228,14 +228,14 @@ def _watched(
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, report
     e = new.now.innovations.newest
-    watch, alarms = jumps.add(state.watch, e)
+    watch, alarms = jumps.add(state.watch, e, new.now.refused)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
     if alarm:
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
         onset = max(jumps.onset(state.watch, e), int(new.now.refused.max()))
-        before = max(len(known) - onset, 0)
+        before = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
             x, found = _filtered(work, x, earlier)

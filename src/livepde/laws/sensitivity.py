@@ -49,7 +49,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.verdict import judge_of, judged
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
     BandedStage,
@@ -304,7 +304,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         x = changed(state.now, U=U)
         return changed(_started(work, state, x), initial=np.ones(1, dtype=bool))
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a sample is not used
+    @nonfinite_allowed()  # such a sample is not used
     def begin(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> SensitivityState:
@@ -369,7 +369,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         state, reports = self.step_members(work, state, work.filter.span(interval))
         return state, reports.member(0)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
+    @nonfinite_allowed()  # reported as a status
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
@@ -425,15 +425,16 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if np.count_nonzero(far):
                 near = ~far.any(axis=1)
                 usual = usual & (near if replays is None else replays | near)
-            parts["scale"] = scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            scale = state.scale.add(span.z1, span.z1 - told.predicted)
+            parts["scale"] = state.scale.kept(scale, x.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:
-                noise = np.sqrt(before.level)[:, None] * filter_.noise_of(span)
+                noise = filter_.noise_of(before, span)
                 beyond = scale.beyond(span.z1 - told.predicted, noise)
                 usual = usual & ~(beyond > guards.runaway)
         if (jumps := self.jumps) is not None and (present := span.present).any():
-            seen, alarm = jumps.add(state.watch, x.innovations.newest)
+            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.refused)
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)

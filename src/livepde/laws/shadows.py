@@ -29,7 +29,7 @@ from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, put, take, where
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
@@ -128,7 +128,7 @@ class ShadowedSteps(NamedTuple):
     jumps: Mask
 
 
-class Found(NamedTuple):
+class ErrorIncrement(NamedTuple):
     """Discretisation error of a block of steps.
 
     Attributes
@@ -196,7 +196,9 @@ class MeanProcess:
         columns, _, failure = advance(self.control, stage, u[None], span.start, span.t1)
         if failure is not None:
             return u, kept, ~no
-        return columns[0], now, ~np.isfinite(columns[0]).all(axis=1)
+        # Warm-start data of a state that is not finite would spoil all later ones.
+        good: Mask = np.isfinite(columns[0]).all(axis=1)
+        return columns[0], where(good, now, kept), ~good
 
 
 class Shadow(ABC):
@@ -217,11 +219,15 @@ class Shadow(ABC):
         """
 
     @abstractmethod
-    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
         """Return the discretisation error of a block of steps."""
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return fields of the state after one more interval was read, before any estimate."""
+        return {}
+
+    def anew(self, s: ShadowState, which: Mask) -> dict[str, Any]:
+        """Return fields of the state in which members have no error beside `ShadowState.u`."""
         return {}
 
     def in_readings(self, s: ShadowState) -> Array | None:
@@ -268,7 +274,7 @@ class StepShadow(Shadow):
     ) -> ShadowState:
         return changed(s, halves=self.halves.stage.kept(1))
 
-    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
         u, kept, failed = self.halves.propagate(block.x, block.x.u, s.halves, block.step)
         error = self.factor * (block.end.u - u)
         size = np.sqrt((error * error).sum(axis=1))
@@ -277,7 +283,7 @@ class StepShadow(Shadow):
         weight = 1.0 + (0.5 * (block.waited + block.next) - 1.0) * alike
         # The error of a step with a jump is exceptional and no measure for the next ones.
         parts = {"halves": kept, "size": np.where(block.jumps | failed, s.size, size)}
-        return Found(failed, parts, u=weight[:, None] * error)
+        return ErrorIncrement(failed, parts, u=weight[:, None] * error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +348,7 @@ class InputShadow(Shadow):
         length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
         return {"slope": slope, "length": length, "bend": bend, "missed": missed}
 
-    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
         ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
         # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
         # this off again when they have been read.
@@ -350,7 +356,7 @@ class InputShadow(Shadow):
         missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
         left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
-            return Found(np.zeros(len(missed), dtype=bool), left)
+            return ErrorIncrement(np.zeros(len(missed), dtype=bool), left)
         # Only their sum counts, wherever in the block the inputs were missed.
         span = block.step
         # The response is linear in the input for small errors: one interval takes the sum of all.
@@ -358,7 +364,7 @@ class InputShadow(Shadow):
         first, last = span.inputs0 + off, span.inputs1 + off
         moved = replace(span, inputs0=first, inputs1=last, interval=None)
         u, _, failed = self.process.propagate(block.x, block.x.u, block.x.kept, moved)
-        return Found(failed, left, u=u - block.end.u)
+        return ErrorIncrement(failed, left, u=u - block.end.u)
 
 
 class HeldInputShadow(InputShadow):
@@ -434,7 +440,7 @@ class MeshShadow(Shadow):
         gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
         return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
 
-    def error(self, s: ShadowState, block: ShadowedSteps) -> Found:
+    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
         x, end, mesh, span = block.x, block.end, self.mesh, block.span
         coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
         # A long step for the whole block has a time error of its own, which cancels only in the
@@ -452,7 +458,11 @@ class MeshShadow(Shadow):
         # that is the effect of a difference which has grown linearly.
         a = MESH * (slope[:, None] @ s.gains)[:, 0]
         parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
-        return Found(failed, parts | {"gains": np.zeros_like(s.gains)}, a=a)
+        return ErrorIncrement(failed, parts | {"gains": np.zeros_like(s.gains)}, a=a)
+
+    def anew(self, s: ShadowState, which: Mask) -> dict[str, Any]:
+        rows = which[:, None]
+        return {"fine": np.where(rows, 0.0, s.fine), "seen": np.where(rows, 0.0, s.seen)}
 
     def in_readings(self, s: ShadowState) -> Array | None:
         return -MESH * s.seen
@@ -596,15 +606,26 @@ class ShadowSet:
         parts |= {"begun": begun, "last": s.count, "due": s.count + wait, "failed": failed}
         return changed(s, u=u, a=a, **parts)
 
-    def in_readings(self, x: FilterState, at: Moments) -> Array:
-        """Return by how much predictions are off, (members, shadows, sensors)."""
+    def in_readings(self, x: FilterState, at: Moments) -> tuple[FilterState, Array]:
+        """Return by how much predictions are off, (members, shadows, sensors), and the filter.
+
+        A shadow that is not finite there counts as failed, and begins anew from no error.
+        """
         s = x.shadows
         seen = self.rows(x, s.u, s.a, at)
         for row, shadow in enumerate(self.shadows):
             more = shadow.in_readings(s)
             if more is not None:
                 seen[:, row] += more
-        return seen
+        if np.vdot(seen, seen) < np.inf:
+            return x, seen
+        wrong: Mask = ~np.asarray(np.isfinite(seen).all(axis=2))
+        rows = wrong[:, :, None]
+        parts = {"u": np.where(rows, 0.0, s.u), "a": np.where(rows, 0.0, s.a)}
+        parts["failed"] = s.failed + wrong.sum(axis=1)
+        for row, shadow in enumerate(self.shadows):
+            parts |= shadow.anew(s, wrong[:, row])
+        return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(
         self, x: FilterState, new: FilterState, left: Array, weights: Array, off: Array, t: float

@@ -34,7 +34,7 @@ from livepde.laws.iterated_smoother import expecting, missed, moved
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array
+from livepde.linalg import Array, nonfinite_allowed
 from livepde.stepping import KeptFactors
 
 __all__ = ["evidence", "smoothed"]
@@ -80,7 +80,7 @@ def smoothed(
         level and the statistics of its innovations are those of all samples.
     """
     work, before = work.unaccompanied, before.unaccompanied
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # not finite: not used
+    with nonfinite_allowed():  # not finite: not used
         best = _descended(_FixedInterval(work, before, after, data))
     return _backward(best, after)
 
@@ -93,7 +93,7 @@ def evidence(
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
     work, before = work.unaccompanied, before.unaccompanied
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+    with nonfinite_allowed():
         samples = _FixedInterval(work, before, after, data)
         samples.work = replace(work, options=replace(work.options, adaptive=True))
         found = samples.about(samples.estimated)

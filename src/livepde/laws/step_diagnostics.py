@@ -139,7 +139,8 @@ def stacked(members: Sequence[Diagnostics[float]]) -> Diagnostics[Array]:
 
     def columns(tables: Sequence[Mapping[Any, float]]) -> dict[Any, Any]:
         names = dict.fromkeys(name for table in tables for name in table)
-        return {name: column([table.get(name, math.nan) for table in tables]) for name in names}
+        found = {name: column([table.get(name, math.nan) for table in tables]) for name in names}
+        return {name: numbers for name, numbers in found.items() if known(numbers)}
 
     shifts = [one.shifts for one in members]
     return Diagnostics(

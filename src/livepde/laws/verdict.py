@@ -14,7 +14,7 @@ from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
-from livepde.linalg import Array
+from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
 
 __all__ = ["judge_of", "judged"]
@@ -71,7 +71,7 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
     def found() -> Verdict:
         one = take(x, member)
         w, settled = judge.summed_up(one.ledger, one.causes)
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        with nonfinite_allowed():
             at = _position(filter_, replace(one, causes=w, ledger=settled))
             return assess(judge.dictionary, at)
 

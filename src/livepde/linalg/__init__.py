@@ -11,6 +11,7 @@ from livepde.linalg.krylov import conjugate_gradients, gmres
 from livepde.linalg.leading import Leading
 from livepde.linalg.memo import Memo
 from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
+from livepde.linalg.nonfinite import nonfinite_allowed
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, compact, sandwich
 from livepde.linalg.protocol import Factor, Solver
@@ -42,6 +43,7 @@ __all__ = [
     "compact",
     "conjugate_gradients",
     "gmres",
+    "nonfinite_allowed",
     "positive_definite",
     "sandwich",
 ]

@@ -69,21 +69,6 @@ class Interval:
         """Copy of the interval without a measurement at the end."""
         return replace(self, z1=np.full_like(self.z1, np.nan))
 
-    def divided(self, count: int) -> list[Interval]:
-        """Return equal subintervals, in time order."""
-        if count == 1:
-            return [self]
-        share = [k / count for k in range(count + 1)]
-        # The ends are the given values, not interpolated ones, so that dividing an interval does
-        # not change a digit there.
-        times = [self.t0, *(self.t0 + s * (self.t1 - self.t0) for s in share[1:-1]), self.t1]
-        inputs = [self.inputs0, *(self.at(t).inputs for t in times[1:-1]), self.inputs1]
-        z = [self.z0, *(self.z(t) for t in times[1:-1]), self.z1]
-        return [
-            Interval(times[k], times[k + 1], inputs[k], inputs[k + 1], z[k], z[k + 1])
-            for k in range(count)
-        ]
-
     @cached_property
     def present(self) -> Array:
         """Mask of the sensors with a value at the end, shape (sensors,)."""
