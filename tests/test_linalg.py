@@ -27,6 +27,7 @@ from livepde.linalg import (
     gmres,
     positive_definite,
     sandwich,
+    silenced,
 )
 
 NUMBERS = st.floats(-10, 10, allow_nan=False, width=32)
@@ -156,6 +157,17 @@ ENGINES = [
     for name in BUILD
 ]
 DEFINITE = ("symmetric", "cholmod", "pardiso symmetric", "multigrid")
+
+
+def test_silenced_functions_leave_the_error_state_as_it_was():
+    @silenced
+    def divided(x, depth):
+        return x / 0.0 if depth == 0 else divided(x, depth - 1)
+
+    with np.errstate(all="raise"):
+        before = np.geterr()
+        assert divided(np.ones(1), 2) == np.inf
+        assert np.geterr() == before
 
 
 def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():

@@ -29,7 +29,7 @@ from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
 from livepde.laws import AnyLaw, Belief, InitialReading, Law, Problem, Report, Status, numerical
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array
+from livepde.linalg import Array, silenced
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
@@ -283,9 +283,7 @@ class Identifier:
                 gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
-        # Not as a decorator: with NumPy 1 one object would keep the old state of all threads.
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # seen in the result
-            self._state, report = self._stepped(interval)
+        self._state, report = self._stepped(interval)
         self._samples += 1
         if report.status.taken:
             if names:
@@ -324,6 +322,7 @@ class Identifier:
             )
         self._state, self._inputs = state, inputs
 
+    @silenced  # seen in the result
     def _stepped(self, interval: Interval) -> tuple[Any, Report]:
         """Return state and report after a sample; the state before it after a numerical failure.
 

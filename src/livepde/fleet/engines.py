@@ -15,7 +15,7 @@ from livepde.fem import Moment
 from livepde.laws import AnyLaw, Belief, InitialReading, MemberReports, Problem, Status
 from livepde.laws.member_arrays import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, silenced
 from livepde.stepping import Span
 
 __all__ = ["Beliefs", "BlockEngine", "Factors", "FleetEngine", "SeparateEngine", "State"]
@@ -211,7 +211,7 @@ class BlockEngine(FleetEngine):
         belief: Belief = self.law.member_belief(self.work, state.now, k)
         return belief
 
-    @np.errstate(over="ignore", invalid="ignore")  # of members whose step has failed
+    @silenced  # of members whose step has failed
     def beliefs(self, state: SensitivityState) -> Beliefs:
         now, reduction = state.now, self.work.filter.reduction
         latent = self.work.filter.problem.model.latent

@@ -49,7 +49,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.verdict import judge_of, judged
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, Mask, silenced
 from livepde.stepping import (
     Alexander2,
     BandedStage,
@@ -305,7 +305,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         x = changed(state.now, U=U)
         return changed(_started(work, state, x), initial=np.ones(1, dtype=bool))
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # such a sample is not used
+    @silenced  # such a sample is not used
     def begin(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
     ) -> SensitivityState:
@@ -370,7 +370,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         state, reports = self.step_members(work, state, work.filter.span(interval))
         return state, reports.member(0)
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
+    @silenced  # reported as a status
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:

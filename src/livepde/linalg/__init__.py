@@ -14,6 +14,7 @@ from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, compact, sandwich
 from livepde.linalg.protocol import Factor, Solver
+from livepde.linalg.silenced import silenced
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Mask, Sparse
 
@@ -44,4 +45,5 @@ __all__ = [
     "gmres",
     "positive_definite",
     "sandwich",
+    "silenced",
 ]

@@ -8,10 +8,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
-import numpy as np
-
 from livepde.errors import LinearAlgebraError
-from livepde.linalg import Array, Factor
+from livepde.linalg import Array, Factor, silenced
 
 __all__ = ["TINY", "Near", "Newton", "Solution", "StageEquation", "StagePoint", "StepFailed"]
 
@@ -148,7 +146,7 @@ class Newton:
     iterations: int = 60
     refresh: float = 0.2
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # reported as a status
+    @silenced  # reported as a status
     def solve(
         self,
         equation: StageEquation[Point],

@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, Mask, silenced
 from livepde.stepping import Moments
 from livepde.verdict.directions import JUMP, Dictionary
 from livepde.verdict.evidence import causes_of, quiet
@@ -184,7 +184,7 @@ class Judge:
         after = changed(ledger, seen=ledger.seen + 1, waiting=ledger.waiting + 1, rows=rows)
         return one if members == 1 else np.repeat(one, members, axis=0), after
 
-    @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # counted as nothing
+    @silenced  # counted as nothing
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
