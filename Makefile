@@ -36,7 +36,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-fast test-system test-long test-all coverage mpi lowest versions package check format docs bench experiment lock clean
+.PHONY: help demo test test-fast test-system test-long test-threads test-all coverage mpi lowest versions package check format docs bench experiment lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
@@ -57,6 +57,9 @@ test-system: $(READY)  ## Run those with programs of their own, brokers, browser
 
 test-long: $(READY)  ## Run those that take longer, which CI runs, too
 	@$(BIN)/$(PYTEST) $(LONG)
+
+test-threads: $(READY)  ## Run those of threads with 100 trials of each law
+	@LIVEPDE_THREAD_TRIALS=100 $(BIN)/$(PYTEST) tests/test_threads.py
 
 test-all: $(READY)  ## Run all: brokers, browsers, processes, studies and pages, too
 	@$(BIN)/$(PYTEST)

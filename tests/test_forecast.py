@@ -17,7 +17,8 @@ HIDDEN = lp.Points({"c": 0.8})
 LAWS = {
     "gradient": lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(c1=1.0)),
     "sensitivity": lp.SensitivityLaw(drift=0.01, jumps=lp.Jumps()),
-    "replay": lp.SensitivityLaw(replay=lp.Replay(first=2)),
+    # At once: a replay under way would go on with samples in which nothing is measured.
+    "replay": lp.SensitivityLaw(replay=lp.Replay(first=2, slice=100)),
     "auto": lp.AutoLaw(),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -534,15 +535,12 @@ class FieldBlock(Block):
     def _cells(self, points: Array) -> IntArray:
         """Return the cell of each point, shape (k,); raise ValueError for a point outside."""
         mesh, whole = self.field.mesh, Measure(self.field.mesh, 1)
+        if not whole.kept:  # scikit-fem keeps its search tree on the mesh, for good
+            mesh = copy(mesh)
         finder = mesh.element_finder(mapping=whole.mapping)
         width = max(1, SEARCHED // mesh.nelements)  # points that may be sought in all cells
         starts = range(0, points.shape[1], width)
-        try:
-            parts = [finder(*points[:, k : k + width]) for k in starts]
-        finally:
-            # scikit-fem stores its search tree on the mesh for good: of a large mesh it is dropped.
-            if not whole.kept:
-                vars(mesh).pop("_cached_tree", None)
+        parts = [finder(*points[:, k : k + width]) for k in starts]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64)
 
     def probe(self, points: Array, what: str = "point") -> sp.csr_array:

@@ -65,7 +65,12 @@ def join(*states: State) -> State:
 
 
 def put(state: State, which: Any, part: State) -> State:
-    """Return a state with some members exchanged, by an index array or a number."""
+    """Return a state with some members exchanged, by an index array or a number.
+
+    The only member is the other state itself: no step writes into the arrays of a state.
+    """
+    if isinstance(which, int) and _members(state) == 1:
+        return part
     index = [which] if isinstance(which, int) else which
 
     def exchanged(array: Array, new: Array) -> Array:

@@ -20,8 +20,6 @@ from livepde.linalg import Array
 
 __all__ = ["finish_replays", "replay_slice"]
 
-AT_ONCE = 32  # samples: a replay of so few is not divided
-
 
 def replay_slice(
     work: SensitivityWork, state: SensitivityState
@@ -59,9 +57,7 @@ def _advanced(
     part = take(state, which) if len(which) < len(state) else state
     ended, taken = np.zeros(len(which), dtype=bool), 0
     failures = ended.copy()
-    while (active := part.replay.active).any():
-        if taken >= most and (part.replay.count[active] > AT_ONCE).all():
-            break
+    while taken < most and part.replay.active.any():
         part, failed = _one_sample(work, part)
         for k in np.flatnonzero(part.replay.active).tolist():
             part, ended[k] = _turned(work, part, k, k in failed)
