@@ -1,9 +1,10 @@
 """The journal of a run: samples, estimates and checkpoints in one file that survives a kill.
 
-The file is an SQLite database in write-ahead mode. A sample is committed before the identifier
-sees it, an estimate with the next commit; a checkpoint of the identifier from time to time. After a
-crash at any moment the last checkpoint and the samples after it give the same numbers as if nothing
-had happened. One process writes; any number of processes may read at the same time.
+The file is an SQLite database in write-ahead mode. Samples, each with the position of its source,
+and estimates are committed in the groups that the run decides on (`Live`), a checkpoint of the
+identifier from time to time. After a crash at any moment the last checkpoint, the samples after it
+and the rows from the last position on give the same numbers as if nothing had happened. One process
+writes; any number of processes may read at the same time.
 
 The journal is append-only: samples and estimates are never changed; only `thin` and withdrawals
 remove them. Freed pages are reused, so that a journal that is thinned stops growing.
@@ -281,7 +282,7 @@ class Journal:
     # --- writing -------------------------------------------------------------------------------
 
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
-        """Insert a sample and commit: it survives a kill of the process once this returns.
+        """Insert a sample, which survives a kill of the process from the next commit on.
 
         Parameters
         ----------
@@ -296,7 +297,6 @@ class Journal:
             names += self.noise
         row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
-        self._write(self._db.commit)
         return Taken(self._current, t, self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
@@ -391,7 +391,7 @@ class Journal:
         self._write(self._db.commit)
 
     def commit(self, position: str | None = None) -> None:
-        """Commit, so that readers see all records since the last accepted sample.
+        """Commit: readers see all records until now, and they survive a kill of the process.
 
         Parameters
         ----------

@@ -26,6 +26,8 @@ from livepde.verdict import LEVELS
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
+GROUP = 64  # most samples of one commit
+AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two evaluations of the verdict; a change is an event
 LOOK = 0.5  # seconds between two checks whether to stop
@@ -119,6 +121,13 @@ def _since(samples: Iterable[Ready]) -> float | None:
 class Live:
     """A live run, which continues until its source ends or it is stopped.
 
+    Samples that are at hand together are committed in groups. Nothing outside of the process is
+    told of a sample or its estimate before they are committed: sources are acknowledged, and sinks
+    get estimates, after the commit of their group. A group ends before the run waits for its
+    source, and before a step if it has 64 samples or the last commit is 0.25 s ago. The first 64
+    samples of a session are committed one by one, each before its step: a sample in whose step the
+    last session has ended is among them.
+
     Parameters
     ----------
     identifier
@@ -139,8 +148,7 @@ class Live:
     begun, irregular
         Samples that the feed has delivered already, and remarks on irregular rows until then.
     waits
-        Whether the feed may wait for samples: estimates are then committed before waiting, for
-        readers of the journal; else with the next sample, in one transaction.
+        Whether the feed may wait for samples: all that was taken is then committed before.
     patient
         Whether to wait for a journal that cannot be written (a full disk), with the run not well
         meanwhile; else the journal's `RunError` ends the run.
@@ -197,6 +205,10 @@ class Live:
         self._refusal = self._failure = ""
         self._unwell, self._told, self._doubt = "", (-1, "well"), ""
         self._unwritten = ""  # why the journal cannot be written
+        self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
+        self._untold: deque[Estimate] = deque()  # for the sinks, once they are committed
+        self._committed = self._heard
+        self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
         self._put_last = -math.inf  # time of the last estimate that sinks were given
         self.ailments: list[Callable[[], str]] = [
             lambda: self._unwritten,
@@ -240,6 +252,10 @@ class Live:
         patient.
         """
         begun, again = self._clock(), None
+        # The journal has rolled back what was not committed: it is taken once more.
+        self._waiting.extendleft(reversed(self._group))
+        self._group.clear()
+        self._untold.clear()
         while again is None:
             if not (self.patient and self.journal.remedy):
                 raise error
@@ -333,6 +349,7 @@ class Live:
         self._conclude()
 
     def _conclude(self) -> None:
+        self._commit()
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
         notes: list[str] = []
@@ -386,7 +403,25 @@ class Live:
         # let the same rows be read and counted again.
         remarks = self.feed.remarks(self._waiting)
         self._count(remarks)
-        self.journal.commit(self.feed.position(self._waiting) if remarks else None)
+        self._commit(self.feed.position(self._waiting) if remarks else None)
+
+    def _commit(self, position: str | None = None) -> None:
+        """Commit, then acknowledge the samples of the group and hand their estimates to sinks."""
+        self.journal.commit(position)
+        self._committed = self._clock()
+        while self._group:
+            self.feed.acknowledge(self._group.popleft())
+        while self._untold:
+            self._put(self._untold.popleft())
+
+    def _is_due(self, taken: Taken) -> bool:
+        """Return whether a sample must be committed before its step; see the class."""
+        return (
+            taken.id <= self._one_by_one
+            or (self.waits and not self._waiting)
+            or len(self._group) >= GROUP
+            or self._clock() - self._committed >= AGE
+        )
 
     def _relieve(self) -> None:
         relieved = self.backlog.relieved(self._waiting)
@@ -505,6 +540,7 @@ class Live:
         ready = self._waiting.popleft()
         try:
             if ready.since is not None:
+                self._commit()
                 self._go_back(ready.since)
             # Counts, position and sample are one transaction, so that a crash keeps all or none.
             position = self.feed.position(self._waiting)
@@ -513,7 +549,9 @@ class Live:
         except RunError:
             self._waiting.appendleft(ready)
             raise
-        self.feed.acknowledge(ready)
+        self._group.append(ready)
+        if self._is_due(taken):
+            self._commit()
         self._step(taken)
 
     def _go_back(self, t: float) -> None:
@@ -574,8 +612,8 @@ class Live:
 
     def _hand_on(self, estimate: Estimate, again: bool) -> None:
         """Hand an estimate to the sinks; judge it and keep a checkpoint at intervals."""
-        if not again:
-            self._put(estimate)
+        if self.sinks and not again:
+            self._untold.append(estimate)
         if estimate.status.taken:
             self._taken, self._refused = self._clock(), 0
         self._failed = 0 if estimate.status.ok else self._failed + 1
