@@ -255,7 +255,6 @@ class Live:
         # The journal has rolled back what was not committed: it is taken once more.
         self._waiting.extendleft(reversed(self._group))
         self._group.clear()
-        self._untold.clear()
         while again is None:
             if not (self.patient and self.journal.remedy):
                 raise error
@@ -278,6 +277,8 @@ class Live:
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
+        # What was committed is still to be told; the other samples are taken once more.
+        self._untold = deque(one for one in self._untold if one.t <= self.identifier.t)
         # The source was not polled meanwhile, so that time is no silence of it.
         self._heard = self._taken = now = self._clock()
         self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
@@ -377,8 +378,9 @@ class Live:
                 self._mend(error)
                 # Steps that are taken again reach no sink, but the last estimate is news to them.
                 last = self.result.last
-                if last is not None and last.t > self._put_last:
-                    self._put(last)
+                known = self._untold[-1].t if self._untold else self._put_last
+                if last is not None and last.t > known:
+                    self._untold.append(last)
 
     def _go_on(self) -> None:
         """Take samples until the source ends or `stopping` is set."""
