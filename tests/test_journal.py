@@ -258,6 +258,54 @@ def test_no_step_begins_before_what_is_old_is_committed(tmp_path):
     assert [number for _, number in watched.acknowledged] == [*range(1, 31)]
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("no SVD"), TypeError("a defect")])
+def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
+    tmp_path, monkeypatch, error
+):
+    """As one by one: a failure of the numerics sets the sample aside, others go on."""
+    monkeypatch.setattr("livepde.runs.live_loop.AGE", np.inf)
+    found = []
+    for name, source in (("one", Rows), ("group", AtHand)):
+        folder = tmp_path / name
+        folder.mkdir()
+        told = []
+
+        class Sink:
+            def put(self, estimate, told=told):
+                told.append(estimate.t)
+
+            def close(self):
+                pass
+
+        run = live(folder, source(rows(40)), sinks=[Sink()])
+        step = run.identifier.step
+
+        def unreadable(t, z, inputs=None, step=step):
+            estimate = step(t, z, inputs)
+            if 1.95 < t < 2.05:
+
+                def read():
+                    raise error
+
+                estimate.__dict__.update(_read=read)
+                estimate.__dict__.pop("belief", None)
+            return estimate
+
+        run.identifier.step = unreadable
+        run.run()
+        times = [record.t for record in run.journal]
+        assert len(times) == 39
+        assert told == times
+        events = [(event.kind, event.message) for event in run.journal.events]
+        found.append((list(run.journal), run.journal.counts, events))
+        run.journal.close()
+    (one, counts, events), (group, *rest) = found
+    assert rest == [counts, events]
+    assert counts == {("aside", ""): 1}
+    assert all(np.array_equal(a.numbers, b.numbers) for a, b in zip(one, group, strict=True))
+
+
 # --- a journal that cannot be written ------------------------------------------------------------
 
 

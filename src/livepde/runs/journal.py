@@ -351,15 +351,16 @@ class Journal:
         self._write(self._db.commit)
         return int(self._one("SELECT number FROM tries WHERE id = ?", self._current))
 
-    def append(self, record: Record, /) -> None:
-        """Keep the estimate of the last sample that `accept` or `samples` has returned.
+    def append(self, record: Record, /, number: int | None = None) -> None:
+        """Keep the estimate of a sample; default the last that `accept` or `samples` has returned.
 
         An estimate that was kept before a crash is left unchanged.
         """
+        number = self._current if number is None else number
         found = (record.numbers, record.innovation, record.withheld_error)
         self._insert(
             "estimates",
-            self._current,
+            number,
             float(record.t),
             record.status,
             record.steps,
@@ -368,8 +369,8 @@ class Journal:
             conflict="ON CONFLICT (id) DO NOTHING",
         )
         if record.snapshot is not None:
-            self.keep(record.snapshot, self._current)
-        self._last = self._current
+            self.keep(record.snapshot, number)
+        self._last = number
 
     def keep(self, snapshot: Snapshot, number: int | None = None) -> None:
         """Keep the fields of a sample; those of the last one (None) until `rewind` deletes them."""
@@ -402,6 +403,11 @@ class Journal:
             # With the number of the sample, since the position of any later sample supersedes it.
             self._say("position", json.dumps([self.accepted, position]))
         self._write(self._db.commit)
+
+    def rollback(self) -> None:
+        """Forget all records since the last commit."""
+        self._write(self._db.rollback)
+        self._stand()
 
     def _say(self, key: str, value: str) -> None:
         """Set a value of the header."""

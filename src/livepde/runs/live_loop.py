@@ -126,7 +126,9 @@ class Live:
     get estimates, after the commit of their group. A group ends before the run waits for its
     source, and before a step if it has 64 samples or the last commit is 0.25 s ago. The first 64
     samples of a session are committed one by one, each before its step: a sample in whose step the
-    last session has ended is among them.
+    last session has ended is among them. Belief and diagnostics of a group's estimates are computed
+    together at its end, where each finds code and data of the one before in the caches of the
+    processor; if one of them cannot be computed, the samples are taken again one by one.
 
     Parameters
     ----------
@@ -206,6 +208,8 @@ class Live:
         self._unwell, self._told, self._doubt = "", (-1, "well"), ""
         self._unwritten = ""  # why the journal cannot be written
         self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
+        # Of the group, to be stored at its end: number of the sample, and whether with its fields.
+        self._unread: deque[tuple[int, Estimate, bool]] = deque()
         self._untold: deque[Estimate] = deque()  # for the sinks, once they are committed
         self._committed = self._heard
         self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
@@ -252,9 +256,7 @@ class Live:
         patient.
         """
         begun, again = self._clock(), None
-        # The journal has rolled back what was not committed: it is taken once more.
-        self._waiting.extendleft(reversed(self._group))
-        self._group.clear()
+        self._put_back()  # the journal has rolled back what was not committed
         while again is None:
             if not (self.patient and self.journal.remedy):
                 raise error
@@ -270,18 +272,36 @@ class Live:
                 self.journal.reopen()
                 # A write comes first: if it fails, no steps are taken again in vain.
                 self.journal.say_health(why)
-                # The tries of samples are not counted: the disk has failed, not their steps.
-                again = self._again(math.inf)
-                self.journal.commit()
-                self._restore()
+                again = self._recover()
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
-        # What was committed is still to be told; the other samples are taken once more.
-        self._untold = deque(one for one in self._untold if one.t <= self.identifier.t)
         # The source was not polled meanwhile, so that time is no silence of it.
         self._heard = self._taken = now = self._clock()
         self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
+        return again
+
+    def _one_at_a_time(self) -> None:
+        """Go back to the last commit, and take the samples of the group again one by one."""
+        self._put_back()
+        self.journal.rollback()
+        self._one_by_one = self.journal.accepted + GROUP
+        self._recover()
+
+    def _put_back(self) -> None:
+        """Put the samples that are not committed back among those to be taken."""
+        self._waiting.extendleft(reversed(self._group))
+        self._group.clear()
+        self._unread.clear()
+
+    def _recover(self) -> int:
+        """Go on from the last commit; return the number of samples taken again."""
+        # The tries of samples are not counted: it was not the process that has ended.
+        again = self._again(math.inf)
+        self.journal.commit()
+        self._restore()
+        # What was committed is still to be told; the other samples are taken once more.
+        self._untold = deque(one for one in self._untold if one.t <= self.identifier.t)
         return again
 
     def _restore(self) -> None:
@@ -381,6 +401,11 @@ class Live:
                 known = self._untold[-1].t if self._untold else self._put_last
                 if last is not None and last.t > known:
                     self._untold.append(last)
+            except Exception:
+                if not self._unread:
+                    raise
+                # Of a step, or of an estimate before it; one by one it belongs to its own sample.
+                self._one_at_a_time()
 
     def _go_on(self) -> None:
         """Take samples until the source ends or `stopping` is set."""
@@ -409,12 +434,24 @@ class Live:
 
     def _commit(self, position: str | None = None) -> None:
         """Commit, then acknowledge the samples of the group and hand their estimates to sinks."""
+        self._record()
         self.journal.commit(position)
         self._committed = self._clock()
         while self._group:
             self.feed.acknowledge(self._group.popleft())
         while self._untold:
             self._put(self._untold.popleft())
+
+    def _record(self) -> None:
+        """Store the estimates of the group."""
+        before, self.busy = self.busy, True
+        try:
+            while self._unread:
+                number, estimate, keeps = self._unread[0]
+                self.journal.append(self.result.record(estimate, keeps), number)
+                self._unread.popleft()
+        finally:
+            self.busy = before
 
     def _is_due(self, taken: Taken) -> bool:
         """Return whether a sample must be committed before its step; see the class."""
@@ -576,7 +613,10 @@ class Live:
         try:
             estimate = self.identifier.step(taken.t, taken.values)
             self._seconds += time.monotonic() - begun
-            self.result.add(estimate)
+            if self._group:
+                self._unread.append((taken.id, estimate, self.result.announce(estimate)))
+            else:
+                self.result.add(estimate)
         except DataError as error:
             if not self.strict:
                 self._tell("refused", str(error))
@@ -600,6 +640,7 @@ class Live:
 
     def _withdraw(self) -> None:
         """Withdraw the last sample; waiting samples are later, and taken in their turn."""
+        self._record()
         self.journal.withdraw()
         self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
 
@@ -627,6 +668,7 @@ class Live:
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
         if self._steps % CHECKPOINT == 0:
+            self._record()
             self.journal.checkpoint(self.identifier.dump())
             if math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
