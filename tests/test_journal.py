@@ -34,15 +34,17 @@ from livepde.runs.journal import KEPT_EVENTS, Event, Journal
 from livepde.runs.live_loop import Live, Retention
 from livepde.runs.salvage import Salvage
 from livepde.streams.intake import Intake
-from livepde.streams.sources import Follow, Rows, json_row
+from livepde.streams.sources import Follow, Row, Rows, json_row
 
 NAME = "journal.sqlite"
 CHECKPOINT = 40  # samples between two checkpoints here: a run has several in less time
+GROUP = 8  # samples of one commit here
 
 
 @pytest.fixture(autouse=True)
 def often(monkeypatch):
     monkeypatch.setattr("livepde.runs.live_loop.CHECKPOINT", CHECKPOINT)
+    monkeypatch.setattr("livepde.runs.live_loop.GROUP", GROUP)
 
 
 def samples(count: int, after: float = -np.inf) -> SampleFeed:
@@ -53,6 +55,21 @@ def started(folder: Path, count: int, **options) -> Live:
     path = folder / NAME
     kept = Journal.open(path, write=True) if path.exists() else journal(path)
     return Live(identifier(), samples(count, kept.last), kept, fields_every=10, **options)
+
+
+class AtHand(Rows):
+    """Rows that are all there at once."""
+
+    def __init__(self, rows) -> None:
+        self._found = [Row(values) for values in rows]
+
+    @property
+    def done(self) -> bool:
+        return not self._found
+
+    def poll(self, wait: float) -> list[Row]:
+        found, self._found = self._found, []
+        return found
 
 
 @cache
@@ -109,14 +126,17 @@ class Breaks:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["accept", "append", "checkpoint", "step"])
-def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(tmp_path, monkeypatch, method):
+@pytest.mark.parametrize("waits", [True, False])
+@pytest.mark.parametrize("method", ["accept", "append", "commit", "checkpoint", "step"])
+def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
+    tmp_path, monkeypatch, method, waits
+):
     count = CHECKPOINT + 40
     whole, broken = folders(tmp_path)
     finished(whole, count)
-    run = started(broken, count)
+    run = started(broken, count, waits=waits)
     owner, calls = (run.identifier if method == "step" else run.journal), []
-    limit = 1 if method == "checkpoint" else CHECKPOINT + 5
+    limit = {"checkpoint": 1, "commit": GROUP + 2}.get(method, CHECKPOINT + 5)
     real = getattr(owner, method)
 
     def breaks(*arguments):
@@ -189,6 +209,101 @@ def test_an_event_of_a_refused_sample_comes_with_its_withdrawal(tmp_path):
     run.run()
     assert [event.kind for event in run.journal.events if event.kind == "refused"] == ["refused"]
     assert run.journal.accepted == 2
+
+
+# --- groups of samples ----------------------------------------------------------------------------
+
+
+class Watched(AtHand):
+    """A source and a sink that look at what a reader of the journal finds when they are told."""
+
+    def __init__(self, path: Path, rows) -> None:
+        super().__init__(rows)
+        self._found = [Row(row.values, row.values["t"]) for row in self._found]
+        self.path, self.acknowledged, self.told = path, [], []
+
+    def acknowledge(self, tokens) -> None:
+        with Journal.open(self.path) as kept:
+            self.acknowledged += [(t, kept.accepted) for t in tokens]
+
+    def put(self, estimate) -> None:
+        with Journal.open(self.path) as kept:
+            self.told.append((estimate.t, kept.estimated))
+
+
+@pytest.mark.slow
+def test_nobody_is_told_of_what_is_not_committed(tmp_path, monkeypatch):
+    """Sources and sinks are told after the commit, of a whole group where samples are at hand."""
+    monkeypatch.setattr("livepde.runs.live_loop.AGE", np.inf)
+    watched = Watched(tmp_path / NAME, rows(40))
+    run = live(tmp_path, watched, sinks=[watched])
+    run.run()
+    times = [row["t"] for row in rows(40)]
+    for told in (watched.acknowledged, watched.told):
+        assert [t for t, _ in told] == times
+        assert all(number >= k for k, (_, number) in enumerate(told, start=1))
+    # One by one at first, since the last session may have ended in one of these, then in groups.
+    ends = [*range(1, GROUP + 1), 16, 24, 32, 40]
+    assert sorted({number for _, number in watched.acknowledged}) == ends
+    # The estimate of the last sample of a group comes with the next one.
+    assert sorted({number for _, number in watched.told}) == [*range(1, GROUP), 15, 23, 31, 39, 40]
+
+
+@pytest.mark.slow
+def test_no_step_begins_before_what_is_old_is_committed(tmp_path):
+    now = itertools.count()
+    watched = Watched(tmp_path / NAME, rows(30))
+    run = live(tmp_path, watched, sinks=[watched], clock=lambda: float(next(now)))
+    run.run()
+    assert [number for _, number in watched.acknowledged] == [*range(1, 31)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("no SVD"), TypeError("a defect")])
+def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
+    tmp_path, monkeypatch, error
+):
+    """As one by one: a failure of the numerics sets the sample aside, others go on."""
+    monkeypatch.setattr("livepde.runs.live_loop.AGE", np.inf)
+    found = []
+    for name, source in (("one", Rows), ("group", AtHand)):
+        folder = tmp_path / name
+        folder.mkdir()
+        told = []
+
+        class Sink:
+            def put(self, estimate, told=told):
+                told.append(estimate.t)
+
+            def close(self):
+                pass
+
+        run = live(folder, source(rows(40)), sinks=[Sink()])
+        step = run.identifier.step
+
+        def unreadable(t, z, inputs=None, step=step):
+            estimate = step(t, z, inputs)
+            if 1.95 < t < 2.05:
+
+                def read():
+                    raise error
+
+                estimate.__dict__.update(_read=read)
+                estimate.__dict__.pop("belief", None)
+            return estimate
+
+        run.identifier.step = unreadable
+        run.run()
+        times = [record.t for record in run.journal]
+        assert len(times) == 39
+        assert told == times
+        events = [(event.kind, event.message) for event in run.journal.events]
+        found.append((list(run.journal), run.journal.counts, events))
+        run.journal.close()
+    (one, counts, events), (group, *rest) = found
+    assert rest == [counts, events]
+    assert counts == {("aside", ""): 1}
+    assert all(np.array_equal(a.numbers, b.numbers) for a, b in zip(one, group, strict=True))
 
 
 # --- a journal that cannot be written ------------------------------------------------------------
@@ -266,8 +381,9 @@ class Failing:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("source", [Rows, AtHand])
 @pytest.mark.parametrize("first", [2, 40, 43, 73])
-def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first):
+def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first, source):
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]
     broken[20:20] = [{"t": 0.1, "a": "none", "left": 1.0}, {"t": -1.0, "a": 1.0, "left": 1.0}] * 3
@@ -288,7 +404,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
         def close(self):
             pass
 
-    run = live(failing, Rows(broken), patient=True, sinks=[Sink()])
+    run = live(failing, source(broken), patient=True, sinks=[Sink()])
     run.run()
     assert run.health["ok"]
     assert run.journal.health == ""

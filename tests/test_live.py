@@ -540,6 +540,44 @@ def test_a_sample_in_which_the_process_ends_again_and_again_is_set_aside(tmp_pat
         assert len(list(kept)) == 20 - aside
 
 
+DEADLY = """
+import os, sys
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+from live_rod import identifier, live
+
+class Deadly(type(identifier())):
+    def step(self, t, z, inputs=None):
+        if 8.95 < t < 9.05:
+            os._exit(7)
+        return super().step(t, z, inputs)
+
+run = live(Path(sys.argv[1]))
+run.identifier.__class__ = Deadly
+run.resume()
+run.run()
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("deaths", [3, 4])
+def test_a_deadly_sample_amid_others_at_hand_is_set_aside(tmp_path, deaths):
+    """It is not committed before the first death, and once by itself from the second on."""
+    write(tmp_path, 100)
+    child = [sys.executable, "-c", DEADLY, str(tmp_path), str(Path(__file__).parent)]
+    accepted = []
+    for _ in range(deaths):
+        assert subprocess.run(child, check=False).returncode == 7
+        with Journal.open(tmp_path / "journal.sqlite") as kept:
+            accepted.append(kept.accepted)
+    assert accepted[0] < 91
+    assert accepted[1:] == [91] * (deaths - 1)
+    run = live(tmp_path)
+    resumed(run)
+    assert len(run.journal) == 100 - (deaths == 4)
+    assert run.journal.counts == ({("aside", ""): 1} if deaths == 4 else {})
+
+
 @pytest.mark.slow
 def test_health_and_metrics(tmp_path):
     def ask(path):

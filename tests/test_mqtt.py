@@ -87,14 +87,11 @@ def publish(server: Server, messages, topic: str = "rod") -> None:
 
 
 def until(run, count: int) -> None:
-    """Run until so many samples have been estimated."""
+    """Run until sinks have heard of so many samples; one more may be taken, if it is at hand."""
 
     class Counter:
-        seen = 0
-
         def put(self, estimate):
-            self.seen += 1
-            if self.seen >= count:
+            if len(run.result) >= count:
                 run.stopping.set()
 
         def close(self):
@@ -122,7 +119,7 @@ def test_what_was_not_safe_comes_again(server, tmp_path):
     publish(server, list(rows(40))[30:])
     again = live(tmp_path, source(server))
     again.resume()
-    until(again, 28)
+    until(again, 40)
     assert [round(record.t, 6) for record in again.journal] == [
         round(0.1 * k, 6) for k in range(40)
     ]
@@ -302,15 +299,17 @@ def test_what_the_broker_could_not_be_told_is_late_and_never_used_twice(
     run = live(tmp_path, heard)
     monkeypatch.setattr(heard, "acknowledge", lambda tokens: None)  # killed before each of them
     until(run, 12)
+    taken = run.journal.accepted
+    assert taken in (12, 13)
     heard.close()
     run.journal.close()
     again = live(tmp_path, source(server))
     again.resume()
-    until(again, 8)
+    until(again, 20)
     assert [round(record.t, 6) for record in again.journal] == [
         round(0.1 * k, 6) for k in range(20)
     ]
-    assert again.journal.counts == {("late", name): 12 for name in COLUMNS}
+    assert again.journal.counts == {("late", name): taken for name in COLUMNS}
     again.feed.close()
     again.journal.close()
 

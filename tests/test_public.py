@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import livepde
+from benchmarks.overhead import rod
 from benchmarks.startup import BASE, SCRIPT, startup
 from livepde import errors
 
@@ -121,6 +122,21 @@ def test_what_a_script_uses_is_light():
     assert not {"asyncio", "decimal", "multiprocessing", "sqlite3", "ssl"} & more
     above = "cases cli dashboard diagnostics fleet models reproduce runs streams"
     assert not {f"livepde.{name}" for name in above.split()} & more
+
+
+@pytest.mark.slow
+def test_the_command_line_comes_lightly_to_its_first_estimates(tmp_path):
+    """Tables and the parts of SciPy that are slow to load wait until something needs them."""
+    code = (
+        "import livepde.cli; from livepde.cases import load; "
+        f"case = load({str(rod(tmp_path, samples=60))!r}).prepare(); step = case.identifier.step; "
+        "[step(sample.t, sample.z).parameters for _, sample in zip(range(2), case.stream)]"
+    )
+    more = loaded(code)
+    assert {"livepde.runs.journal", "livepde.cases.case_channels", "livepde.streams.gaps"} <= more
+    slow = {"matplotlib", "pandas", "pyarrow", "xarray"}
+    slow |= {f"scipy.{part}" for part in ("interpolate", "ndimage", "optimize", "special", "stats")}
+    assert not slow & more
 
 
 @pytest.mark.study

@@ -313,8 +313,21 @@ class Result:
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        keeps = self._count % self.fields_every == 0
-        self.records.append(self.record(estimate, keeps))
+        self.records.append(self.record(estimate, self._keeps))
+        self._follow(estimate)
+
+    def announce(self, estimate: Estimate) -> bool:
+        """Count an estimate whose record is stored later; return whether it keeps its fields."""
+        keeps = self._keeps
+        self._follow(estimate)
+        return keeps
+
+    @property
+    def _keeps(self) -> bool:
+        """Whether the next estimate is stored with its fields."""
+        return self._count % self.fields_every == 0
+
+    def _follow(self, estimate: Estimate) -> None:
         self._count += 1
         self._settled = None
         self.last = estimate

@@ -7,10 +7,9 @@ from functools import partial
 from itertools import chain
 from pathlib import Path
 from statistics import fmean
-from typing import Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
-import pandas as pd
 
 from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
@@ -35,6 +34,9 @@ from livepde.observation import (
 from livepde.observation.placed import POSITION, shift_names
 from livepde.samples import by_name, noise_channel
 from livepde.streams import Column
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 __all__ = [
     "columns_of",
@@ -402,6 +404,8 @@ def _listed(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tup
 
 def _positions_table(case: CaseContent, key: str, file: Path) -> pd.DataFrame:
     """Return a table with the columns name, x (and y, z), as text; empty where a cell is."""
+    import pandas as pd  # slow to load, and most cases have no such table
+
     try:
         table = pd.read_csv(file, dtype=str, nrows=MEMBERS + 1, skipinitialspace=True).fillna("")
     except (OSError, ValueError) as error:

@@ -34,7 +34,6 @@ from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
-from livepde.streams.join import join_tables
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
@@ -149,6 +148,8 @@ def _joined(
     case: CaseContent, files: Sequence[FileSpec], columns: Mapping[str, Column]
 ) -> DataTable:
     """Return several files as one table, joined by time; each channel comes from one of them."""
+    from livepde.streams.join import join_tables
+
     specs = [case.spec.data.of(file) for file in files]
     paths = [_found(case, str(spec.file)) for spec in specs]
     headers = list(map(partial(_header, case), specs, paths))

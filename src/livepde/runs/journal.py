@@ -1,9 +1,10 @@
 """The journal of a run: samples, estimates and checkpoints in one file that survives a kill.
 
-The file is an SQLite database in write-ahead mode. A sample is committed before the identifier
-sees it, an estimate with the next commit; a checkpoint of the identifier from time to time. After a
-crash at any moment the last checkpoint and the samples after it give the same numbers as if nothing
-had happened. One process writes; any number of processes may read at the same time.
+The file is an SQLite database in write-ahead mode. Samples, each with the position of its source,
+and estimates are committed in the groups that the run decides on (`Live`), a checkpoint of the
+identifier from time to time. After a crash at any moment the last checkpoint, the samples after it
+and the rows from the last position on give the same numbers as if nothing had happened. One process
+writes; any number of processes may read at the same time.
 
 The journal is append-only: samples and estimates are never changed; only `thin` and withdrawals
 remove them. Freed pages are reused, so that a journal that is thinned stops growing.
@@ -281,7 +282,7 @@ class Journal:
     # --- writing -------------------------------------------------------------------------------
 
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
-        """Insert a sample and commit: it survives a kill of the process once this returns.
+        """Insert a sample, which survives a kill of the process from the next commit on.
 
         Parameters
         ----------
@@ -296,7 +297,6 @@ class Journal:
             names += self.noise
         row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
-        self._write(self._db.commit)
         return Taken(self._current, t, self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
@@ -351,15 +351,16 @@ class Journal:
         self._write(self._db.commit)
         return int(self._one("SELECT number FROM tries WHERE id = ?", self._current))
 
-    def append(self, record: Record, /) -> None:
-        """Keep the estimate of the last sample that `accept` or `samples` has returned.
+    def append(self, record: Record, /, number: int | None = None) -> None:
+        """Keep the estimate of a sample; default the last that `accept` or `samples` has returned.
 
         An estimate that was kept before a crash is left unchanged.
         """
+        number = self._current if number is None else number
         found = (record.numbers, record.innovation, record.withheld_error)
         self._insert(
             "estimates",
-            self._current,
+            number,
             float(record.t),
             record.status,
             record.steps,
@@ -368,8 +369,8 @@ class Journal:
             conflict="ON CONFLICT (id) DO NOTHING",
         )
         if record.snapshot is not None:
-            self.keep(record.snapshot, self._current)
-        self._last = self._current
+            self.keep(record.snapshot, number)
+        self._last = number
 
     def keep(self, snapshot: Snapshot, number: int | None = None) -> None:
         """Keep the fields of a sample; those of the last one (None) until `rewind` deletes them."""
@@ -391,7 +392,7 @@ class Journal:
         self._write(self._db.commit)
 
     def commit(self, position: str | None = None) -> None:
-        """Commit, so that readers see all records since the last accepted sample.
+        """Commit: readers see all records until now, and they survive a kill of the process.
 
         Parameters
         ----------
@@ -402,6 +403,11 @@ class Journal:
             # With the number of the sample, since the position of any later sample supersedes it.
             self._say("position", json.dumps([self.accepted, position]))
         self._write(self._db.commit)
+
+    def rollback(self) -> None:
+        """Forget all records since the last commit."""
+        self._write(self._db.rollback)
+        self._stand()
 
     def _say(self, key: str, value: str) -> None:
         """Set a value of the header."""

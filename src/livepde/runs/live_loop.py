@@ -26,6 +26,8 @@ from livepde.verdict import LEVELS
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
+GROUP = 64  # most samples of one commit
+AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two evaluations of the verdict; a change is an event
 LOOK = 0.5  # seconds between two checks whether to stop
@@ -119,6 +121,15 @@ def _since(samples: Iterable[Ready]) -> float | None:
 class Live:
     """A live run, which continues until its source ends or it is stopped.
 
+    Samples that are at hand together are committed in groups. Nothing outside of the process is
+    told of a sample or its estimate before they are committed: sources are acknowledged, and sinks
+    get estimates, after the commit of their group. A group ends before the run waits for its
+    source, and before a step if it has 64 samples or the last commit is 0.25 s ago. The first 64
+    samples of a session are committed one by one, each before its step: a sample in whose step the
+    last session has ended is among them. Belief and diagnostics of a group's estimates are computed
+    together at its end, where each finds code and data of the one before in the caches of the
+    processor; if one of them cannot be computed, the samples are taken again one by one.
+
     Parameters
     ----------
     identifier
@@ -139,8 +150,7 @@ class Live:
     begun, irregular
         Samples that the feed has delivered already, and remarks on irregular rows until then.
     waits
-        Whether the feed may wait for samples: estimates are then committed before waiting, for
-        readers of the journal; else with the next sample, in one transaction.
+        Whether the feed may wait for samples: all that was taken is then committed before.
     patient
         Whether to wait for a journal that cannot be written (a full disk), with the run not well
         meanwhile; else the journal's `RunError` ends the run.
@@ -197,6 +207,12 @@ class Live:
         self._refusal = self._failure = ""
         self._unwell, self._told, self._doubt = "", (-1, "well"), ""
         self._unwritten = ""  # why the journal cannot be written
+        self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
+        # Of the group, to be stored at its end: number of the sample, and whether with its fields.
+        self._unread: deque[tuple[int, Estimate, bool]] = deque()
+        self._untold: deque[Estimate] = deque()  # for the sinks, once they are committed
+        self._committed = self._heard
+        self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
         self._put_last = -math.inf  # time of the last estimate that sinks were given
         self.ailments: list[Callable[[], str]] = [
             lambda: self._unwritten,
@@ -240,6 +256,7 @@ class Live:
         patient.
         """
         begun, again = self._clock(), None
+        self._put_back()  # the journal has rolled back what was not committed
         while again is None:
             if not (self.patient and self.journal.remedy):
                 raise error
@@ -255,16 +272,36 @@ class Live:
                 self.journal.reopen()
                 # A write comes first: if it fails, no steps are taken again in vain.
                 self.journal.say_health(why)
-                # The tries of samples are not counted: the disk has failed, not their steps.
-                again = self._again(math.inf)
-                self.journal.commit()
-                self._restore()
+                again = self._recover()
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
         # The source was not polled meanwhile, so that time is no silence of it.
         self._heard = self._taken = now = self._clock()
         self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
+        return again
+
+    def _one_at_a_time(self) -> None:
+        """Go back to the last commit, and take the samples of the group again one by one."""
+        self._put_back()
+        self.journal.rollback()
+        self._one_by_one = self.journal.accepted + GROUP
+        self._recover()
+
+    def _put_back(self) -> None:
+        """Put the samples that are not committed back among those to be taken."""
+        self._waiting.extendleft(reversed(self._group))
+        self._group.clear()
+        self._unread.clear()
+
+    def _recover(self) -> int:
+        """Go on from the last commit; return the number of samples taken again."""
+        # The tries of samples are not counted: it was not the process that has ended.
+        again = self._again(math.inf)
+        self.journal.commit()
+        self._restore()
+        # What was committed is still to be told; the other samples are taken once more.
+        self._untold = deque(one for one in self._untold if one.t <= self.identifier.t)
         return again
 
     def _restore(self) -> None:
@@ -333,6 +370,7 @@ class Live:
         self._conclude()
 
     def _conclude(self) -> None:
+        self._commit()
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
         notes: list[str] = []
@@ -360,8 +398,14 @@ class Live:
                 self._mend(error)
                 # Steps that are taken again reach no sink, but the last estimate is news to them.
                 last = self.result.last
-                if last is not None and last.t > self._put_last:
-                    self._put(last)
+                known = self._untold[-1].t if self._untold else self._put_last
+                if last is not None and last.t > known:
+                    self._untold.append(last)
+            except Exception:
+                if not self._unread:
+                    raise
+                # Of a step, or of an estimate before it; one by one it belongs to its own sample.
+                self._one_at_a_time()
 
     def _go_on(self) -> None:
         """Take samples until the source ends or `stopping` is set."""
@@ -386,7 +430,37 @@ class Live:
         # let the same rows be read and counted again.
         remarks = self.feed.remarks(self._waiting)
         self._count(remarks)
-        self.journal.commit(self.feed.position(self._waiting) if remarks else None)
+        self._commit(self.feed.position(self._waiting) if remarks else None)
+
+    def _commit(self, position: str | None = None) -> None:
+        """Commit, then acknowledge the samples of the group and hand their estimates to sinks."""
+        self._record()
+        self.journal.commit(position)
+        self._committed = self._clock()
+        while self._group:
+            self.feed.acknowledge(self._group.popleft())
+        while self._untold:
+            self._put(self._untold.popleft())
+
+    def _record(self) -> None:
+        """Store the estimates of the group."""
+        before, self.busy = self.busy, True
+        try:
+            while self._unread:
+                number, estimate, keeps = self._unread[0]
+                self.journal.append(self.result.record(estimate, keeps), number)
+                self._unread.popleft()
+        finally:
+            self.busy = before
+
+    def _is_due(self, taken: Taken) -> bool:
+        """Return whether a sample must be committed before its step; see the class."""
+        return (
+            taken.id <= self._one_by_one
+            or (self.waits and not self._waiting)
+            or len(self._group) >= GROUP
+            or self._clock() - self._committed >= AGE
+        )
 
     def _relieve(self) -> None:
         relieved = self.backlog.relieved(self._waiting)
@@ -505,6 +579,7 @@ class Live:
         ready = self._waiting.popleft()
         try:
             if ready.since is not None:
+                self._commit()
                 self._go_back(ready.since)
             # Counts, position and sample are one transaction, so that a crash keeps all or none.
             position = self.feed.position(self._waiting)
@@ -513,7 +588,9 @@ class Live:
         except RunError:
             self._waiting.appendleft(ready)
             raise
-        self.feed.acknowledge(ready)
+        self._group.append(ready)
+        if self._is_due(taken):
+            self._commit()
         self._step(taken)
 
     def _go_back(self, t: float) -> None:
@@ -536,7 +613,10 @@ class Live:
         try:
             estimate = self.identifier.step(taken.t, taken.values)
             self._seconds += time.monotonic() - begun
-            self.result.add(estimate)
+            if self._group:
+                self._unread.append((taken.id, estimate, self.result.announce(estimate)))
+            else:
+                self.result.add(estimate)
         except DataError as error:
             if not self.strict:
                 self._tell("refused", str(error))
@@ -560,6 +640,7 @@ class Live:
 
     def _withdraw(self) -> None:
         """Withdraw the last sample; waiting samples are later, and taken in their turn."""
+        self._record()
         self.journal.withdraw()
         self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
 
@@ -574,8 +655,8 @@ class Live:
 
     def _hand_on(self, estimate: Estimate, again: bool) -> None:
         """Hand an estimate to the sinks; judge it and keep a checkpoint at intervals."""
-        if not again:
-            self._put(estimate)
+        if self.sinks and not again:
+            self._untold.append(estimate)
         if estimate.status.taken:
             self._taken, self._refused = self._clock(), 0
         self._failed = 0 if estimate.status.ok else self._failed + 1
@@ -587,6 +668,7 @@ class Live:
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
         if self._steps % CHECKPOINT == 0:
+            self._record()
             self.journal.checkpoint(self.identifier.dump())
             if math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)

@@ -18,8 +18,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
-from scipy.ndimage import median_filter
+import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
 
 from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array, Mask
@@ -80,18 +79,21 @@ def _residuals(t: Array, x: Array) -> _Residuals:
 def _threshold(x: Array, size: Array, beyond: float) -> Array:
     """Return the size above which residuals are implausible, from their global and local scale."""
     absolute = np.abs(size)
-    local = np.full_like(absolute, np.median(absolute))
-    if len(absolute) > LOCAL:  # where shorter, SciPy before 1.15.3 corrupts memory
-        # A window that is reflected at an end would count a spike there twice, so the ends take
-        # the median of the first and the last whole window.
-        half = LOCAL // 2
-        local = median_filter(absolute, size=LOCAL)
-        local[:half], local[-half:] = local[half], local[-half - 1]
+    usual = float(np.median(absolute))
     steps = np.abs(np.diff(x))
     # Most residuals of a coarsely resolved channel are zero, and then one step of its resolution
     # would count as a spike.
     resolution = steps[steps > 0.0].min(initial=math.inf)
-    return np.asarray(beyond * np.maximum(GAUSS * (np.median(absolute) + local), resolution))
+    local = np.full_like(absolute, usual)
+    # A local scale only raises the threshold: where no residual is above it without, none is with.
+    suspect = absolute.max() > beyond * max(GAUSS * usual, resolution)
+    if suspect and len(absolute) > LOCAL:  # where shorter, SciPy before 1.15.3 corrupts memory
+        # A window that is reflected at an end would count a spike there twice, so the ends take
+        # the median of the first and the last whole window.
+        half = LOCAL // 2
+        local = scipy.ndimage.median_filter(absolute, size=LOCAL)
+        local[:half], local[-half:] = local[half], local[-half - 1]
+    return np.asarray(beyond * np.maximum(GAUSS * (usual + local), resolution))
 
 
 def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
@@ -165,7 +167,7 @@ def bridged(t: float, past: Series, later: Series) -> float:
     if len(past) < 2 or len(later) < 2:
         return x0 + (t - t0) / (t1 - t0) * (x1 - x0)
     times, values = zip(*past[-2:], *later[:2], strict=True)
-    return float(PchipInterpolator(times, values)(t))
+    return float(scipy.interpolate.PchipInterpolator(times, values)(t))
 
 
 def is_spike(past: Series, now: tuple[float, float], later: Series, beyond: float) -> bool:
@@ -193,9 +195,10 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     # The first and the last interval keep the straight line: PCHIP takes its slopes from values on
     # both sides, and `bridged` has to give the same on a stream.
     new[gaps] = np.interp(t[gaps], t[known], x[known])
-    if len(known) >= 4:
-        inner = gaps & (t > t[known[1]]) & (t < t[known[-2]])
-        new[inner] = PchipInterpolator(t[known], x[known])(t[inner])
+    inner = gaps & (t > t[known[1]]) & (t < t[known[-2]])
+    if inner.any():
+        line = scipy.interpolate.PchipInterpolator(t[known], x[known])
+        new[inner] = line(t[inner])
     return new, gaps, spikes
 
 
