@@ -104,6 +104,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
         withheld=process.withheld,
         scheme=process.scheme,
         dt_max=process.dt_max,
+        halvings=process.halvings,
         assimilate_from=process.assimilate_from,
     )
     failed, missed = 0, []

@@ -52,16 +52,17 @@ def test_a_step_takes_no_more_stored_samples_again_than_a_slice(assimilated):
 
 
 @pytest.mark.long
-def test_where_a_replay_ends_does_not_depend_on_the_slices():
+@pytest.mark.parametrize("apart", [1, 5])  # samples from one reading to the next
+def test_where_a_replay_ends_does_not_depend_on_the_slices(apart):
     ends = {}
     for size in (3, 16, 1000):
         identifier, estimates = rod(slice=size, iterations=2), []
-        for sample in readings(200):
-            estimates.append(identifier.step(*sample))
+        for k, (t, z) in enumerate(readings(200 * apart), start=1):
+            estimates.append(identifier.step(t, z if k % apart == 0 else z * np.nan))
         done = [k + 1 for k, e in enumerate(estimates) if not np.isnan(e.diagnostics.replay_left)]
         assert len(done) == 5  # due at 8, 16, 32, 64 and 128
         ends[size] = done[-1], estimates[-1]
-    assert ends[3][0] > ends[16][0] > ends[1000][0] == 128
+    assert ends[3][0] > ends[16][0] > ends[1000][0] == 128 * apart
     for size in (3, 16):
         np.testing.assert_array_equal(ends[size][1].q, ends[1000][1].q)
         np.testing.assert_array_equal(ends[size][1].u, ends[1000][1].u)

@@ -29,7 +29,7 @@ class Process:
 
     Attributes
     ----------
-    model, observation, u0, scheme, dt_max, inputs, withheld, assimilate_from
+    model, observation, u0, scheme, dt_max, halvings, inputs, withheld, assimilate_from
         As an `Identifier` takes them; `inputs` are the channels at each time.
     times
         Of the samples, shape (times,); the first is the initial time.
@@ -52,6 +52,7 @@ class Process:
     u0: Any
     scheme: Scheme = field(default_factory=ImplicitEuler)
     dt_max: float = np.inf
+    halvings: int = Advance.halvings
     inputs: Sequence[Mapping[str, float]] | None = None
     weights: Array | None = None
     withheld: Observation | None = None

@@ -26,6 +26,7 @@ def _twin(experiment: ModuleType, std: float) -> Process:
         q_true=np.tile(twin.q, (len(twin.times), 1)),
         u0=twin.states[0],
         scheme=twin.scheme,
+        halvings=0,  # the data are those of whole steps, which must not be graded
         weights=twin.weights,
     )
 

@@ -29,7 +29,8 @@ class Replay:
     than others: less than 20 times the median on a rod with two unknowns. Until it has caught up,
     estimates are linear about the reference of before. Where it ends does not depend on the slices
     while each replay ends before the next is due: its references come from the samples that were
-    there when it began. With finished data a larger slice costs nothing but longer steps. A run
+    there when it began. Where few samples have readings a slice is longer, by the number of samples
+    for each that has one. With finished data a larger slice costs nothing but longer steps. A run
     ends with the result of the replay under way (`Identifier.settled`).
 
     Parameters

@@ -34,7 +34,18 @@ def replay_slice(
         return state, None
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
-    return _advanced(work, state, replay.slice)
+    return _advanced(work, state, replay.slice * _rows_for_each(state))
+
+
+def _rows_for_each(state: SensitivityState) -> float:
+    """Return the stored samples for each that has a reading: the largest of all replays, or 1.
+
+    The next replay is due when readings have doubled, but samples without one are taken again, too:
+    a replay has to be as much faster as there are more of them, to end before.
+    """
+    active = state.replay.active
+    rows = (state.replay.until - state.window)[active]
+    return float((rows / state.replay.count[active]).max(initial=1.0))
 
 
 def finish_replays(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
