@@ -103,18 +103,18 @@ class Diagnostics(Generic[Number]):
 
     def named(self) -> dict[str, Number]:
         """Return the numbers that are known, by their names in tables and files."""
-        found = self._own() | self.shifts.named() | dict(self.extra)
-        return {name: number for name, number in found.items() if known(number)}
+        more = self.shifts.named() | dict(self.extra)
+        return self._own() | {name: number for name, number in more.items() if known(number)}
 
     def each(self, change: Callable[[Number], Other]) -> Diagnostics[Other]:
         """Return the diagnostics with a function of each number that is known."""
         extra = {name: change(number) for name, number in self.extra.items()}
-        own = {name: change(number) for name, number in self._own().items() if known(number)}
+        own = {name: change(number) for name, number in self._own().items()}
         return Diagnostics(**own, shifts=self.shifts.each(change), extra=extra)
 
     def updated(self, more: Diagnostics[Number]) -> Diagnostics[Number]:
         """Return the diagnostics with all that others know instead."""
-        found = {name: number for name, number in more._own().items() if known(number)}
+        found: dict[str, Any] = more._own()
         if more.shifts.sizes:
             found["shifts"] = more.shifts
         return replace(self, **found, extra={**self.extra, **more.extra})
@@ -124,7 +124,9 @@ class Diagnostics(Generic[Number]):
         return self.each(lambda number: float(number[k]))
 
     def _own(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in OWN}
+        """Return the attributes that are known numbers."""
+        own = vars(self)
+        return {name: own[name] for name in OWN if known(own[name])}
 
 
 OWN = tuple(item.name for item in fields(Diagnostics) if item.name not in ("shifts", "extra"))
@@ -134,8 +136,7 @@ def stacked(members: Sequence[Diagnostics[float]]) -> Diagnostics[Array]:
     """Return diagnostics of members as arrays, with NaN for members without."""
 
     def column(numbers: Sequence[float]) -> Any:
-        values = np.array(numbers)
-        return NOT_KNOWN if np.isnan(values).all() else values
+        return NOT_KNOWN if all(map(math.isnan, numbers)) else np.array(numbers)
 
     def columns(tables: Sequence[Mapping[Any, float]]) -> dict[Any, Any]:
         names = dict.fromkeys(name for table in tables for name in table)

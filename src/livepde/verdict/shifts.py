@@ -78,6 +78,8 @@ class Shifts(Generic[Number]):
 
 def known(number: Any) -> bool:
     """Return whether a number, or an array over members, is known: that is not NaN alone."""
+    if isinstance(number, float):  # as most are: without a call of NumPy
+        return not math.isnan(number)
     return bool(np.ndim(number)) or not math.isnan(number)
 
 
