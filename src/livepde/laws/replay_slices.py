@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from itertools import chain
 
@@ -16,7 +15,7 @@ from livepde.laws.member_arrays import changed, join, put, take
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 __all__ = ["finish_replays", "replay_slice"]
 
@@ -34,23 +33,16 @@ def replay_slice(
         return state, None
     for k in np.flatnonzero(due).tolist():
         state = _with(state, k, _begun(work, replay, take(state, k)))
-    return _advanced(work, state, replay.slice * _rows_for_each(state))
-
-
-def _rows_for_each(state: SensitivityState) -> float:
-    """Return the stored samples for each that has a reading: the largest of all replays, or 1.
-
-    The next replay is due when readings have doubled, but samples without one are taken again, too:
-    a replay has to be as much faster as there are more of them, to end before.
-    """
-    active = state.replay.active
-    rows = (state.replay.until - state.window)[active]
-    return float((rows / state.replay.count[active]).max(initial=1.0))
+    # To begin costs as much as a sample. Those without a reading are taken again, too, but the next
+    # replay is due when readings have doubled: to end before, a slice has its share of them.
+    stored = state.replay.until - state.window
+    share = np.maximum(stored / np.maximum(state.replay.count, 1), 1.0)
+    return _advanced(work, state, replay.slice * share - due)
 
 
 def finish_replays(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
     """Return all members after the replays that are under way."""
-    return _advanced(work, state, math.inf)[0]
+    return _advanced(work, state, np.full(len(state), np.inf))[0]
 
 
 def _with(state: SensitivityState, k: int, replay: ReplayState) -> SensitivityState:
@@ -58,7 +50,7 @@ def _with(state: SensitivityState, k: int, replay: ReplayState) -> SensitivitySt
 
 
 def _advanced(
-    work: SensitivityWork, state: SensitivityState, most: float
+    work: SensitivityWork, state: SensitivityState, most: Array
 ) -> tuple[SensitivityState, Diagnostics[Array] | None]:
     """Return all members after at most so many stored samples of each, and diagnostics."""
     which = np.flatnonzero(state.replay.active)
@@ -68,9 +60,9 @@ def _advanced(
     part = take(state, which) if len(which) < len(state) else state
     ended, taken = np.zeros(len(which), dtype=bool), 0
     failures = ended.copy()
-    while taken < most and part.replay.active.any():
-        part, failed = _one_sample(work, part)
-        for k in np.flatnonzero(part.replay.active).tolist():
+    while (going := part.replay.active & (taken < most[which])).any():
+        part, failed = _one_sample(work, part, going)
+        for k in np.flatnonzero(going).tolist():
             part, ended[k] = _turned(work, part, k, k in failed)
             failures[k] = k in failed
         taken += 1
@@ -120,11 +112,11 @@ def _again(work: SensitivityWork, state: SensitivityState, now: FilterState) -> 
 
 
 def _one_sample(
-    work: SensitivityWork, state: SensitivityState
+    work: SensitivityWork, state: SensitivityState, going: Mask
 ) -> tuple[SensitivityState, set[int]]:
-    """Return all members after the next stored sample of each replay, and whose replays failed."""
+    """Return all members after the next stored sample of those `going`, and whose replays fail."""
     replay, together = state.replay, defaultdict(list)
-    for k in np.flatnonzero(replay.active).tolist():
+    for k in np.flatnonzero(going).tolist():
         row = int(replay.row[k])
         # Members with the same interval of time take it together, as arrays.
         together[float(state.log[k, row, 0]), following(state.log[k], row)].append(k)
