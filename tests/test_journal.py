@@ -125,7 +125,7 @@ class Breaks:
         pass
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.parametrize("waits", [True, False])
 @pytest.mark.parametrize("method", ["accept", "append", "commit", "checkpoint", "step"])
 def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(

@@ -445,7 +445,8 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
 
 @pytest.mark.slow
 def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
-    run = live(tmp_path, Rows(rows(101)))
+    biased = ({**row, "b": row["b"] + 0.2} for row in rows(101))
+    run = live(tmp_path, Rows(biased))
     run.run()
     levels = [e.message.partition(":")[0] for e in run.journal.events if e.kind == "verdict"]
     assert levels[:1] == ["do not trust"]
