@@ -42,16 +42,16 @@ def closed():
 
 @pytest.mark.long
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
-    write(tmp_path, 50)
+    write(tmp_path, 60)  # no replay is under way at the end, which only the result would settle
     run = live(tmp_path)
     run.run()
     result = identifier().run(
-        [(row["t"], {k: row[k] for k in ("a", "b", "left")}) for row in rows(50)]
+        [(row["t"], {k: row[k] for k in ("a", "b", "left")}) for row in rows(60)]
     )
     found = run.result.to_xarray()
     assert np.array_equal(found["k"], result.to_xarray()["k"])
     assert np.array_equal(found["innovation"], result.to_xarray()["innovation"], equal_nan=True)
-    assert found.sizes["snapshot"] == 6
+    assert found.sizes["snapshot"] == 7
     run.journal.close()
     with Journal.open(tmp_path / "journal.sqlite") as reader:
         kept = reader.layout.dataset(list(reader))
