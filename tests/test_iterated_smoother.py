@@ -227,3 +227,22 @@ def test_a_direction_that_is_not_told_keeps_the_start_open():
     for t in TIMES[1:]:
         silent.step(t, np.zeros(1))
     assert silent._state.start_due[0] < iterated_smoother.NEVER
+
+
+@pytest.mark.slow
+def test_a_search_that_hardly_moves_the_unknowns_corrects_the_state():
+    """The insulated rod never forgets an error of its mean, which no covariance says."""
+    model = heat(lp.interval(0.0, 1.0, 16), lp.Normal(0.1, 0.05))
+    start = lambda x: 1.0 + np.cos(np.pi * x[0])  # noqa: E731
+    samples = list(readings(model, [0.12], start))[:24]
+    bare = {"shadows": None, "verdict": False}
+    whole = ends(model, lp.SensitivityLaw(), samples, start)
+    alone = ends(model, lp.SensitivityLaw(**bare), samples, start)
+    plain = ends(model, lp.SensitivityLaw(start_window=0, **bare), samples, start)
+    moved = [one.diagnostics.smoother_moved for one in whole]
+    assert 0.0 < np.nanmax(moved) <= iterated_smoother.HOLDS
+    for one, other in zip(whole, alone, strict=True):
+        np.testing.assert_allclose(one.u, other.u, rtol=1e-10)
+        np.testing.assert_allclose(one.q, other.q, rtol=1e-10)
+    assert np.abs(whole[-1].u - plain[-1].u).max() > 1e-9
+    assert whole[-1].verdict.level == "trusted"

@@ -91,12 +91,15 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
         searched = samples.unaccompanied
         best = iterated_smoother(searched)
         moved = math.inf if best is None else _apart(work.filter, best.x, state.now)
-        # An error of the linearisation never grows, measured in the standard deviations that later
-        # samples leave: within `HOLDS` the filter stays as it is.
-        if best is not None and (moved > holds or not _usual(state.now)):
-            found = best if searched is samples else samples.about(best.trajectory)
-            if found is not None:
-                state = changed(state, now=work.filter.relinearised(_without_past(found.x)))
+        found = None if best is None else best.x
+        if best is not None and searched is not samples:
+            if moved <= holds and _usual(state.now) and _is_square(state.now):
+                found = _accompanied(best.x, state.now)
+            else:
+                whole = samples.about(best.trajectory)
+                found = None if whole is None else whole.x
+        if found is not None:
+            state = changed(state, now=work.filter.relinearised(_without_past(found)))
         stays = shares[-1] < HALF and not work.filter.moves
         if stays and count >= ENOUGH and moved <= holds:
             return changed(state, start_due=np.array([NEVER])), moved
@@ -123,6 +126,20 @@ def iterated_smoother(samples: _Samples) -> _Pass | None:
 def _without_past(x: FilterState) -> FilterState:
     """Return a filter without earlier values, which would cost columns in each later update."""
     return changed(x, past=x.past[:, :, :0], dpast=x.dpast[:, :0])
+
+
+def _is_square(x: FilterState) -> bool:
+    """True if the rows of the square root are those of the prior, moved by updates alone."""
+    return bool(x.C.shape[1] == x.C.shape[2])
+
+
+def _accompanied(x: FilterState, now: FilterState) -> FilterState:
+    """Return a filter with the ledger and the errors of the discretisation of another one.
+
+    For two that are near each other: these data are linear about the trajectory, and stand on the
+    rows of the square root, which updates move alike.
+    """
+    return changed(x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
 
 
 def _usual(x: FilterState) -> bool:
