@@ -293,8 +293,8 @@ class Identifier:
                 gaps = self._gaps.gaps(names, missing)
         z0 = self._z if t > self._t else used
         interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
-        before = self._state
-        self._state, report = stepped(self.law, self._work, self.problem, before, interval)
+        parts = self.law, self._work, self.problem
+        self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
         if report.status.taken:
             if names:
@@ -377,8 +377,8 @@ class Identifier:
     ) -> Estimate:
         # Estimates that are kept hold the small state of the law; mean and factors are computed
         # when read.
-        (latent, judge), problem = self.law.deferred(self._work, self._state), self.problem
-        error = withheld
+        latent, judge = self.law.deferred(self._work, self._state)
+        problem, error = self.problem, withheld
         read = latent if self.model.latent.plain else lambda: problem.physical(latent())
         if self.withheld is not None:
             belief = read()

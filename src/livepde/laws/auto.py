@@ -32,6 +32,7 @@ from livepde.laws.history import (
     intervals_since,
     opened,
     reaching,
+    with_readings,
 )
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, FixedInterval, Law, Problem, Report
@@ -296,9 +297,7 @@ class AutoLaw(Law[Bank, AutoState]):
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
         onset = 0
         if alarm:
-            log = state.members.log[at, 1:]
-            readings = log[np.isfinite(log[:, 0]), 1 : 1 + len(state.noise)]
-            shown = np.asarray(np.isfinite(readings).any(axis=1))
+            shown = with_readings(state.members.log[at, 1:], len(state.noise))
             onset = reaching(shown, JUMPS.onset(before.watch, innovations))
         stayed = work.candidates[before.leader].drift == 0.0
         # A member that drifts takes the lead from one that does not: the process has changed, and

@@ -28,6 +28,7 @@ __all__ = [
     "skipped",
     "span_between",
     "trimmed",
+    "with_readings",
 ]
 
 SPARE = np.inf  # time of rows that are not in use
@@ -128,6 +129,12 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
         Interval(first.t, last.t, first.inputs, last.inputs, first.z, last.z, last.noise)
         for first, last in pairwise(_rows(log, channels))
     ]
+
+
+def with_readings(log: Array, sensors: int) -> Mask:
+    """Return whether each sample that one member took, shape (rows, ...), has a reading."""
+    taken = log[np.isfinite(log[:, 0]), 1 : 1 + sensors]
+    return np.asarray(np.isfinite(taken).any(axis=1))
 
 
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:

@@ -176,7 +176,7 @@ def _rescued(
         return not report.status.ok or bool(beyond[0] > guards.runaway)
 
     if not astray(report):
-        return changed(new, scale=state.scale.kept(scale, new.now.refused)), report
+        return changed(new, scale=scale.without_refused(state.scale, new.now.refused)), report
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]

@@ -426,7 +426,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 near = ~far.any(axis=1)
                 usual = usual & (near if replays is None else replays | near)
             scale = state.scale.add(span.z1, span.z1 - told.predicted)
-            parts["scale"] = state.scale.kept(scale, x.refused)
+            parts["scale"] = scale.without_refused(state.scale, x.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:

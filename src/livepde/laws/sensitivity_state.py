@@ -189,22 +189,22 @@ class Scale:
         # A missing reading, NaN, must leave the range as it is: fmin and fmax ignore it.
         return Scale(np.fmin(self.low, z), np.fmax(self.high, z), first)
 
-    def kept(self, with_sample: Scale, refused: IntArray) -> Scale:
-        """Return the value after a sample, but for sensors of which a gate refused the reading.
+    def without_refused(self, before: Scale, refused: IntArray) -> Scale:
+        """Return the value after a sample, that before it for sensors whose reading was refused.
 
         A wild reading would let any later prediction pass for one within the range.
 
         Parameters
         ----------
-        with_sample
-            After `add`.
+        before
+            The value before the sample.
         refused
             How many readings in a row the gate has refused, (members, sensors).
         """
         if not np.count_nonzero(refused):
-            return with_sample
-        pairs = zip(vars(self).values(), vars(with_sample).values(), strict=True)
-        return Scale(*(np.where(refused, before, after) for before, after in pairs))
+            return self
+        pairs = zip(vars(before).values(), vars(self).values(), strict=True)
+        return Scale(*(np.where(refused, earlier, now) for earlier, now in pairs))
 
     def beyond(self, d: Array, noise: Array) -> Array:
         """Return the largest innovation as a multiple of the largest range so far, or of the noise.

@@ -226,7 +226,7 @@ class Shadow(ABC):
         """Return fields of the state after one more interval was read, before any estimate."""
         return {}
 
-    def anew(self, s: ShadowState, which: Mask) -> dict[str, Any]:
+    def restarted(self, s: ShadowState, which: Mask) -> dict[str, Any]:
         """Return fields of the state in which members have no error beside `ShadowState.u`."""
         return {}
 
@@ -460,7 +460,7 @@ class MeshShadow(Shadow):
         parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
         return ErrorIncrement(failed, parts | {"gains": np.zeros_like(s.gains)}, a=a)
 
-    def anew(self, s: ShadowState, which: Mask) -> dict[str, Any]:
+    def restarted(self, s: ShadowState, which: Mask) -> dict[str, Any]:
         rows = which[:, None]
         return {"fine": np.where(rows, 0.0, s.fine), "seen": np.where(rows, 0.0, s.seen)}
 
@@ -624,7 +624,7 @@ class ShadowSet:
         parts = {"u": np.where(rows, 0.0, s.u), "a": np.where(rows, 0.0, s.a)}
         parts["failed"] = s.failed + wrong.sum(axis=1)
         for row, shadow in enumerate(self.shadows):
-            parts |= shadow.anew(s, wrong[:, row])
+            parts |= shadow.restarted(s, wrong[:, row])
         return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(

@@ -404,7 +404,8 @@ class Live:
             except Exception:
                 if not self._unread:
                     raise
-                # Of a step, or of an estimate before it; one by one it belongs to its own sample.
+                # Laws and sensors of one's own may raise anything, in a step or when an estimate
+                # is read. One by one it belongs to its own sample, and is treated as such.
                 self._one_at_a_time()
 
     def _go_on(self) -> None:
