@@ -23,7 +23,10 @@ SEEDS: Mapping[str, int] = {"rod": 16, "rod-source": 16}
 FEW = 4  # seeds of the others
 
 BEGIN, END = "## What was measured\n", "## What these tables do not say\n"
-MADE = "These tables, and the numbers in `docs/peers/*.json`, are made by `python docs/peers.py`."
+MADE = (
+    "Each table is what the command above it has printed, kept in `docs/peers/*.json`; "
+    "`python docs/peers.py` runs them, with more data sets, and makes this part of the page."
+)
 
 
 def measure(names: Iterable[str]) -> None:
