@@ -309,6 +309,22 @@ def honest(
     return benchmark(names, kinds, seeds=seeds, workers=workers, progress=True)
 
 
+@program.command(quick="The same: all parts together take less than five minutes.")
+def silent(
+    *,
+    only: Annotated[list[str] | None, several("Only this part.")] = None,
+    workers: Workers = None,
+) -> Outcome:
+    """Check results that were once wrong without a word against separate computations.
+
+    Example:  python -m benchmarks silent --only smoother
+    """
+    from benchmarks.silent import PARTS
+    from benchmarks.silent import silent as benchmark
+
+    return benchmark(chosen(only, PARTS, "part", PARTS), workers, progress=True)
+
+
 @program.command(name="first-hour", quick="Two truths of each walk.")
 def first_hour(seeds: Annotated[int, Count(20, 2, "Truths of each walk.")]) -> Outcome:
     """Count how often the walks of docs/first-hour.md find truths of another code.

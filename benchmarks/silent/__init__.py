@@ -1,0 +1,38 @@
+"""Results that were wrong without a word: each with its right value from a separate computation.
+
+A part is a module with a function `checks` that returns its checks. It computes the right value
+without livepde, or knows it by definition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+
+from benchmarks.jobs import each
+from livepde.runs.outcome import Check, Outcome
+
+__all__ = ["PARTS", "silent"]
+
+PARTS = {
+    "smoother": "a reading states its noise: smoother and filter agree at the last sample",
+    "moving": "unknowns that move between sparse samples",
+    "unjudged": "a run that was not tested is not trusted",
+    "partial": "the gradient law that tunes itself, with partial data",
+    "repeats": "rows that arrive twice, and clocks that go back",
+    "sensors": "sensors that fail for a while, and wild first rows",
+    "start": "boundary values of the start, checkpoints of another model",
+    "paper": "the paper's law: stages, damping, failed steps",
+}
+
+
+def _part(name: str) -> list[Check]:
+    found: list[Check] = import_module(f"benchmarks.silent.{name}").checks()
+    return found
+
+
+def silent(names: Sequence[str], workers: int | None = None, *, progress: bool = False) -> Outcome:
+    """Return the checks of some parts, in the order of `PARTS`."""
+    jobs = [(name,) for name in names]
+    done = dict(each(_part, jobs, "parts", workers=workers or 2, progress=progress))
+    return Outcome(checks=[check for (name,) in jobs for check in done[(name,)]])
