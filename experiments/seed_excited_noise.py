@@ -59,7 +59,7 @@ class WhiteNoise:
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             size = np.sqrt(z @ gram @ z)
             noise = self.level * size * (root @ rng.standard_normal(len(z)))
-            yield Sample(float(t), z + noise)
+            yield Sample(t=float(t), z=z + noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ class _Noisy:
         rng = np.random.default_rng(self.seed)
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             std = self.noise.std(z, self.twin.weights)
-            yield Sample(float(t), z + std * rng.standard_normal(len(z)))
+            yield Sample(t=float(t), z=z + std * rng.standard_normal(len(z)))
 
 
 def seed_excited_noise(*, quick: bool = False, progress: bool = False) -> Outcome:

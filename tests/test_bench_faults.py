@@ -129,7 +129,15 @@ def test_every_kind_of_broken_line_is_no_right_one(kind):
 
 def record(t: float, value: float = 1.0) -> Record:
     nothing = np.zeros(0)
-    return Record(t, np.array([value]), nothing, nothing, 0, 1, {})
+    return Record(
+        t=t,
+        numbers=np.array([value]),
+        innovation=nothing,
+        withheld_error=nothing,
+        status=0,
+        steps=1,
+        notes={},
+    )
 
 
 def found(*records: Record, state: bytes = b"x") -> damage.Found:

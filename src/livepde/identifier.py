@@ -44,7 +44,7 @@ from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
-from livepde.stepping import Advance, Interval, Scheme
+from livepde.stepping import Advance, End, Interval, Scheme
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
@@ -275,6 +275,12 @@ class Identifier:
             An input has no value yet; a later gap holds the last value and is noted. The position
             of a moving sensor may be missing, and is not held.
         """
+        return self._taken(t, z, inputs)[0]
+
+    def _taken(
+        self, t: float, z: Readings, inputs: Mapping[str, float] | None
+    ) -> tuple[Estimate, Interval]:
+        """Take one sample; return the estimate, and the interval that the law was given."""
         t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         if noise is not None:
@@ -284,15 +290,14 @@ class Identifier:
             self._begun_by(values, t)
         # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        # A first sample at the initial time has an empty interval: both ends are the sample.
-        start = self._inputs if t > self._t else values
         names, gaps = self._channels.inputs, {}
         if names:
             missing = np.array(list(map(held.__contains__, names)), dtype=float)
             if held or np.count_nonzero(self._gaps.held):
                 gaps = self._gaps.gaps(names, missing)
-        z0 = self._z if t > self._t else used
-        interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
+        now = End(t=t, inputs=values, z=used, noise=noise, gaps=gaps)
+        # A first sample at the initial time has an empty interval: both ends are the sample.
+        interval = Interval.between(self._last if t > self._t else now, now)
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
@@ -300,7 +305,13 @@ class Identifier:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
-        return self._estimate(t, measured, withheld, values, report, held, scored=True)
+        estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
+        return estimate, interval
+
+    @property
+    def _last(self) -> End:
+        """The last accepted sample, where the next interval begins."""
+        return End(t=self._t, inputs=self._inputs, z=self._z)
 
     def _time_of_next(self, t: float) -> float:
         """Return the time of the next sample, checked; only the first may be at the start."""
@@ -502,17 +513,15 @@ class Identifier:
             )
         self._check_reachable(float(t[-1]))
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
-        state, before = self._state, self._inputs
+        state, last = self._state, self._last
         if state is None:
-            state, before = self._start(planned[0]), planned[0]
+            state, last = self._start(planned[0]), replace(last, inputs=planned[0])
         blank = np.full(self.observed.size, np.nan)
-        ends = [(end, then, blank) for end, then in zip(t.tolist(), planned, strict=True)]
-        intervals = [
-            Interval(t0, t1, inputs0, inputs1, z0, z1)
-            for (t0, inputs0, z0), (t1, inputs1, z1) in pairwise(
-                [(self._t, before, self._z), *ends]
-            )
+        ends = [
+            End(t=when, inputs=then, z=blank)
+            for when, then in zip(t.tolist(), planned, strict=True)
         ]
+        intervals = [Interval.between(start, stop) for start, stop in pairwise([last, *ends])]
         sensors = self._channels.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
 
@@ -548,7 +557,7 @@ class Identifier:
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
-            taken.append(Sample(sample.t, copy.copy(sample.z), copy.copy(sample.inputs)))
+            taken.append(Sample(t=sample.t, z=copy.copy(sample.z), inputs=copy.copy(sample.inputs)))
             if on_estimate is not None:
                 on_estimate(estimate)
         if result.last is not None:
@@ -594,11 +603,9 @@ class Identifier:
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)
-            t, z, inputs = who._t, who._z, who._inputs
-            estimate = who.step(sample.t, sample.z, sample.inputs)
+            estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
             if before is None:  # the law begins with the inputs of the first sample
-                before, inputs = self._start(who._inputs), who._inputs
-            interval = Interval(t, who._t, inputs, who._inputs, z, who._z)
+                before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who.latent_belief().q)
         result = Result(self.model, self.observed, self.withheld, fields_every)
         data = run.fixed_interval(fields_every)

@@ -112,7 +112,7 @@ class Snapshot:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
     """The stored part of an estimate.
 
@@ -211,14 +211,14 @@ class RecordArrays:
         for k, (numbers, innovation, error) in enumerate(rows):
             said = {name: float(column[k]) for name, column in notes.items()}
             yield Record(
-                self._t[k],
-                numbers,
-                innovation,
-                error,
-                self._status[k],
-                self._steps[k],
-                {name: value for name, value in said.items() if not math.isnan(value)},
-                kept.get(k),
+                t=self._t[k],
+                numbers=numbers,
+                innovation=innovation,
+                withheld_error=error,
+                status=self._status[k],
+                steps=self._steps[k],
+                notes={name: value for name, value in said.items() if not math.isnan(value)},
+                snapshot=kept.get(k),
             )
 
     def _table(self, values: array[float]) -> Array:
@@ -487,7 +487,18 @@ class Layout:
         at = {name: [0.0] * len(grid) for name in ("z", "w")}
         blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [], places=at)
         rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
-        rows.append(Record(0.0, np.zeros(0), np.zeros(1), np.zeros(1), 0, 1, {}, snapshot))
+        rows.append(
+            Record(
+                t=0.0,
+                numbers=np.zeros(0),
+                innovation=np.zeros(1),
+                withheld_error=np.zeros(1),
+                status=0,
+                steps=1,
+                notes={},
+                snapshot=snapshot,
+            )
+        )
         data, coords, _ = blank._contents(rows, None)
         found = {DATE}
         for name, (dimensions, *_) in {**data, **coords}.items():

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate:
     """The estimate of parameter and state after one sample.
 
@@ -340,14 +340,14 @@ class Result:
     def record(self, estimate: Estimate, keeps: bool) -> Record:
         """Return the record of an estimate; `keeps`: with its fields."""
         return Record(
-            estimate.t,
-            np.array(self._readout(estimate.belief)),
-            estimate.innovation,
-            estimate.withheld_error,
-            STATUS_CODES.index(estimate.status.code),
-            estimate.steps,
-            estimate.diagnostics.named(),
-            self.snapshot(estimate) if keeps else None,
+            t=estimate.t,
+            numbers=np.array(self._readout(estimate.belief)),
+            innovation=estimate.innovation,
+            withheld_error=estimate.withheld_error,
+            status=STATUS_CODES.index(estimate.status.code),
+            steps=estimate.steps,
+            notes=estimate.diagnostics.named(),
+            snapshot=self.snapshot(estimate) if keeps else None,
         )
 
     def snapshot(self, estimate: Estimate) -> Snapshot:

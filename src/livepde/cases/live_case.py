@@ -143,7 +143,7 @@ class LiveCase:
         irregular: dict[tuple[str, str], Remark] = {}
         if self._journal is not None and self._journal.first is not None:
             first = self._journal.first
-            self.prepared = self.case.begin(Sample(first.t, first.values), self._start)
+            self.prepared = self.case.begin(Sample(t=first.t, z=first.values), self._start)
         else:
             found = self._begun(stopping, irregular)
             if found is None:
@@ -197,7 +197,7 @@ class LiveCase:
             while found:
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 try:
-                    return self.case.begin(Sample(found[0].t, values), self._start), found
+                    return self.case.begin(Sample(t=found[0].t, z=values), self._start), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
                 self.why = f"the run cannot begin yet: {why}"

@@ -27,7 +27,7 @@ __all__ = ["FleetEstimate", "FleetResult"]
 MEMBER = "member"  # dimension of the dataset
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FleetEstimate:
     """Estimates of all members at one time.
 
@@ -119,7 +119,7 @@ class FleetEstimate:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Row:
     """Record of an estimate: numbers, and no state."""
 
@@ -154,13 +154,13 @@ class FleetResult:
         codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
         self._rows.append(
             _Row(
-                estimate.t,
-                estimate.parameters,
-                estimate.innovation,
-                estimate.withheld_error,
-                np.array(codes, dtype=np.int32),
-                estimate.steps,
-                estimate.diagnostics.named(),
+                t=estimate.t,
+                parameters=estimate.parameters,
+                innovation=estimate.innovation,
+                withheld_error=estimate.withheld_error,
+                status=np.array(codes, dtype=np.int32),
+                steps=estimate.steps,
+                diagnostics=estimate.diagnostics.named(),
             )
         )
         self.last = estimate

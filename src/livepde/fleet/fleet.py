@@ -253,14 +253,32 @@ class Fleet:
             self._begin(values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         if t == last:
-            span = Span(self._t, t, self.inputs, values, values, used, used, noise=noise)
+            span = Span(
+                t0=self._t,
+                t1=t,
+                channels=self.inputs,
+                inputs0=values,
+                inputs1=values,
+                z0=used,
+                z1=used,
+                noise=noise,
+            )
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
-            ends = self._inputs, values, self._z, used
             gaps = np.stack([self._held, missing], axis=1)
             some = gaps if gaps.any() else None
-            span = Span(self._t, t, self.inputs, *ends, noise=noise, gaps=some)
+            span = Span(
+                t0=self._t,
+                t1=t,
+                channels=self.inputs,
+                inputs0=self._inputs,
+                inputs1=values,
+                z0=self._z,
+                z1=used,
+                noise=noise,
+                gaps=some,
+            )
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         # A member whose step failed keeps its time and values: its next step covers both intervals.

@@ -230,7 +230,20 @@ def _judged(
         return filter_.estimate(x)
 
     z, at, u = span.z1, span.end, x.u + x.du
-    sample = ScoredSample(x.C, x.causes, a, q, u, Y, d, used, z, predicted, noise, at)
+    sample = ScoredSample(
+        C=x.C,
+        M=x.causes,
+        a=a,
+        q=q,
+        u=u,
+        Y=Y,
+        d=d,
+        used=used,
+        z=z,
+        predicted=predicted,
+        noise=noise,
+        at=at,
+    )
     causes, ledger = judge.add(x.ledger, sample)
     return changed(x, causes=causes, ledger=ledger)
 

@@ -318,7 +318,7 @@ def numerical(error: Exception) -> Status | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FixedInterval:
     """The samples of a run and its estimates, for a smoother.
 

@@ -123,7 +123,9 @@ def _iterated(
             if guards.within_reach(x.da - begin.da)[0]:
                 return levelled(x, temper), tempered
         start, length = interval.at(interval.t0), interval.t1 - interval.t0
-        window = Window(begin, x, begin.q[0], False, start, length)
+        window = Window(
+            start=begin, now=x, reference=begin.q[0], initial=False, moment=start, length=length
+        )
         far = missed_most(filter_, window) > guards.reach
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered

@@ -84,7 +84,14 @@ def _window(work: SensitivityWork, state: SensitivityState, now: FilterState) ->
     first = first_interval(state.log[:, begin:], work.filter.problem.channels)
     length = float(np.nanmax(state.log[0, begin : int(state.replay.until[0]) + 1, 0])) - first.t1
     reference = state.replay.reference[0]
-    return Window(state.start, now, reference, bool(state.initial[0]), first.end, length)
+    return Window(
+        start=state.start,
+        now=now,
+        reference=reference,
+        initial=bool(state.initial[0]),
+        moment=first.end,
+        length=length,
+    )
 
 
 def _begun(work: SensitivityWork, replay: Replay, state: SensitivityState) -> ReplayState:

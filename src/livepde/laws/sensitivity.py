@@ -326,7 +326,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not np.isfinite(now.da).all():
                 return state
             initial = bool(state.initial[0])
-            begun = Window(state.now, now, x.q[0], initial, interval.end, 0.0)
+            begun = Window(
+                start=state.now,
+                now=now,
+                reference=x.q[0],
+                initial=initial,
+                moment=interval.end,
+                length=0.0,
+            )
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))

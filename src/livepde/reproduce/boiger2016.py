@@ -113,7 +113,7 @@ class NoisyTwin:
             else:
                 size = level * np.sqrt(z @ twin.weights @ z)
                 noise = size * (rng.standard_normal(len(self._modes)) @ self._modes)
-            yield Sample(float(t), z + noise)
+            yield Sample(t=float(t), z=z + noise)
 
 
 @dataclass(frozen=True, eq=False)

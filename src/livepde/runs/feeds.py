@@ -207,7 +207,7 @@ class SampleFeed(Feed):
         """Return the next sample."""
         for sample in self._samples:
             if sample.t > self._after:
-                return [Ready(sample.t, self._values(sample), ())]
+                return [Ready(t=sample.t, values=self._values(sample), tokens=())]
         self._done = True
         return []
 

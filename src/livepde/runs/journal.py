@@ -96,7 +96,7 @@ ESTIMATES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Taken:
     """An accepted sample: its number, its time and the values of all channels (NaN: missing).
 
@@ -297,7 +297,7 @@ class Journal:
             names += self.noise
         row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
-        return Taken(self._current, t, self._named(row.tolist()))
+        return Taken(id=self._current, t=t, values=self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
         self._newest += 1
@@ -639,7 +639,9 @@ class Journal:
             with sound(self.path):
                 if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                taken = Taken(number, float(t), self._named(np.frombuffer(channels).tolist()))
+                taken = Taken(
+                    id=number, t=float(t), values=self._named(np.frombuffer(channels).tolist())
+                )
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
@@ -689,7 +691,16 @@ class Journal:
         found, innovation, error, _ = np.split(values, np.cumsum(sizes))
         said = {str(name): float(number) for name, number in json.loads(notes).items()}
         code = STATUS_CODES.index(STATUS_CODES[status])
-        return Record(float(t), found, innovation, error, code, int(steps), said, snapshot)
+        return Record(
+            t=float(t),
+            numbers=found,
+            innovation=innovation,
+            withheld_error=error,
+            status=code,
+            steps=int(steps),
+            notes=said,
+            snapshot=snapshot,
+        )
 
     def dataset(self) -> xr.Dataset:
         """Return the estimates as a dataset; see `Result.to_xarray`."""

@@ -110,7 +110,7 @@ def _merged(samples: Sequence[Ready]) -> Ready:
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
     tokens = tuple(t for sample in samples for t in sample.tokens)
-    return Ready(samples[-1].t, mean, tokens, _since(samples))
+    return Ready(t=samples[-1].t, values=mean, tokens=tokens, since=_since(samples))
 
 
 def _since(samples: Iterable[Ready]) -> float | None:

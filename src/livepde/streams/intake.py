@@ -142,7 +142,7 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ready:
     """A sample that is complete.
 
@@ -191,7 +191,7 @@ class Past(Protocol):
         """Return whether all samples later than a time can be withdrawn."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Held:
     """A row that waits until later rows have confirmed or refuted its time."""
 
@@ -295,7 +295,7 @@ class Intake:
         else:
             if t is None:
                 found.remark("outside", "", "not between start and stop")
-            elif self._judged(_Held(t, row, token), found):
+            elif self._judged(_Held(t=t, row=row, token=token), found):
                 self._release(found)
                 return found
         found.spent.append(token)
@@ -565,7 +565,9 @@ class Intake:
         self._recent.append((t, sample.values))
         self._released.append(t)
         since, self._since = self._since, None
-        found.ready.append(Ready(t, sample.values, tuple(sample.tokens), since))
+        found.ready.append(
+            Ready(t=t, values=sample.values, tokens=tuple(sample.tokens), since=since)
+        )
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""
