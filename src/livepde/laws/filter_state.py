@@ -41,6 +41,9 @@ class FilterState:
         Time for which the unknowns have moved, shape (members,).
     innovations
         Statistics of the innovations.
+    rate
+        How fast the readings forget the process noise of unknowns that move, by which steps are
+        divided, shape (members,).
     refused
         How many values in a row of each sensor the gate has refused, shape (members, sensors).
     level, samples
@@ -68,6 +71,7 @@ class FilterState:
     past: Array = field(metadata={"grows": 1})
     dpast: Array
     age: Array
+    rate: Array
     innovations: Innovations
     refused: IntArray
     level: Array

@@ -255,6 +255,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             past=np.zeros((1, k, 0)),
             dpast=np.zeros((1, 0)),
             age=0.0 * one,
+            rate=0.0 * one,
             innovations=Innovations.start(sensors),
             refused=np.zeros((1, sensors), dtype=np.int64),
             level=one,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 
 __all__ = ["End", "Interval", "Moments", "Span", "own_noise"]
 
@@ -258,6 +258,18 @@ class Span:
         return Moments(
             t=self.t1, channels=self.channels, inputs=self.inputs1, interval=self.interval
         )
+
+    def part(self, group: IntArray) -> Span:
+        """Return the span of some members."""
+
+        def some(values: Array) -> Array:
+            return values[group] if len(values) > 1 else values
+
+        parts = {item.name: getattr(self, item.name) for item in fields(self)}
+        arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+        if self.inputs0 is self.inputs1:  # the same object says that inputs are held
+            arrays["inputs0"] = arrays["inputs1"]
+        return Span(**(parts | arrays))
 
     def member(self, k: int) -> Interval:
         """Return the interval of one member."""
