@@ -291,7 +291,15 @@ def concluded(
     draw
         Whether to draw figures.
     """
-    from livepde.runs import arrivals, checks_of, input_findings, tables, verdict, verdict_table
+    from livepde.runs import (
+        arrivals,
+        checks_of,
+        clock_findings,
+        input_findings,
+        tables,
+        verdict,
+        verdict_table,
+    )
     from livepde.runs.outcome import attempted
     from livepde.verdict import Verdict
 
@@ -305,7 +313,8 @@ def concluded(
     driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
-        return verdict(dataset).with_findings(input_findings(driven.journal, driving))
+        found = [*clock_findings(driven.journal), *input_findings(driven.journal, driving)]
+        return verdict(dataset).with_findings(found)
 
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())

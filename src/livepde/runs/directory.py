@@ -220,7 +220,8 @@ class RunWriter:
             left.unlink(missing_ok=True)
         begun = {"at": _now(), "livepde": version}
         changed: dict[str, Any] = {}
-        if (path / CASE).read_text(encoding="utf-8", errors="replace") != case:
+        kept = (path / CASE).read_text(encoding="utf-8", errors="replace")
+        if kept != case or run.settings != list(settings):
             begun["intake.shift"] = str(_parts(case)[1])
             changed = {**_written_case(path, case, original or case), "settings": list(settings)}
         resumed = [*run.record.get("resumed", []), begun]

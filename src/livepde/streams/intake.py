@@ -287,7 +287,8 @@ class Intake:
                 f"the times of {name} went back to t = {late:g}, and its rows are late until they "
                 f"are later than t = {self._last:g}; {remedy}"
             )
-        if self._ahead and self._begun:
+        # One row far ahead is counted when it is refuted; several are a matter of health.
+        if self._begun and len({one.t for one in self._ahead}) > 1:
             return (
                 f"rows are far ahead of t = {self._newest:g}, from t = {self._ahead[0].t:g} on, "
                 f"and wait until those after them agree; {remedy}"
