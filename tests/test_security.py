@@ -190,17 +190,17 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
 @pytest.mark.long
 def test_a_damaged_dataset_is_one_sentence(hostile):
     path = hostile / "estimates.nc"
-    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
     for _ in range(200):
         content = bytearray(whole)
         for place in rng.integers(0, 3000, 2):
             content[place] = rng.integers(0, 256)
-        path.write_bytes(content[: len(content) - int(rng.integers(0, 2)) * 1000])
-        try:
+        content = content[: len(content) - int(rng.integers(0, 2)) * 1000]
+        path.write_bytes(content)
+        if content == whole:
+            continue
+        with pytest.raises(lp.errors.RunError, match="is damaged"):
             _ = runs.open(hostile).dataset
-        except lp.errors.RunError:
-            refused += 1
-    assert refused > 100
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from functools import partial
@@ -45,6 +45,7 @@ __all__ = [
     "clock_of",
     "data_file",
     "limits_of",
+    "passwords_of",
     "policy_of",
     "publishers_of",
     "read_data",
@@ -60,6 +61,8 @@ UNSET = (
     f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
     "the measurements."
 )
+PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
+TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password of a server
 LOG = logging.getLogger("livepde.run")
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
@@ -292,11 +295,13 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
     return (stamp - since_1970(origin)) * clock.second
 
 
-def source_of(case: CaseContent, data: Data, position: str) -> RowSource:
+def source_of(
+    case: CaseContent, data: Data, position: str, passwords: Mapping[str, str] | None = None
+) -> RowSource:
     """Return the source of the rows of a case, from a position on."""
     match data:
         case None:
-            return _own_source(case, position)
+            return _own_source(case, position, passwords or {})
         case str():
             return _file_source(case, Path(data), position)
         case Iterable():
@@ -304,12 +309,12 @@ def source_of(case: CaseContent, data: Data, position: str) -> RowSource:
     return data
 
 
-def _own_source(case: CaseContent, position: str) -> RowSource:
+def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) -> RowSource:
     """Return the source that the case names: a broker, a server or a file."""
     spec = case.spec.data
     if spec.mqtt is not None:
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
-        return MqttSource(_broker(case, spec.mqtt, "data.mqtt"), topics, spec.times[0])
+        return MqttSource(_broker(case, spec.mqtt, "data.mqtt", passwords), topics, spec.times[0])
     if spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
@@ -319,7 +324,7 @@ def _own_source(case: CaseContent, position: str) -> RowSource:
             spec.times[0],
             interval=case.positive(spec.opcua.interval, "s", "data.opcua.interval"),
             username=spec.opcua.username,
-            password=_password(case, spec.opcua.password_env, "data.opcua"),
+            password=passwords.get("data.opcua"),
         )
     return _file_source(case, data_file(case), position)
 
@@ -337,12 +342,12 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
     )
 
 
-def publishers_of(case: CaseContent) -> list[Sink]:
+def publishers_of(case: CaseContent, passwords: Mapping[str, str]) -> list[Sink]:
     """Return the sinks that a case names."""
     spec = case.spec.output.mqtt
     if spec is None:
         return []
-    return [MqttSink(_broker(case, spec, "output.mqtt"), spec.topic)]
+    return [MqttSink(_broker(case, spec, "output.mqtt", passwords), spec.topic)]
 
 
 def source_text(case: CaseContent) -> str:
@@ -358,22 +363,45 @@ def source_text(case: CaseContent) -> str:
     return str(spec.file or spec.reader)
 
 
-def _broker(case: CaseContent, spec: BrokerSpec, key: str) -> Broker:
+def _broker(case: CaseContent, spec: BrokerSpec, key: str, passwords: Mapping[str, str]) -> Broker:
     return Broker(
         host=spec.host,
         port=spec.port,
         client_id=spec.client_id or f"livepde-{case.name}",
         username=spec.username,
-        password=_password(case, spec.password_env, key),
+        password=passwords.get(key),
         tls=spec.tls,
         ca_file=spec.ca_file,
         session=round(case.positive(spec.session, "s", f"{key}.session")),
     )
 
 
-def _password(case: CaseContent, variable: str | None, key: str) -> str | None:
-    if variable is None:
-        return None
+def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
+    """Return the passwords of a case by the key of their connection, before any is opened.
+
+    Parameters
+    ----------
+    own
+        Whether the case's own source is used.
+    allowed
+        Environment variables that may be sent, besides those whose names begin with LIVEPDE_.
+    """
+    spec, allowed = case.spec, set(allowed)
+    sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}
+    connections = {**sources, "output.mqtt": spec.output.mqtt}
+    named = {key: one.password_env for key, one in connections.items() if one is not None}
+    return {key: _password(case, name, key, allowed) for key, name in named.items() if name}
+
+
+def _password(case: CaseContent, variable: str, key: str, allowed: Collection[str]) -> str:
+    # A case of somebody else must not send any secret of this machine to a server that it names.
+    own = variable.startswith(PASSWORDS) and variable != TOKEN
+    if not (own or variable in allowed):
+        raise case.error(
+            f"{key}.password_env",
+            f"the environment variable {variable} would be sent to a server that the case names; "
+            f"if you trust it, add --allow-env {variable}, or let the name begin with {PASSWORDS}.",
+        )
     if variable not in os.environ:
         raise case.error(
             f"{key}.password_env", f"the environment variable {variable} is not set; set it."
@@ -412,5 +440,6 @@ def policy_of(case: CaseContent) -> Policy:
         tolerance=duration(spec.tolerance, "intake.tolerance"),
         leap=leap,
         repeated=spec.repeated,
+        shift=duration(spec.shift, "intake.shift"),
         channels=habits,
     )

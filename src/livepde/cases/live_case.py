@@ -17,6 +17,7 @@ from livepde.cases.data import (
     Data,
     check_hours,
     limits_of,
+    passwords_of,
     policy_of,
     publishers_of,
     read_data,
@@ -24,7 +25,7 @@ from livepde.cases.data import (
 )
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
-from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted
+from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
@@ -57,6 +58,9 @@ class LiveCase:
     pace
         Speed of the replay of a finished file, relative to real time; infinity: as fast as
         possible.
+    allow_env
+        Environment variables that the case may use as passwords, besides those whose names begin
+        with LIVEPDE_.
 
     Attributes
     ----------
@@ -79,7 +83,13 @@ class LiveCase:
     """
 
     def __init__(
-        self, case: Case, data: Data = None, *, path: Path | None = None, pace: float = math.inf
+        self,
+        case: Case,
+        data: Data = None,
+        *,
+        path: Path | None = None,
+        pace: float = math.inf,
+        allow_env: Iterable[str] = (),
     ) -> None:
         if not pace > 0.0:
             raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
@@ -89,6 +99,7 @@ class LiveCase:
         self.why = ""
         # An invalid case is refused here, before anything is connected.
         self._policy, self._limits = policy_of(case), limits_of(case)
+        self._passwords = passwords_of(case, data is None, allow_env)
         self._path = path
         self._journal: Journal | None = None
         self._intake: Intake | None = None
@@ -136,7 +147,7 @@ class LiveCase:
             The source ended before the first sample.
         """
         stopping = stopping or threading.Event()
-        sinks = [*sinks, *publishers_of(self.case)]
+        sinks = [*sinks, *publishers_of(self.case, self._passwords)]
         for sink in sinks:
             self._stack.callback(sink.close)
         waiting: Sequence[Ready] = ()
@@ -235,7 +246,7 @@ class LiveCase:
             last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
         self._intake, position = self._new_intake()
-        return Gathered(source_of(case, data, position), self._intake)
+        return Gathered(source_of(case, data, position, self._passwords), self._intake)
 
     def _reads_all(self, data: Data, named: str | None) -> bool:
         """Return whether all rows are read at once, not followed one by one."""
@@ -258,12 +269,11 @@ class LiveCase:
         position = ""
         if journal is not None:
             begun = journal.layout.attrs.get("origin")
-            shift, position = shifted(journal.position)
+            position = journal.position
             options |= {
                 "origin": _seconds(begun),
                 "dates": begun is not None,
                 "last": journal.last,
-                "shift": shift,
                 "recent": [(one.t, one.values) for one in journal.recent(RECENT)],
             }
         intake = Intake(case.columns, case.clock, self._policy, **options)

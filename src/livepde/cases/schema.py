@@ -314,6 +314,7 @@ class IntakeSpec(Spec):
     tolerance: Quantity = Policy.tolerance
     leap: Quantity | None = None
     repeated: Literal["first", "last"] = Policy.repeated
+    shift: Quantity = Policy.shift
     overflow: Literal["queue", "merge", "drop"] = Backlog.overflow
     queue: PositiveInt = Backlog.length
     silence: Quantity | None = None

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 __all__ = ["Event", "Journal", "Taken"]
 
 LOG = logging.getLogger("livepde.run")
-FORMAT = 2
+FORMAT = 3
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
@@ -551,23 +551,6 @@ class Journal:
             else:
                 low = rows[0][0] + 1
         return low
-
-    def returns_to(self, t: float) -> bool:
-        """Return whether all samples later than a time can be withdrawn."""
-        before = self._number_at(math.nextafter(t, math.inf)) - 1
-        numbers = [n for (n,) in self._read("SELECT id FROM checkpoints WHERE id <= ?", before)]
-        # Without a checkpoint all samples are taken again from the first, unless they were thinned.
-        return before > 0 and bool(numbers or not self._thinning()[0])
-
-    def go_back(self, t: float) -> None:
-        """Withdraw all samples later than a time with their estimates, fields and checkpoints."""
-        first = self._number_at(math.nextafter(t, math.inf))
-        later = self._read("SELECT id FROM samples WHERE id >= ? ORDER BY id DESC", first)
-        # From the newest on, so that their numbers can be used again and leave no gaps.
-        for (number,) in later:
-            self._forget(int(number))
-        self._write(self._db.commit)
-        self._last = self._current = self._highest("estimates")
 
     @property
     def position(self) -> str:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from livepde.runs.journal import Journal
 
 __all__ = [
+    "clock_findings",
     "doubts",
     "findings_of",
     "input_findings",
@@ -115,6 +116,19 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         text = f"Channel {name}: {'; '.join(parts)}."
         found.append(Finding("input", "note", text, name, held))
     return found
+
+
+def clock_findings(journal: Journal) -> list[Finding]:
+    """Return that times went back, if they did: estimates rest on the times as they came."""
+    count = journal.counts.get(("clock", ""), 0)
+    if not count:
+        return []
+    text = (
+        f"Times of rows went back {count} times, and rows were not used until their times were new "
+        "again. Later times are only right if the clock was right afterwards."
+    )
+    remedy = "If the clock was wrong, state its correction with `intake.shift`."
+    return [Finding("clock", "caution", text, "", count, remedy=remedy)]
 
 
 def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:
