@@ -16,7 +16,6 @@ from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError, RunError
 from livepde.identifier import Identifier
 from livepde.result import Estimate
-from livepde.verdict import LEVELS, NOT_JUDGED
 
 __all__ = ["Estimator", "Known", "Learned", "Trust"]
 
@@ -35,8 +34,8 @@ class Trust:
     - Each unknown number is well determined: its standard deviation is at most `spread` times its
       value or, if it may be negative, times the prior standard deviation where that is larger.
     - Each lies inside of its bounds, not at one.
-    - The run has judged itself (`Estimate.verdict`), and the verdict is not "do not trust". A run
-      that is not judged, of few samples or by a law that makes no tests, is never trusted.
+    - The run has judged itself (`Estimate.verdict`): one of fewer than 20 samples, or of a law that
+      makes no tests, is "not judged".
 
     Parameters
     ----------
@@ -85,10 +84,7 @@ class Trust:
                 return f"{label} = {value:.4g} is known to {deviation:.2g} only"
             if not low < value < high:
                 return f"{label} = {value:.4g} lies at its bound"
-        verdict = estimate.verdict
-        if verdict.level in (NOT_JUDGED, LEVELS[-1]):
-            return f"the verdict on it is {verdict.level!r}: {verdict.sentences[0]}"
-        return ""
+        return "" if estimate.verdict.judged else estimate.verdict.sentences[0]
 
 
 class Estimator(Protocol):
