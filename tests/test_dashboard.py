@@ -326,6 +326,9 @@ def test_a_finished_run_without_a_journal(tmp_path):
     said = str(cards.verdict(seen))
     assert "Expected rmse <= 0.1, but it is 0.5." in said
     assert "The case says so." in said
+    level, text = cards.gravest(replace(seen, checks=[]))  # nothing of six samples is judged
+    assert (level, text.partition(": ")[0]) == ("warn", "Not judged")
+    assert "Nothing looks wrong" not in str(cards.verdict(replace(seen, checks=[])))
 
 
 def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):

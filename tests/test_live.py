@@ -605,15 +605,18 @@ def test_health_and_metrics(tmp_path):
         "silent": False,
         "status": "ok",
         "counts": [["conflict", "a", 1], ["conflict", "b", 1], ["conflict", "left", 1]],
-        "verdict": "caution",
-        "findings": ["There are 4 samples: too few to judge by."],
+        "verdict": "not judged",
+        "findings": [
+            "Not judged: whether the model holds was not tested (innovations: there are 4 samples, "
+            "20 are needed)."
+        ],
     }
     value = run.result.last.parameters["k"][0]
     assert f'livepde_estimate{{unknown="k"}} {value!r}' in ask("/metrics")
     told = ask("/metrics")
     assert 'livepde_remarks_total{channel="a",kind="conflict"} 1.0' in told
     assert "livepde_waiting_samples 0.0" in told
-    assert "livepde_verdict 1.0" in told
+    assert "livepde_verdict -1.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
     run.silent = True

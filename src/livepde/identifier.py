@@ -39,6 +39,7 @@ from livepde.laws import (
     stepped,
 )
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.step_ledger import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 7  # of the checkpoint
+FORMAT = 8  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -150,6 +151,7 @@ class Identifier:
         self._samples = 0
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
         self._gaps = InputLedger.start(len(self.inputs))
+        self._steps = StepLedger.start()
         # Boundary values may come with the first sample; the initial state has to wait for them
         # then.
         if not self.inputs:
@@ -174,6 +176,7 @@ class Identifier:
         other = copy.copy(self)
         other._state, other._t, other._z, other._samples = state, t, z, samples
         other._gaps = InputLedger(np.zeros(1 + len(held), dtype=np.int64), held)
+        other._steps = StepLedger.start()
         begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
         return other
@@ -301,6 +304,7 @@ class Identifier:
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
+        self._steps = self._steps.add(report.status.code)
         if report.status.taken:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
@@ -347,13 +351,13 @@ class Identifier:
     @property
     def place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
-        ledgers = self._withheld, self._gaps
+        ledgers = self._withheld, self._gaps, self._steps
         return self._state, self._t, self._z, self._inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
-        self._withheld, self._gaps = ledgers
+        self._withheld, self._gaps, self._steps = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -426,16 +430,16 @@ class Identifier:
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return the verdict of the law with the findings on withheld sensors and gaps."""
-        withheld, gaps = self._withheld, self._gaps
+        """Return the verdict of the law with the findings on steps, withheld sensors and gaps."""
+        withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        if not names and not np.count_nonzero(gaps.counts[1:]):
+        if not names and not steps.failed and not np.count_nonzero(gaps.counts[1:]):
             return judge
 
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
-            return judge().with_findings([*withheld.findings(names), *held])
+            return judge().with_findings([*steps.findings(), *withheld.findings(names), *held])
 
         return found
 
@@ -647,6 +651,7 @@ class Identifier:
             "withheld_last": self._withheld.last,
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
+            "steps": self._steps.counts,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -684,6 +689,7 @@ class Identifier:
             z = checkpoint.rebuild(self._z, leaves, "z")
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
             gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
+            steps = StepLedger(leaves["steps"].astype(np.int64))
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
@@ -695,7 +701,7 @@ class Identifier:
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
-        self._state, self._withheld, self._gaps = state, withheld, gaps
+        self._state, self._withheld, self._gaps, self._steps = state, withheld, gaps, steps
         if state is None and not self.inputs:
             self._begin(inputs)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from livepde.laws.coupled import (
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.equation_tests import EquationLedger, EquationTests, ObservedEquation
 from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel, Probes
 from livepde.laws.information import InformationMetric
 from livepde.laws.law import Problem
@@ -56,6 +58,8 @@ class GradientParts:
         never held.
     memory
         Pattern of the information, for `StageTerms`.
+    tests
+        Tests of the equation, for the verdict; None: there is none.
     """
 
     problem: Problem
@@ -70,6 +74,7 @@ class GradientParts:
     probes: Probes | None = None
     memory: Pattern | None = None
     at_estimate: bool = False
+    tests: EquationTests | None = None
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
@@ -105,6 +110,16 @@ class GradientParts:
             return excitation
         seen = self.probes(np.array([w, u]).T, q, moment)
         return self.gate.add(excitation, seen[:, 0], seen[:, 1])
+
+    def tested(
+        self, tested: EquationLedger, present: Array, equation: Callable[[], ObservedEquation]
+    ) -> EquationLedger:
+        """Return the sums of the tests after a sample; one of some sensors only is left out."""
+        if self.tests is None or not self.tests.possible:
+            return tested
+        if not present.all():
+            return tested.interrupted()
+        return self.tests.add(tested, equation())
 
 
 class StageSequence:

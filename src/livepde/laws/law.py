@@ -458,7 +458,8 @@ class Law(ABC, Generic[Work, State]):
 
     def unjudged(self) -> Verdict:
         """Return the verdict where no innovation is judged."""
-        return Verdict.of((), (f"innovations: {type(self).__name__} says nothing of their size",))
+        why = f"innovations: {type(self).__name__} says nothing of their size"
+        return Verdict.of((), (why,), judged=False)
 
 
 AnyLaw = Law[Any, Any]

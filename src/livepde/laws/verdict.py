@@ -15,7 +15,7 @@ from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
-from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
+from livepde.verdict import WINDOWS, Dictionary, Judge, Position, Verdict, assess, too_few
 
 __all__ = ["judge_of", "judged"]
 
@@ -62,9 +62,9 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
     """Return a function that gives the verdict on a member, and holds no more than that needs."""
     judge = filter_.judge
     if judge is None:
-        return lambda: Verdict.of((), ("innovations: verdict = False",))
+        return lambda: Verdict.of((), ("innovations: verdict = False",), judged=False)
     if not x.ledger.seen[member]:
-        return lambda: Verdict.of([_unseen()])
+        return lambda: Verdict.of((), (too_few("innovations", 0),), judged=False)
     # The answers of the process are states of the size of u, which no finding reads.
     x = changed(x, ledger=changed(x.ledger, process=np.zeros((len(x), 0, 0))))
 
@@ -76,10 +76,6 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
             return assess(judge.dictionary, at)
 
     return found
-
-
-def _unseen() -> Finding:
-    return Finding("samples", "caution", "There are no samples: nothing to judge by.")
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

@@ -22,7 +22,7 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
-from livepde.verdict import LEVELS
+from livepde.verdict import LEVELS, NOT_JUDGED
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
@@ -224,7 +224,7 @@ class Live:
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
         told = [event for event in journal.events if event.kind == "verdict"]
-        self._level = told[-1].message.partition(":")[0] if told else LEVELS[0]
+        self._level = told[-1].message.partition(":")[0] if told else NOT_JUDGED
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -670,7 +670,7 @@ class Live:
         if verdict.level != self._level:
             self._level = verdict.level
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
-            self._tell("verdict", f"{verdict.level}: {said}")
+            self._tell("verdict", f"{verdict.level}: {said.removeprefix('Not judged: ')}")
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""

@@ -24,13 +24,20 @@ from livepde.verdict.evidence import (
     mean_squares,
     quiet,
 )
-from livepde.verdict.findings import Cause, Finding, Severity, Verdict, channel_setting
+from livepde.verdict.findings import (
+    FEWEST,
+    Cause,
+    Finding,
+    Severity,
+    Verdict,
+    channel_setting,
+    too_few,
+)
 from livepde.verdict.ledger import Ledger
 
 __all__ = ["Position", "assess"]
 
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
-FEWEST = 20  # samples before which there is nothing to judge by
 LARGER = 1.5  # times the stated noise that is worth a note
 SMALLER = 0.5
 FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
@@ -86,9 +93,8 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
     """Return the verdict on one member."""
     seen = int(at.ledger.seen)
     if seen < FEWEST:
-        text = f"There are {seen} samples: too few to judge by."
-        few = Finding("samples", "caution", text, evidence=float(seen))
-        return Verdict.of([few], dictionary.left_out)
+        untested = (too_few("innovations", seen), *dictionary.left_out)
+        return Verdict.of((), untested, judged=False)
     evidence = causes_of(at.ledger)
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:

@@ -10,13 +10,12 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray
 from livepde.verdict.evidence import chance
-from livepde.verdict.findings import Cause, Finding, channel_setting
+from livepde.verdict.findings import FEWEST, Cause, Finding, channel_setting
 from livepde.verdict.shifts import Shifts
 
 __all__ = ["InputLedger", "WithheldLedger"]
 
 HELD = 0.02  # share of the samples in which the last value of an input was held
-FEWEST = 20  # values before which there is nothing to judge by
 CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
 SIMILAR = 0.05  # relative difference of a slope to that of a unit
 UNITS = (
