@@ -348,8 +348,7 @@ class Form(FormMatrices):
 
         with np.errstate(all="ignore"):  # roots and logarithms of random numbers
             return any(
-                differ(here, steep, values[test], t) or differ(here, there, flux, t)
-                for t in PROBED
+                differ(here, steep, values[test], t) or differ(here, there, flux, t) for t in PROBED
             )
 
     @property
