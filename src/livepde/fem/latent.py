@@ -267,6 +267,10 @@ class Composed(FormMatrices):
         """True if the form is linear in the latent coefficients."""
         return self.latent.linear and self.form.linear_in_parameter
 
+    def differentiates(self, slot: str, test: str = "v") -> bool:
+        """Return True if, integrated by parts, the form contains derivatives of an argument."""
+        return self.form.differentiates(slot, test)
+
     def _physical(self, coefficients: dict[str, Array]) -> dict[str, Array]:
         if "q" not in coefficients:
             return coefficients

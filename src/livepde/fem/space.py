@@ -16,7 +16,7 @@ from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
 from livepde.fem.fields import Declaration, Piecewise, Unknown, declared
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
-from livepde.linalg import Array, IntArray, compact
+from livepde.linalg import Array, IntArray, Mask, compact
 
 __all__ = ["FunctionSpace", "LocalSpace", "Named"]
 
@@ -55,6 +55,11 @@ class LocalSpace:
                 owners += [(local, columns, name, k) for k in range(size)]
             left = columns.stop
         return owners
+
+    @cached_property
+    def derivatives(self) -> Mask:
+        """Mask of the components of fields that are derivatives, shape (components,)."""
+        return np.array([name != "value" for _, _, name, _ in self._owners])
 
     def component(self, k: int) -> tuple[slice, Array]:
         """Return the slice of local functions of a component, and its values (local, E, P)."""

@@ -37,6 +37,7 @@ from livepde.stepping import Newton
 
 __all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
 
+ROUNDING = 1e-9  # of entries of P, which are at most about one
 SAME = 1e-9  # of a step: times that are the same but for rounding
 MOST_STAGES = 8  # kept for different sets of present sensors
 
@@ -248,11 +249,19 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
             "one moves (evolution=): give a number for gain, or use SensitivityLaw."
         )
+    whole = _sees_all(problem)
+    if not whole and model.form_A.differentiates("u"):
+        raise LawError(
+            "GradientLaw: gain='auto' needs data of the whole state where A contains derivatives "
+            "of u, because fluxes at the border of partial data would decide the unknowns: use "
+            "SensitivityLaw on this Subdomain or these sensors, or give a number for gain."
+        )
     metric = InformationMetric(model, observation.nodal)
     observed: ObservedPart[Any] = GeneralizedInverse(problem)
     if observation.reconstruction.regularises:
         observed = RegularizedInverse(problem)
-    elif smooths(problem.observed):
+    elif whole and smooths(problem.observed):
+        # Of partial data the smoothed part moves with w, and errors grow: they stay as they are.
         observed = SelfChosenSmoothing(problem)
     return GradientParts(
         problem=problem,
@@ -265,6 +274,12 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         metric=metric,
         memory=metric.pattern,
     ).prepared()
+
+
+def _sees_all(problem: Problem) -> bool:
+    """Return True if all sensors together determine every free coefficient of the state."""
+    hidden = abs(problem.observed.split().P) @ problem.model.X.free
+    return not bool((hidden > ROUNDING).any())
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:
