@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,6 +38,9 @@ __all__ = [
     "Snapshot",
     "bare",
     "name_clashes",
+    "refusal",
+    "refused_readings",
+    "used_errors",
 ]
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
@@ -549,6 +552,38 @@ def bare(name: str) -> str:
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
+
+
+def refusal(name: str) -> str:
+    """Return the name of the note that is 1 where a reading of a sensor was refused.
+
+    >>> refusal("T_1")
+    'refused T_1'
+    """
+    return f"refused {name}"
+
+
+def refused_readings(data: xr.Dataset) -> dict[str, Mask]:
+    """Return sensor -> which samples have a reading that the gate refused; none without."""
+    found = {}
+    for name in map(str, data["sensor"].values) if "sensor" in data else ():
+        note = refusal(name)
+        key = f"{NOTE}{note}" if f"{NOTE}{note}" in data else note
+        if key in data and data[key].dims == ("time",):
+            found[name] = np.asarray(data[key].values == 1.0)
+    return found
+
+
+def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
+    """Return errors of channels, (samples, channels), NaN where the gate refused the reading."""
+    errors: Array = data[variable].transpose("time", dimension).values
+    refused = refused_readings(data) if variable == "innovation" else {}
+    if not refused:
+        return errors
+    errors, names = errors.copy(), list(map(str, data[dimension].values))
+    for name, which in refused.items():
+        errors[which, names.index(name)] = math.nan
+    return errors
 
 
 def name_clashes(

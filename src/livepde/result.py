@@ -18,7 +18,16 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
-from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
+from livepde.records import (
+    STATUS_CODES,
+    Layout,
+    Record,
+    RecordArrays,
+    Records,
+    Snapshot,
+    refused_readings,
+    used_errors,
+)
 from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
@@ -540,12 +549,15 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
         if variable not in data:
             continue
-        for name in data[dimension].values:
-            errors = data[variable].sel({dimension: name}).dropna("time")
+        columns = used_errors(data, variable, dimension).T
+        for name, column in zip(data[dimension].values, columns, strict=True):
+            errors = column[np.isfinite(column)]
             rows[f"{variable}:{name}"] = {
                 "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
                 "count": float(len(errors)),
             }
+    for name, which in refused_readings(data).items():
+        rows[f"innovation:{name}"]["refused"] = float(which.sum())
     return rows
 
 

@@ -162,7 +162,10 @@ class AutoLaw(Law[Bank, AutoState]):
         work = replace(
             work,
             filter=replace(work.filter, rank=rank, drift=drift, judge=wider),
-            options=replace(work.options, adaptive=True),
+            # Some members drift: they follow a change of the process, and are compared with others.
+            options=replace(
+                work.options, adaptive=True, gate=replace(work.options.gate, anchors=False)
+            ),
             start_window=self.member.start_window if walks else 0,
         )
         return Bank(candidates, work, replays, stated)
@@ -293,7 +296,7 @@ class AutoLaw(Law[Bank, AutoState]):
         at = state.at(leader)
         now = state.members.now
         innovations = now.innovations.newest[at : at + 1]
-        watch, alarms = JUMPS.add(state.watch, innovations, now.refused[at : at + 1])
+        watch, alarms = JUMPS.add(state.watch, innovations, now.screened.refused[at : at + 1])
         alarm, state = bool(alarms[0]), changed(state, watch=watch)
         onset = 0
         if alarm:

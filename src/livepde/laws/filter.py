@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
+from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
@@ -118,6 +119,11 @@ class Filter:
     def drifts(self, member: IntArray) -> Array:
         """Return the drift of some members."""
         return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
+
+    @cached_property
+    def anchor(self) -> Anchor:
+        """Correction of the state by readings that do not change the unknowns."""
+        return Anchor(self.problem, self.sensors)
 
     @cached_property
     def moves(self) -> bool:

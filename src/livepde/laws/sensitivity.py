@@ -20,6 +20,7 @@ from livepde.laws.assimilation import (
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState
+from livepde.laws.gate import Gate, Screened
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
@@ -229,7 +230,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
-        options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
+        # Unknowns that move, or that may jump, follow a change of the process themselves.
+        anchors = not (filter_.moves or self.jumps is not None)
+        gate = Gate(self.gate, self.gate_patience, anchors)
+        options = UpdateOptions(gate, self.noise == "auto")
         # A replay iterates the same linearisation: both would do the same work twice.
         iterated = 0 if self.replay else self.start_window
         return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
@@ -257,7 +261,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             age=0.0 * one,
             rate=0.0 * one,
             innovations=Innovations.start(sensors),
-            refused=np.zeros((1, sensors), dtype=np.int64),
+            screened=Screened.start(sensors),
             level=one,
             samples=GUESS * one,
             evidence=0.0 * one,
@@ -434,7 +438,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 near = ~far.any(axis=1)
                 usual = usual & (near if replays is None else replays | near)
             scale = state.scale.add(span.z1, span.z1 - told.predicted)
-            parts["scale"] = scale.without_refused(state.scale, x.refused)
+            parts["scale"] = scale.without_refused(state.scale, x.screened.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:
@@ -442,7 +446,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 beyond = scale.beyond(span.z1 - told.predicted, noise)
                 usual = usual & ~(beyond > guards.runaway)
         if (jumps := self.jumps) is not None and (present := span.present).any():
-            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.refused)
+            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.screened.refused)
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -21,6 +21,7 @@ from livepde.laws.member_arrays import changed, where, zeros
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
+from livepde.records import refusal
 from livepde.stepping import Span
 
 __all__ = [
@@ -293,8 +294,8 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         found = innovations.diagnostics
         if work.options.adaptive:
             found = replace(found, noise_level=np.sqrt(level))
-        if work.options.gate < np.inf:
-            found = replace(found, refused=told.refused)
+        if work.options.gate.beyond < np.inf:
+            found = _with_refused(found, told.refused, work.filter.problem.observed.names)
         if work.jumps is not None:
             found = replace(found, jump=np.zeros(members))
         if shadows is not None:
@@ -308,6 +309,15 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
 
     steps = np.array([told.steps] * members)
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
+
+
+def _with_refused(
+    found: Diagnostics[Array], refused: Mask, sensors: Sequence[str]
+) -> Diagnostics[Array]:
+    """Return diagnostics with the number of readings refused, and those sensors."""
+    some = np.flatnonzero(refused.any(axis=0)).tolist()
+    each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in some}
+    return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
 
 
 def without_factors(x: FilterState) -> FilterState:

@@ -100,16 +100,20 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     names = [""] * reduction.size
     for label, place in reduction.stay:
         names[place] = label
+    sensors, screened = problem.observed.names, x.screened
+    since, off = screened.since[0].tolist(), screened.off[0].tolist()
     return Position(
         ledger=x.ledger.of_member(0),
         moved=found,
         distance=_distance(reduction, x, a),
-        sensors=problem.observed.names,
+        sensors=sensors,
         noise=np.sqrt(x.level[0]) * filter_.noise,
         unit=problem.observed.observation.unit,
         time_unit=problem.model.time_unit,
         unknowns=names,
         moving=reduction.moves,
+        aside={sensors[i]: (since[i], off[i]) for i in np.flatnonzero(screened.aside[0])},
+        apart={sensors[i]: since[i] for i in np.flatnonzero(screened.apart[0])},
     )
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -76,6 +76,10 @@ class Position:
         Label of each reduced unknown that stays.
     moving
         Whether unknowns move.
+    aside
+        Sensors that are set aside: name -> (since when, last reading minus prediction).
+    apart
+        Sensors that correct the state but not the unknowns: name -> since when.
     """
 
     ledger: Ledger
@@ -87,6 +91,8 @@ class Position:
     time_unit: str
     unknowns: Sequence[str]
     moving: bool
+    aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    apart: Mapping[str, float] = field(default_factory=dict)
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -99,7 +105,7 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
-    findings += [*_noise(at), *_stuck(at), *_refused(at), *_prior(at)]
+    findings += [*_noise(at), *_stuck(at), *_aside(at), *_refused(at), *_prior(at)]
     return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
 
 
@@ -394,9 +400,35 @@ def _stuck(at: Position) -> Iterator[Finding]:
     off = np.abs(ledger.value - ledger.last) / at.noise
     for i in np.flatnonzero((ledger.stuck >= STANDS - 1) & (off > FAR)):
         name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
+        if name in at.aside:  # its readings are not used
+            continue
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
         cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
+
+
+def _aside(at: Position) -> Iterator[Finding]:
+    """Return which sensors are not used, because their readings contradict all else."""
+    time = f" {at.time_unit}" if at.time_unit else ""
+    for name, (since, off) in at.aside.items():
+        unit = f" {at.unit.replace('degC', 'K')}" if at.unit else ""
+        text = (
+            f"{name} is set aside since t = {since:g}{time}: its readings disagree with the model "
+            f"and with the other sensors or its own past, at last by {off:+.3g}{unit}."
+        )
+        cause = Cause("sensor", name, f"sensor {name} is broken or displaced")
+        remedy = (
+            f"Check {name}. If it shows a value that stands for no reading, add it to `missing`."
+        )
+        yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
+    if at.apart:
+        since, number = min(at.apart.values()), float(len(at.apart))
+        text = (
+            f"Since t = {since:g}{time} most readings contradict the model: the process or an "
+            "input has changed. They correct the state; the unknowns are kept as they were before."
+        )
+        remedy = "Allow jumps with `law.jumps = true`, or model the change with `evolution`."
+        yield Finding("changed", "do not trust", text, evidence=number, remedy=remedy)
 
 
 def _refused(at: Position) -> Iterator[Finding]:
