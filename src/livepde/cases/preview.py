@@ -340,6 +340,11 @@ def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
     """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
+    if block.vector:
+        raise ConfigurationError(
+            "advice on sensors requires a state that is one number at each point; this one is a "
+            "vector."
+        )
     # -(-n // m) is n / m, rounded up.
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
     return block.at_vertices[::every], block.field.mesh.p[:, ::every], part
