@@ -17,6 +17,7 @@ from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
 from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
+from livepde.laws.replay import FIXED
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
 from livepde.model import Model
@@ -27,7 +28,6 @@ from livepde.verdict import REFINE, Shifts, discretised
 __all__ = ["Advice", "Identified", "Preview", "advise", "linearised", "preview"]
 
 MOST_SAMPLES = 500
-NEVER = 1 << 60
 
 MOST_CANDIDATES = 400  # positions that are compared
 SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
@@ -107,7 +107,7 @@ def linearised(law: AnyLaw) -> SensitivityLaw | None:
     if not isinstance(law, SensitivityLaw):
         return None
     # A replay that never comes keeps the reference, an infinite gate every reading.
-    replay = Replay(NEVER, NEVER)
+    replay = Replay(FIXED, FIXED)
     return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf, shadows=None)
 
 
@@ -283,10 +283,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
 
 def _moves(model: Model, law: SensitivityLaw) -> bool:
     """Return whether an unknown changes in time, by the law or by its own evolution."""
-    return bool(law.drift) or any(
-        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
-        for unknown in model.parameter_space.unknowns.values()
-    )
+    return bool(law.drift or model.latent.random)
 
 
 def _information(
@@ -343,6 +340,11 @@ def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
     """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
+    if block.vector:
+        raise ConfigurationError(
+            "advice on sensors requires a state that is one number at each point; this one is a "
+            "vector."
+        )
     # -(-n // m) is n / m, rounded up.
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
     return block.at_vertices[::every], block.field.mesh.p[:, ::every], part

@@ -93,6 +93,11 @@ class Latent:
         return any(p.evolution.moves for p in self.parts.values())
 
     @cached_property
+    def random(self) -> tuple[str, ...]:
+        """Names of the unknowns that move at random."""
+        return tuple(name for name, p in self.parts.items() if p.evolution.growth(1.0, 1.0).any())
+
+    @cached_property
     def V(self) -> sp.csr_array:
         """Summation matrix of the visible components, shape (m, dim)."""
         blocks = [

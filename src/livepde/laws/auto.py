@@ -143,9 +143,11 @@ class AutoLaw(Law[Bank, AutoState]):
 
     def prepare(self, problem: Problem) -> Bank:
         stated = self.noise is not None or problem.observed.noise is not None
-        law = self.member
+        # A replay keeps one reference, which is of no use for unknowns that move far from it.
+        walks = bool(problem.model.latent.random)
+        law = replace(self.member, replay=None) if walks else self.member
         if not stated:  # until it is guessed; nor is that of an initial state known
-            law = replace(self.member, noise=1.0)
+            law = replace(law, noise=1.0)
             problem = replace(problem, initial_readings={})
         work = law.prepare(problem)
         reduction = work.filter.reduction
@@ -153,8 +155,6 @@ class AutoLaw(Law[Bank, AutoState]):
         rank = max(2 * reduction.size + 4, work.filter.rank)
         drifts = bool(reduction.still.any())
         candidates = tuple(c for c in CANDIDATES if drifts or not c.drift)
-        # A replay keeps one reference, which is of no use for unknowns that move far from it.
-        walks = reduction.moving(0.0) > 0
         replays = np.array([not (walks or c.drift) for c in candidates])
         judge = work.filter.judge
         wider = None if judge is None else judge.widened(rank - work.filter.rank)
@@ -166,7 +166,6 @@ class AutoLaw(Law[Bank, AutoState]):
             options=replace(
                 work.options, adaptive=True, gate=replace(work.options.gate, anchors=False)
             ),
-            start_window=self.member.start_window if walks else 0,
         )
         return Bank(candidates, work, replays, stated)
 

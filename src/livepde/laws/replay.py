@@ -10,7 +10,9 @@ from livepde.errors import LawError
 from livepde.laws.filter_state import FilterState
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["Replay", "ReplayState"]
+__all__ = ["FIXED", "Replay", "ReplayState"]
+
+FIXED = 1 << 60  # samples before a first replay that never comes: the reference stays
 
 
 @dataclass(frozen=True)

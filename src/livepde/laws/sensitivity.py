@@ -33,7 +33,7 @@ from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
-from livepde.laws.replay import Replay, ReplayState
+from livepde.laws.replay import FIXED, Replay, ReplayState
 from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
@@ -51,6 +51,7 @@ from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.verdict import judge_of, judged
 from livepde.linalg import Array, Mask, nonfinite_allowed
+from livepde.model import Model
 from livepde.stepping import (
     Alexander2,
     BandedStage,
@@ -106,7 +107,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Time constant with which the cross-covariance of state and parameters decays.
     replay
         Iterate about one reference trajectory; for states with a long memory. Not together with
-        `memory`.
+        `memory`, nor with unknowns that move at random (`RandomWalk`, `MeanReverting`, `drift`):
+        samples of the past belong to other values of them.
     rank
         Columns of the factor while unknowns move; default the number of coordinates and five times
         that of those that move.
@@ -192,6 +194,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
                 "observation (one number, or one for each sensor) or to the law."
             )
+        self.check_replay(model)
         reduction = Reduction.of(problem, self.modes)
         # Constant unknowns never need more rows than coordinates. Moving ones and noisy inputs add
         # rows at each step, and a compression needs room for the state's own uncertainty.
@@ -237,6 +240,21 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # A replay iterates the same linearisation: both would do the same work twice.
         iterated = 0 if self.replay else self.start_window
         return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
+
+    def check_replay(self, model: Model) -> None:
+        """Refuse a replay of unknowns that move at random; raises `LawError`."""
+        # A reference that is never moved, as in a preview, stays right: only replays go wrong.
+        if self.replay is None or self.replay.first == FIXED:
+            return
+        latent = model.latent
+        still = [name for name, part in latent.parts.items() if not part.evolution.moves]
+        moving = [(name, "its `evolution`") for name in latent.random]
+        moving += [(name, "`drift`") for name in still if self.drift]
+        for name, cause in moving:
+            raise LawError(
+                "SensitivityLaw: replay requires unknowns that are constant or follow harmonics, "
+                f"but '{name}' moves at random by {cause}: leave out `replay`."
+            )
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
         return self._init(work, q0, u0, None)
