@@ -165,12 +165,13 @@ class EquationTests:
         space = HilbertSpace(sp.csr_array(smooth), "tests", np.flatnonzero(free == 0.0))
         load = np.random.default_rng(0).standard_normal((model.X.dim, TESTS))
         p: Array = np.asarray(space.riesz(np.sqrt(mass.diagonal())[:, None] * load))
-        return p / np.sqrt((p * (mass @ p)).sum(axis=0))
+        found: Array = p / np.sqrt((p * (mass @ p)).sum(axis=0))
+        return found
 
     @property
     def possible(self) -> bool:
         """Whether the data determine the state somewhere, so that its equation can be tested."""
-        return self.functions.shape[1] > 0
+        return bool(self.functions.shape[1])
 
     def add(self, ledger: EquationLedger, at: ObservedEquation) -> EquationLedger:
         """Return the ledger after a sample."""
