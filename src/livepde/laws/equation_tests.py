@@ -33,7 +33,6 @@ from livepde.fem import Moment
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.linalg import Array
 from livepde.model import Model, h1_form, mass_form
-from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 from livepde.verdict import FEWEST, Finding, Severity, Verdict, too_few
 
@@ -137,18 +136,19 @@ class EquationTests:
 
     Parameters
     ----------
-    model, split
-        The process, and the split of its state by all sensors.
+    forms
+        Forms of a stage of all sensors.
     prior
         Columns V, shape (m, k), with the covariance V V^T of q that a prior states; none where the
         law does not go by the prior.
     """
 
-    def __init__(self, model: Model, split: Split, prior: Array) -> None:
-        self.forms = StageForms(model, split, None, None, 0.0)
-        self.partial = split.omega is not None and len(split.omega) < model.mesh.nelements
+    def __init__(self, forms: StageForms, prior: Array) -> None:
+        omega = forms.split.omega
+        self.forms = forms
+        self.partial = omega is not None and len(omega) < forms.model.mesh.nelements
         self.prior = prior
-        self.functions = self._functions(model)
+        self.functions = self._functions(forms.model)
 
     def _functions(self, model: Model) -> Array:
         """Return the test functions, shape (n, TESTS); no columns where the data are no function.

@@ -145,7 +145,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
         # A constant gain does not go by the prior, which need not have a size that means anything.
         if isinstance(metric, InformationMetric):
             prior = metric.probes
-        return replace(parts, tests=EquationTests(problem.model, problem.observed.split(), prior))
+        forms = parts.stage(np.ones(problem.observed.size, dtype=bool)).terms.forms
+        return replace(parts, tests=EquationTests(forms, prior))
 
     def _parts(self, problem: Problem) -> GradientParts:
         if self.gain == "auto":
