@@ -15,8 +15,9 @@ the process does,
 
 and for a law that is tuned by the prior with (A(u_alpha) e, p_j), e drawn from the prior: an error
 of a few per cent of them is that of mesh, time step and smoothing. Sums weigh the sample k by k^2:
-they forget the start, when q was not yet learned. Constants were chosen on rods and squares with
-right models and wrong ones (`benchmarks.silent.unjudged`), a sound run has 0.1 at most.
+they forget the start, when q was not yet learned. The bounds were chosen on rods and squares with
+right models and wrong ones (`benchmarks.silent.unjudged`): with a right model and a q that is
+learned 0.1 is left at most, and up to 0.15 where a constant gain has not learned a field yet.
 
 Nothing of this sees the process outside of omega, nor errors of mesh and step by themselves.
 """
