@@ -135,9 +135,7 @@ FAR = (("a", lp.LogNormal(3.0, 3.0)),)
 def meshed(cells: int) -> list[str]:
     """Return the findings on a rod with some cells, and readings of one with 160."""
     unknowns = {"a": lp.Normal(0.2, 0.1)}
-    fine, coarse = (
-        driven_rod(unknowns, lambda t: 5 * np.sin(3 * t), line(n)) for n in (160, cells)
-    )
+    fine, coarse = (driven_rod(unknowns, lambda t: 5 * np.sin(t), line(n)) for n in (160, cells))
     G = lp.Points(rods.PLACES).matrix(fine.state_space)
     truth = fine.initial_parameter({"a": 0.3})
     control = Advance(lp.Alexander2(), dt_max=0.01)
@@ -241,7 +239,7 @@ RUNS = {
     "channel_ledgers: input": Pair(partial(fed, gaps=True), fed),
     "channel_ledgers: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
     "shifts: hold": Pair(partial(fed, hold=True), fed),
-    "shifts: discretisation": Pair(partial(meshed, 4), partial(meshed, 40)),
+    "shifts: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
     "findings: bound": Pair(partial(warned_of, NARROW), partial(warned_of, ONE)),
     "findings: flat": Pair(partial(warned_of, BESIDE), partial(warned_of, ONE)),
     "run_verdict: input": Pair(partial(counted, spike=2), counted),

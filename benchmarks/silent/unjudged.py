@@ -83,7 +83,7 @@ def judged(
     """Return the result of a run: of all of the rod, or of its part."""
     of = model() if of is None else of
     stated = noise or None
-    sensors = lp.Full(noise=stated)
+    sensors: Any = lp.Full(noise=stated)
     if part:
         sensors = lp.Subdomain(lambda x: (x[0] > 0.2) & (x[0] < 0.7), noise=stated)
     G = sensors.bind(of.state_space, of.X, of.parameter_space).G
@@ -185,7 +185,7 @@ def checks() -> list[Check]:
         Check(
             "an empty run: not shown as not judged",
             float(
-                lp.Identifier(model(), lp.Full(), bare, u0=0.0).run([]).verdict.level
+                lp.Identifier(model(), lp.Full(noise=0.01), bare, u0=0.0).run([]).verdict.level
                 != "not judged"
             ),
             0.0,

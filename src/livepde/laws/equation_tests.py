@@ -15,8 +15,9 @@ the process does,
 
 and for a law that is tuned by the prior with (A(u_alpha) e, p_j), e drawn from the prior: an error
 of a few per cent of them is that of mesh, time step and smoothing. Sums weigh the sample k by k^2:
-they forget the start, when q was not yet learned. Constants were chosen on rods and squares with
-right models and wrong ones (`benchmarks.silent.unjudged`), a sound run has 0.1 at most.
+they forget the start, when q was not yet learned. The bounds were chosen on rods and squares with
+right models and wrong ones (`benchmarks.silent.unjudged`): with a right model and a q that is
+learned 0.1 is left at most, and up to 0.15 where a constant gain has not learned a field yet.
 
 Nothing of this sees the process outside of omega, nor errors of mesh and step by themselves.
 """
@@ -33,7 +34,6 @@ from livepde.fem import Moment
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.linalg import Array
 from livepde.model import Model, h1_form, mass_form
-from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 from livepde.verdict import FEWEST, Finding, Severity, Verdict, too_few
 
@@ -137,18 +137,19 @@ class EquationTests:
 
     Parameters
     ----------
-    model, split
-        The process, and the split of its state by all sensors.
+    forms
+        Forms of a stage of all sensors.
     prior
         Columns V, shape (m, k), with the covariance V V^T of q that a prior states; none where the
         law does not go by the prior.
     """
 
-    def __init__(self, model: Model, split: Split, prior: Array) -> None:
-        self.forms = StageForms(model, split, None, None, 0.0)
-        self.partial = split.omega is not None and len(split.omega) < model.mesh.nelements
+    def __init__(self, forms: StageForms, prior: Array) -> None:
+        omega = forms.split.omega
+        self.forms = forms
+        self.partial = omega is not None and len(omega) < forms.model.mesh.nelements
         self.prior = prior
-        self.functions = self._functions(model)
+        self.functions = self._functions(forms.model)
 
     def _functions(self, model: Model) -> Array:
         """Return the test functions, shape (n, TESTS); no columns where the data are no function.
@@ -165,12 +166,13 @@ class EquationTests:
         space = HilbertSpace(sp.csr_array(smooth), "tests", np.flatnonzero(free == 0.0))
         load = np.random.default_rng(0).standard_normal((model.X.dim, TESTS))
         p: Array = np.asarray(space.riesz(np.sqrt(mass.diagonal())[:, None] * load))
-        return p / np.sqrt((p * (mass @ p)).sum(axis=0))
+        found: Array = p / np.sqrt((p * (mass @ p)).sum(axis=0))
+        return found
 
     @property
     def possible(self) -> bool:
         """Whether the data determine the state somewhere, so that its equation can be tested."""
-        return self.functions.shape[1] > 0
+        return bool(self.functions.shape[1])
 
     def add(self, ledger: EquationLedger, at: ObservedEquation) -> EquationLedger:
         """Return the ledger after a sample."""

@@ -141,10 +141,12 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "out, or use SensitivityLaw."
             )
         parts = self._parts(problem)
+        metric, prior = parts.metric, np.zeros((problem.model.Q.dim, 0))
         # A constant gain does not go by the prior, which need not have a size that means anything.
-        auto = isinstance(parts.metric, InformationMetric)
-        prior = parts.metric.probes if auto else np.zeros((problem.model.Q.dim, 0))
-        return replace(parts, tests=EquationTests(problem.model, problem.observed.split(), prior))
+        if isinstance(metric, InformationMetric):
+            prior = metric.probes
+        forms = parts.stage(np.ones(problem.observed.size, dtype=bool)).terms.forms
+        return replace(parts, tests=EquationTests(forms, prior))
 
     def _parts(self, problem: Problem) -> GradientParts:
         if self.gain == "auto":
