@@ -12,6 +12,19 @@ import numpy as np
 from scipy.linalg import expm
 
 
+def mean_and_end(rate: float, h: float, gained: float) -> np.ndarray:
+    """Return the covariance of mean and end value of the noise of a walk or a relaxation in h.
+
+    By van Loan's block exponential of (integral, value); `gained` is the variance at the end.
+    """
+    A, Q = np.array([[0.0, 1.0], [0.0, -rate]]), np.diag([0.0, 1.0])
+    block = expm(h * np.block([[-A, Q], [np.zeros((2, 2)), A.T]]))
+    P = block[2:, 2:].T @ block[:2, 2:]
+    scale = np.diag([1.0 / h, 1.0])
+    found: np.ndarray = gained / P[1, 1] * scale @ (P + P.T) @ scale / 2
+    return found
+
+
 @dataclass(frozen=True)
 class Exact:
     """The process, and one reading of u at each sample.

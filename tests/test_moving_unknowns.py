@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exact_walk import mean_and_end
 from factories import advanced, driven_rod, line, observe, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
@@ -93,11 +94,16 @@ class Dense:
         B, A = model.form_B.matrix("v", "u", u=zero).toarray(), model.A(zero).matrix.toarray()
         free, h = model.X.free.astype(bool), (t1 - t0) / substeps
         for t in t0 + h * np.arange(1, substeps + 1):
-            F, gained = np.zeros((k, k)), np.zeros((k, k))
+            F, gained = np.zeros((k, k)), np.zeros((2 * k, 2 * k))
             for p in model.latent.parts.values():
                 F[p.part, p.part] = np.kron(p.evolution.transition(h), np.eye(p.size))
-                grown = np.repeat(p.evolution.growth(h, p.unknown.prior.latent_std), p.size)
-                gained[p.part, p.part] = grown[:, None] * self.prior[p.part, p.part]
+                grown = p.evolution.growth(h, p.unknown.prior.latent_std)
+                rates, own = -np.diag(p.evolution.generator), np.arange(k)[p.part]
+                pairs = [mean_and_end(*each) for each in zip(rates, itertools.repeat(h), grown)]
+                for row, column in np.ndindex(2, 2):
+                    variance = np.repeat([pair[row, column] for pair in pairs], p.size)
+                    here = np.ix_(own + row * k, own + column * k)
+                    gained[here] = variance[:, None] * self.prior[p.part, p.part]
             prior = model.latent.prior
             a = prior + F @ (self.x[n:] - prior)
             S, u = M / h + B, model.impose(self.x[:n], lp.fem.Moment(t))
@@ -105,7 +111,8 @@ class Dense:
             step = np.zeros((n, n))
             step[np.ix_(free, free)] = np.linalg.inv(S[np.ix_(free, free)])
             J = np.block([[step @ M / h, -step @ A @ F], [np.zeros((k, n)), F]])
-            N = np.vstack([-step @ A, np.eye(k)])
+            # The one stage of the scheme sees the mean of the noise over the step.
+            N = np.block([[-step @ A, np.zeros((n, k))], [np.zeros((k, k)), np.eye(k)]])
             self.x = np.concatenate([u + step @ load, a])
             self.P = J @ self.P @ J.T + N @ gained @ N.T
 

@@ -87,7 +87,7 @@ class Assimilation(NamedTuple):
     predicted
         Predicted value of each sensor, shape (members, sensors).
     steps
-        Substeps taken.
+        Substeps taken, one number for all members or shape (members,).
     status
         Why no member could be stepped, or ok.
     finite
@@ -99,7 +99,7 @@ class Assimilation(NamedTuple):
     """
 
     predicted: Array
-    steps: int
+    steps: int | IntArray
     status: Status
     finite: Mask
     refused: Mask
@@ -137,7 +137,7 @@ def assimilate(
 
 
 def absorb(
-    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int = 0
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int | IntArray = 0
 ) -> tuple[FilterState, Assimilation]:
     """Update a state that belongs to the end of a span by the measurements there.
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import lapack
@@ -41,6 +41,8 @@ from livepde.stepping import (
     advance,
 )
 from livepde.verdict import Judge
+
+Steps: TypeAlias = int | IntArray
 
 __all__ = ["Filter", "Update", "contraction"]
 
@@ -195,8 +197,10 @@ class Filter:
         q, da = self.reduction.predict(x.q, h), x.da @ F.T
         return changed(x, q=q, da=da, C=x.C @ F.T, age=x.age + h, shadows=shadows)
 
-    def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def predict(self, x: FilterState, span: Span) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
+
+        That number is one for each member if they differ.
 
         The process noise of the unknowns is independent from substep to substep.
         """
@@ -213,7 +217,7 @@ class Filter:
 
     def _divided(
         self, x: FilterState, span: Span
-    ) -> tuple[FilterState, FilterState, int, StepFailed | None]:
+    ) -> tuple[FilterState, FilterState, Steps, StepFailed | None]:
         """Return the state at the start with the rate that the step needs, and as `carried`."""
         length, more = span.t1 - span.start, True
         while more:
@@ -226,12 +230,12 @@ class Filter:
                 x = changed(x, rate=rate)
         return x, end, taken, failure
 
-    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
         if not self.moves:
             return self._through(x, span, [span.t1])
         # Each part of a step has process noise of its own.
-        parts, taken = grades(x.rate, span.t1 - span.start), 0
+        parts, taken = grades(x.rate, span.t1 - span.start), np.zeros(len(x), dtype=np.int64)
         for count in sorted(set(parts.tolist())):
             times = pieces(self.problem.control, span.start, span.t1, count)
             if (parts == count).all():
@@ -240,7 +244,7 @@ class Filter:
             some, steps, failure = self._through(take(x, group), span.part(group), times)
             if failure is not None:
                 return x, steps, failure
-            x, taken = put(x, group, some), max(taken, steps)
+            x, taken[group] = put(x, group, some), steps
         return x, taken, None
 
     def _through(

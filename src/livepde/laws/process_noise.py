@@ -25,17 +25,17 @@ from functools import lru_cache
 
 import numpy as np
 
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Advance
 
 __all__ = ["NoiseRows", "grades", "pieces"]
 
 SHORT = 1e-3  # steps over relaxation times below which a path is that of a random walk
-LONGEST = 0.5  # of the last part of a step over the memory of the readings: standard deviations are
-# within 2 % of those of the exact filter then (tests/test_sparse_samples.py)
+LONGEST = 0.35  # of the last part of a step over the memory of the readings: standard deviations
+# are within 1 % of those of the exact filter then (tests/test_sparse_samples.py)
 COUNTS = 0.01  # variances of the noise of a reading by which the path has to matter for it
+HARDLY = COUNTS / 64.0  # by which it would not matter in a part of twice the length either
 MOST = 10  # parts of a step at most: the last one is a 512th then
-SLOWER = 0.5  # share of the rate so far below which a measured one takes its place
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 
@@ -111,9 +111,10 @@ class NoiseRows:
     def rate(self, before: Array, Y: Array) -> Array:
         """Return the rate at which readings forget the process noise, shape (members,).
 
-        Readings that forget slower than the step see an arch as well as a ramp, others the ramp
-        alone: the ratio of both tells the rate. It rises where the step is too long for it, and
-        falls slowly.
+        Readings that forget slower than the step see an arch as well as a ramp, those that forget
+        faster the ramp alone, those that are late more of the arch: the ratio of both tells the
+        rate. It rises at once where a part of the step is too long for it, and falls to a half of
+        it at most.
 
         Parameters
         ----------
@@ -126,19 +127,26 @@ class NoiseRows:
         if self.weight == 1.0:  # one stage sees the mean of both alike
             return before
         moving = len(self.columns)
-        ramp, arch = (np.linalg.norm(part, axis=2) for part in (Y[:, :moving], Y[:, moving:]))
+        # What each sensor sees, and all of them together: (members, moving, sensors + 1).
+        whole = np.linalg.norm(Y, axis=2, keepdims=True)
+        seen = np.abs(np.concatenate([Y, whole], axis=2))
+        ramp, arch = seen[:, :moving], seen[:, moving:]
         means = _mean(self.rates, self.length, 0.0, 1.0)
         # A state that forgets at a rate lambda is divided by 1 + w lambda h in each of two stages.
-        rest, w = means[0] - self.weight, self.weight
+        rest, w = (means[0] - self.weight)[:, None], self.weight
         with np.errstate(all="ignore"):  # what no sensor sees gives no finite number
-            found = (means[1] * ramp / arch - rest) / w
-            steps = np.maximum((found - 1.0) / w, 0.0)
-            counts = ramp * ramp / (3.0 + 2.0 * steps) > COUNTS
-        steps = np.where(np.isfinite(steps) & (ramp > 0.0), steps, 0.0)
-        found = steps.max(axis=1) / self.length
-        needed = np.where(counts & (steps > LONGEST), steps, 0.0).max(axis=1) / self.length
-        slower = np.where(found < SLOWER * before, found, before)
-        return np.where(needed > 0.0, np.maximum(needed, before), slower)
+            found = (means[1][:, None] * ramp / arch - rest) / w
+            # Negative where readings are late: a delay asks for short parts as a memory does.
+            parts = np.abs(found - 1.0) / w
+            counts = ramp * ramp / (3.0 + 2.0 * parts)
+
+        def fastest(chosen: Mask) -> Array:
+            rate: Array = np.where(chosen & np.isfinite(parts), parts, 0.0).max(axis=(1, 2))
+            return rate / self.length
+
+        needed = fastest((counts > COUNTS) & (parts > LONGEST))
+        slower = np.clip(fastest(counts > HARDLY), 0.5 * before, before)
+        return np.where(needed > before, needed, slower)
 
 
 def _paths(rates: Array, length: float, s: Array) -> Array:

@@ -307,7 +307,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.array([told.steps] * members)
+    steps = np.array(np.broadcast_to(told.steps, members))
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
 
 
