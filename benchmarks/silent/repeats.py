@@ -125,9 +125,12 @@ def fit(rows: Sequence[Row]) -> float:
     """Return the diffusivity by least squares on all rows."""
     left = np.array([row["left"] for row in rows])
     measured = np.array([[row["T_3"], row["T_6"]] for row in rows])
-    answer = least_squares(
-        lambda p: (simulated(1e-5 * p[0], left) - measured).ravel() / NOISE, [3.0], x_scale=1.0
-    )
+
+    def residual(p: Array) -> Array:
+        off: Array = (simulated(1e-5 * float(p[0]), left) - measured).ravel() / NOISE
+        return off
+
+    answer = least_squares(residual, [3.0])
     return 1e-5 * float(answer.x[0])
 
 
@@ -244,7 +247,7 @@ def _went_back(found: _Done, rows: Sequence[Row]) -> list[Check]:
         _none("clock back: times that were never stated", len(set(found.times) ^ set(kept))),
         _none("clock back: late rows that are not counted", abs(late - len(rows) + len(kept))),
         _none("clock back: episodes that are not counted", abs(clock - episodes)),
-        _none("clock back: no event says so", not any("went back" in e for e in found.events)),
+        _none("clock back: no event says so", int(not any("went back" in e for e in found.events))),
     ]
 
 
