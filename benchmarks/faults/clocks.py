@@ -59,7 +59,7 @@ MOVED: Mapping[str, Any] = {
         *rows[:200], *_moved(rows[200:300], HOUR), *rows[300:],
     ],
 }  # fmt: skip
-CLOCKS = INSERTED | MOVED
+CLOCKS = {**INSERTED, **MOVED}
 LASTING = ("set back by a day",)  # rows are late until the end, and the run is not well
 
 
