@@ -168,7 +168,7 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(broken, "BYTES", {})
     case, rows = cases.load(tmp_path / "case.toml"), rod.rod_rows(20)
     fed = broken.fed(case, rows, tmp_path / "rows.jsonl", 20, np.random.default_rng(0))
-    assert fed.reasons == {"late": 20}
+    assert fed.reasons == {"repeated": 20}
     monkeypatch.setattr(
         broken, "JSON", {"new": lambda row, write, rng: write({**row, "time": "2027-01-01"})}
     )

@@ -168,6 +168,50 @@ def test_what_is_sent_again_to_standard_input_is_used_once(here):
     assert np.array_equal(resumed["alpha"], expected["alpha"])
 
 
+@pytest.mark.parametrize("source", ["file", "lines"])
+def test_a_block_that_comes_again_changes_nothing(here, source):
+    """More rows than one commit has; rows 80 to 139 come again after row 159, and are counted."""
+    whole = [row(k) for k in range(220)]
+    again = [*whole[:160], *whole[80:140], *whole[160:]]
+    found = {}
+    for name, given in (("whole", whole), ("again", again)):
+        if source == "file":
+            Path("rows.csv").write_text(HEADER + table(*given))
+            command = ("run", case('file = "rows.csv"'), "--realtime", "--speed", "inf")
+            assert call(*command, "--out", name)[0] == 0
+        else:
+            lines = "".join(json.dumps(one) + "\n" for one in given)
+            command = ("run", case(), "--realtime", "--data", "-", "--out", name)
+            assert call(*command, stdin=lines)[0] == 0
+        found[name] = runs.open(name).dataset
+        with Journal.open(Path(name) / JOURNAL) as journal:
+            assert journal.counts == ({} if name == "whole" else {("repeated", ""): 60})
+    for variable in ("time", "alpha", "alpha_std", "innovation"):
+        expected = found["whole"][variable]
+        assert np.array_equal(found["again"][variable], expected, equal_nan=True)
+
+
+def test_a_run_goes_on_with_a_stated_shift(here):
+    """A clock goes back by twenty minutes: rows are late, then corrected by what the user says."""
+    back = [{**row(k), "time": row(k - 20)["time"]} for k in range(20, 40)]
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(20)), *back[:10]))
+    command = ("run", case('file = "rows.csv"'), "--realtime", "--speed", "inf")
+    command = (*command, "--out", "run", "--resume")
+    assert call(*command)[0] == 0
+    found = runs.open("run")
+    assert found.dataset.sizes["time"] == 20
+    assert any("Times of rows went back once" in note for note in found.notes)
+    with Journal.open(Path("run") / JOURNAL) as journal:
+        assert "intake.shift" in journal.health
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(20)), *back))
+    assert call(*command, "--set", "intake.shift=20 min")[0] == 0
+    expected = [60.0 * k for k in (*range(20), *range(30, 40))]
+    assert runs.open("run").dataset["time"].values.tolist() == expected
+    assert runs.open("run").record["resumed"][0]["intake.shift"] == "20 min"
+    with pytest.raises(lp.errors.CaseError, match=r"intake\.shift"):
+        call(*command, "--set", "intake.shift=20 K")
+
+
 def test_what_is_not_valid_is_counted_in_files_too(here):
     rows = [row(k) for k in range(12)]
     rows[4]["T_3"], rows[7]["left"] = 85.0, ""

@@ -123,8 +123,9 @@ def clock_findings(journal: Journal) -> list[Finding]:
     count = journal.counts.get(("clock", ""), 0)
     if not count:
         return []
+    often = "once" if count == 1 else f"{count} times"
     text = (
-        f"Times of rows went back {count} times, and rows were not used until their times were new "
+        f"Times of rows went back {often}, and rows were not used until their times were new "
         "again. Later times are only right if the clock was right afterwards."
     )
     remedy = "If the clock was wrong, state its correction with `intake.shift`."

@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import pairwise
-from typing import Any, Literal, Protocol
+from itertools import chain, pairwise
+from typing import Any, Literal, Protocol, TypeAlias
 
 from livepde.errors import DataError, SampleError
 from livepde.streams.channel_times import FAR, ChannelTimes, present, usual_of
@@ -106,6 +106,7 @@ MOST_AHEAD = 1000  # rows that wait so; more than these are used without a contr
 REMEMBERED = 1024  # accepted samples that are remembered though the journal has them
 PLAIN = Habit()
 NAN = math.nan
+Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an accepted sample
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,7 @@ class Past(Protocol):
     def last(self) -> float:
         """Time of the last sample, -inf before any."""
 
-    def between(self, low: float, high: float) -> Sequence[tuple[float, Mapping[str, float]]]:
+    def between(self, low: float, high: float) -> Sequence[Known]:
         """Return some of the samples between two times, none where they were thinned."""
 
 
@@ -347,8 +348,9 @@ class Intake:
             self._wait(held, received, found)
             return True
         if held.t > self._newest:
-            # A row that continues the old times refutes those far ahead before it.
-            self._refuse(self._ahead, found)
+            # A row that continues the old times refutes those far ahead, and confirms earlier ones.
+            self._refuse([one for one in self._ahead if one.t > held.t], found)
+            self._use_ahead(found)
             self._received = received
         return self._placed(held, found)
 
@@ -379,8 +381,7 @@ class Intake:
         """Return whether the rows that wait have continued at a usual pace for long enough."""
         times = sorted({one.t for one in self._ahead})
         steps = [b - a for a, b in pairwise(times)]
-        usual = max((self._times.usual(one.values) for one in self._ahead[-1:]), default=math.nan)
-        own = usual_of(steps)
+        usual, own = self._times.usual(self._ahead[-1].values), usual_of(steps)
         reach = self._reach(own if math.isnan(usual) else max(usual, own))
         # The last rows of them, without a step that would be far ahead itself.
         breaks = [k for k, step in enumerate(steps, start=1) if step > reach]
@@ -412,36 +413,30 @@ class Intake:
 
     def _repeats(self, t: float, values: Mapping[str, float]) -> bool:
         """Return whether a row was accepted before, or waits, with the same values."""
-        waiting = (one.values for one in self._ahead if one.t == t)
-        known = (known for _, known in self._near(t))
-        return any(self._same(values, one) for one in (*waiting, *known))
+        waiting = [one.values for one in self._ahead if one.t == t]
+        remembered, journaled = self._known(t)
+        if any(_same(values, known) for known in (*waiting, *(one for _, one in remembered))):
+            return True
+        # The journal has other values than the rows where gaps and spikes were bridged.
+        habits = {name: self.policy.habit(name) for name in values}
+        bridged = {name for name, one in habits.items() if one.interpolated or one.screened}
+        firm = {name: value for name, value in values.items() if name not in bridged} or values
+        return any(_same(firm, known) for _, known in journaled)
 
-    def _near(self, t: float) -> list[tuple[float, Mapping[str, float]]]:
-        """Return the samples of a moment: open, accepted in this session, or in the journal."""
+    def _known(self, t: float) -> tuple[list[Known], list[Known]]:
+        """Return the accepted samples of a moment: as they came, and in the journal."""
         low, high = t - self.policy.tolerance, t + self.policy.tolerance
-        found: list[tuple[float, Mapping[str, float]]] = [
+        found: list[Known] = [
             (s, sample.values) for s, sample in self._open.items() if low <= s <= high
         ]
         if low > self._last:
-            return found
+            return found, []
         for s, values in reversed(self._accepted):
             if s < low:
-                return found  # all samples since then are remembered
+                return found, []  # all samples since then are remembered
             if s <= high:
                 found.append((s, values))
-        if self.past is not None:
-            found += self.past.between(low, high)
-        return found
-
-    def _same(self, values: Mapping[str, float], known: Mapping[str, float]) -> bool:
-        """Return whether the values of a row are those of a sample."""
-        # A sample has other values than its rows where gaps and spikes were bridged.
-        habits = {name: self.policy.habit(name) for name in values}
-        firm = [name for name, one in habits.items() if not (one.interpolated or one.screened)]
-        return all(
-            known.get(name, NAN) == values[name] or (math.isnan(values[name]) and name in known)
-            for name in firm or values
-        )
+        return found, [*self.past.between(low, high)] if self.past is not None else []
 
     def withdraw(self, last: float) -> None:
         """Accept rows later than this time again: the samples after it were withdrawn."""
@@ -482,7 +477,8 @@ class Intake:
 
     def _refuse_late(self, held: _Held, found: IntakeOutcome) -> None:
         """Count the values of a row that is too late: other values than known ones, or new ones."""
-        near = sorted(self._near(held.t), key=lambda sample: abs(sample[0] - held.t))
+        both = chain(*self._known(held.t))
+        near = sorted(both, key=lambda sample: abs(sample[0] - held.t))
         known = near[0][1] if near else {}
         for name in present(held.values):
             value, before = held.values[name], known.get(name, NAN)
@@ -595,10 +591,10 @@ class Intake:
     def _remember(self, t: float, came: dict[str, float]) -> None:
         """Remember an accepted sample, at least until the journal has it."""
         self._accepted.append((t, came))
-        if len(self._accepted) > REMEMBERED and (
-            self.past is None or self._accepted[0][0] <= self.past.last
-        ):
-            self._accepted.popleft()
+        if len(self._accepted) > 2 * REMEMBERED:
+            kept = math.inf if self.past is None else self.past.last
+            while len(self._accepted) > REMEMBERED and self._accepted[0][0] <= kept:
+                self._accepted.popleft()
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""
@@ -651,6 +647,14 @@ class Intake:
         if not (habit.interpolated and self.policy.longest(habit) > 0.0):
             return channel not in values
         return math.isnan(values.get(channel, NAN)) and not self._later(t, channel)
+
+
+def _same(values: Mapping[str, float], known: Mapping[str, float]) -> bool:
+    """Return whether the values of a row are those of a sample."""
+    return all(
+        known.get(name, NAN) == value or (math.isnan(value) and name in known)
+        for name, value in values.items()
+    )
 
 
 def _microseconds(stamp: float) -> float:
