@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -42,3 +41,33 @@ def exact(rows: int, change: float = 1.0, after: int = 10**9) -> np.ndarray:
 def readings(rows: int, seed: int = 0, **process) -> np.ndarray:
     noise = NOISE * np.random.default_rng(seed).standard_normal((rows, 3))
     return exact(rows, **process) + noise
+
+
+def case_text() -> str:
+    """Return a case for `table`, whose initial state is made of the first row."""
+    sensors = "\n".join(
+        f'T_{k + 1} = {{ role = "sensor", column = "T_{k + 1}", at = {x}, noise = {NOISE} }}'
+        for k, x in enumerate(AT)
+    )
+    return f"""
+equation = "heat"
+initial = "interpolate"
+mesh = {{ from = 0, to = {LENGTH}, cells = 16 }}
+data = {{ file = "rod.csv", time = "t", time_unit = "s" }}
+unknowns.alpha = {{ prior = 5e-5, std = 3e-5 }}
+law.kind = "sensitivity"
+
+[channels]
+T_left = {{ role = "boundary", column = "T_left", at = "left" }}
+T_right = {{ role = "boundary", column = "T_right", at = "right" }}
+{sensors}
+"""
+
+
+def table(z: np.ndarray, left_cells: dict[int, float] | None = None) -> str:
+    """Return readings with the values of the ends as a CSV file; some of the left end differ."""
+    lines = ["t,T_left,T_1,T_2,T_3,T_right"]
+    for k, row in enumerate(z.tolist()):
+        end = (left_cells or {}).get(k, left(k * STEP))
+        lines.append(",".join(map(repr, [k * STEP, float(end), *row, 20.0])))
+    return "\n".join(lines) + "\n"

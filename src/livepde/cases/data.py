@@ -20,6 +20,7 @@ from livepde.cases.case_content import CaseContent
 from livepde.cases.equations import check_options, load_code, own_code
 from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
+from livepde.linalg import Mask
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -32,6 +33,7 @@ from livepde.streams import (
 )
 from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
+from livepde.streams.first_rows import wild_first_rows
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
@@ -39,6 +41,7 @@ from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = [
+    "START",
     "Data",
     "assimilation_start",
     "check_hours",
@@ -52,6 +55,8 @@ __all__ = [
     "reader_of",
     "source_of",
     "source_text",
+    "suspect_start",
+    "wild_start",
     "without_gaps",
 ]
 
@@ -64,6 +69,8 @@ UNSET = (
 PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
 TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password of a server
 LOG = logging.getLogger("livepde.run")
+FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
+START = "start"  # kind of remark on values of the first rows
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
@@ -200,9 +207,65 @@ def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
+def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
+    """Return a record without wild first values, from which no initial state must be made.
+
+    They count as missing. Rows at the start in which an input lacks its value for that are left
+    out.
+    """
+    wild = wild_first_rows(table.t, table.values, _comparable(case, table.names))
+    if not wild.any():
+        return table
+    values, drives = np.where(wild, math.nan, table.values), _driving(case, table.names)
+    lacking = (wild & drives).any(axis=1)
+    begin = int(np.flatnonzero(lacking)[-1]) + 1 if lacking.any() else 0
+    counts = zip(table.names, wild.sum(axis=0).tolist(), strict=True)
+    remarks = {**table.remarks, **{(START, name): n for name, n in counts if n}}
+    return replace(table, t=table.t[begin:], values=values[begin:], remarks=remarks)
+
+
+def wild_start(
+    case: CaseContent, rows: Sequence[tuple[float, Mapping[str, float]]]
+) -> list[tuple[int, str]]:
+    """Return the wild values of the first rows of a live source: row and channel of each."""
+    names = list(case.spec.channels)
+    values = np.array([[row.get(name, math.nan) for name in names] for _, row in rows])
+    wild = wild_first_rows(np.array([t for t, _ in rows]), values, _comparable(case, names))
+    return [(k, names[i]) for k, i in np.argwhere(wild).tolist()]
+
+
+def suspect_start(case: CaseContent, row: Mapping[str, float]) -> bool:
+    """Return whether a value of the first row lies far from all others of the same quantity."""
+    names = list(case.spec.channels)
+    for group in _comparable(case, names):
+        values = np.sort([x for k in group if math.isfinite(x := row.get(names[k], math.nan))])
+        if len(values) < 3:
+            continue
+        below, above = values[1] - values[0], values[-1] - values[-2]
+        if below > FAR * np.ptp(values[1:]) or above > FAR * np.ptp(values[:-1]):
+            return True
+    return False
+
+
+def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
+    """Return the channels that measure the same component of the state."""
+    groups: dict[str | None, list[int]] = {}
+    for k, name in enumerate(names):
+        channel = case.spec.channels.get(name)
+        if channel is not None and channel.role in ("boundary", "sensor", "withheld"):
+            groups.setdefault(channel.of, []).append(k)
+    return [*groups.values()]
+
+
+def _driving(case: CaseContent, names: Sequence[str]) -> Mask:
+    """Return which columns drive the model."""
+    channels = case.spec.channels
+    return np.array([name in channels and channels[name].drives for name in names])
+
+
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    channels = case.spec.channels
+    table, channels = without_wild_start(case, table), case.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
     screened = [name for name, item in channels.items() if item.screened]
     return fill_table(table, interpolated, screened)

@@ -8,12 +8,14 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from livepde.cases.case import Case, Prepared
 from livepde.cases.data import (
+    START,
     Data,
     check_hours,
     limits_of,
@@ -22,6 +24,8 @@ from livepde.cases.data import (
     publishers_of,
     read_data,
     source_of,
+    suspect_start,
+    wild_start,
 )
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
@@ -29,6 +33,7 @@ from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
+from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
@@ -199,13 +204,15 @@ class LiveCase:
         LOG.info("waits for the first sample")
         why = told = "no sample came"
         heard = time.monotonic()
-        while not (stopping.is_set() or self._feed.done):
-            found = list(self._feed.poll(LOOK))
+        found: list[Ready] = []
+        while not stopping.is_set() and (found or not self._feed.done):
+            new = list(self._feed.poll(LOOK))
             heard = self._listened(heard)
-            remarks, known = self._feed.remarks(found), set(irregular)
-            for remark in remarks:
+            remarks, known = self._feed.remarks(new), set(irregular)
+            found += new
+            for remark in [*remarks, *self._without_wild(found)]:
                 gather(irregular, remark)
-            while found:
+            while found and not self._too_few(found):
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 try:
                     return self.case.begin(Sample(t=found[0].t, z=values), self._start), found
@@ -225,6 +232,22 @@ class LiveCase:
         first = next(iter(irregular.values()), None)
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
         raise DataError(f"{self.case.path}: {why}{wrong}.")
+
+    def _too_few(self, found: Sequence[Ready]) -> bool:
+        """Return whether more rows have to show if the first one is wild, as it looks."""
+        few = not self._feed.done and len(found) <= FEWEST
+        return few and suspect_start(self.case, found[0].values)
+
+    def _without_wild(self, found: list[Ready]) -> list[Remark]:
+        """Blank wild values of the first rows, and return remarks on them."""
+        if len(found) <= FEWEST:
+            return []
+        remarks = []
+        for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):
+            message = f"{name} = {found[k].values[name]:g} is far off all that follows"
+            remarks.append(Remark(START, name, message))
+            found[k] = replace(found[k], values=found[k].values | {name: math.nan})
+        return remarks
 
     def _listened(self, heard: float) -> float:
         """Note whether the source is silent, and return when something came from it last."""

@@ -51,6 +51,7 @@ class Anchor:
             Innovations, and which of them correct the state, (members, sensors).
         """
         problem, du, U = self.problem, x.du.copy(), x.U.copy()
+        errors = x.shadows.u.copy()  # of the discretisation, which the correction removes, too
         _, Y = self.sensors.observe(x, at)
         for k in np.flatnonzero(used.any(axis=1)).tolist():
             some = np.flatnonzero(used[k])
@@ -61,4 +62,5 @@ class Anchor:
             K = R @ np.linalg.pinv(H @ R, rcond=1e-9, hermitian=True)
             du[k] += K @ d[k, some]
             U[k] -= Y[k][:, some] @ K.T
-        return changed(x, du=du, U=U)
+            errors[k] -= (errors[k] @ H.T) @ K.T
+        return changed(x, du=du, U=U, shadows=changed(x.shadows, u=errors))

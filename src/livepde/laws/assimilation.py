@@ -174,12 +174,13 @@ def absorb(
     parts: dict[str, Any] = {}
     if options.gate.beyond < math.inf:
         expected = d / np.sqrt(variance + shift * shift)
-        far = _far(x, e, expected, used, options.gate.beyond)
+        screened, pause = x.screened.paused(span.t1 - np.asarray(span.t0))
+        far = _far(x, e, np.where(pause[:, None], e, expected), used, options.gate.beyond)
         z = np.broadcast_to(span.z1, used.shape)  # members may share one sample
         if far is None:
-            parts["screened"] = x.screened.fitted(z, used)
+            parts["screened"] = screened.fitted(z, used)
         else:
-            gated = options.gate(x.screened, z, innovations, noise, far, used, span.t1)
+            gated = options.gate(screened, z, innovations, noise, far, used, span.t1, pause)
             parts["screened"], used, whole = gated.state, gated.kept, bool(gated.kept.all())
             refused, anchored = present & ~used, gated.anchored
             newest = np.where(gated.counted, e, np.nan)

@@ -14,13 +14,15 @@ __all__ = ["Gate", "Gated", "Screened"]
 
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 LASTING = 100  # readings that misfit, after which constants have to explain them as well
+CALM = 50  # samples without a correction of the state, after which a disturbance is over
+PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
 ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """What the gate remembers of each sensor; all arrays have the shape (members, sensors).
+    """What the gate remembers of each sensor; arrays have the shape (members, sensors).
 
     Attributes
     ----------
@@ -41,6 +43,12 @@ class Screened:
     last, run, longest
         The last reading, how often it has been repeated, and the longest repetition of a reading
         that was used.
+    strain
+        Readings that misfit while they corrected the state, since a disturbance began.
+    calm
+        Samples since a sensor was `apart`, at most `CALM`, shape (members,).
+    pace
+        Longest usual interval between samples, shape (members,); 0 before.
     """
 
     refused: IntArray
@@ -56,6 +64,9 @@ class Screened:
     last: Array
     run: IntArray
     longest: IntArray
+    strain: IntArray
+    calm: IntArray
+    pace: Array
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Screened:
@@ -76,7 +87,17 @@ class Screened:
             last=never,
             run=none,
             longest=none,
+            strain=none,
+            calm=np.full(members, CALM),
+            pace=np.zeros(members),
         )
+
+    def paused(self, length: Array) -> tuple[Screened, Mask]:
+        """Return the value after intervals of a length (members,), and which were pauses."""
+        pause: Mask = (self.pace > 0.0) & (length > PAUSE * self.pace)
+        # A pace that changes for good is usual after a few samples.
+        usual = np.where(pause, PAUSE * self.pace, length)
+        return replace(self, pace=np.maximum(self.pace, usual)), pause
 
     def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
         """Return the last reading and its repetitions after a sample, and which ones it repeats."""
@@ -89,7 +110,12 @@ class Screened:
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""
         last, run, _ = self.shown(z, present)
-        return replace(self, last=last, run=run)._used(z, present, present)
+        return replace(self, last=last, run=run)._rested()._used(z, present, present)
+
+    def _rested(self) -> Screened:
+        """Return the value with the end of a disturbance, where that is due."""
+        calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
+        return replace(self, calm=calm, strain=np.where(calm[:, None] < CALM, self.strain, 0))
 
     def _used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
         """Return the value with the readings that are used in the past of their sensors."""
@@ -150,7 +176,15 @@ class Gate:
     anchors: bool = False
 
     def __call__(
-        self, x: Screened, z: Array, d: Array, noise: Array, far: Mask, used: Mask, t: float
+        self,
+        x: Screened,
+        z: Array,
+        d: Array,
+        noise: Array,
+        far: Mask,
+        used: Mask,
+        t: float,
+        pause: Mask,
     ) -> Gated:
         """Return what is used of a sample at time t.
 
@@ -160,6 +194,8 @@ class Gate:
             Readings, innovations and their noise, shapes (members, sensors).
         far, used
             Readings that do not fit, and those that are present.
+        pause
+            Members for which the sample follows a pause, shape (members,).
         """
         last, run, same = x.shown(z, used)
         outside, absurd = self._out_of_range(x, z, noise)
@@ -175,23 +211,31 @@ class Gate:
         voters = used & ~implausible
         most = 2 * (voters & misfit).sum(axis=1) > voters.sum(axis=1)
         together = most[:, None] & voters
+        # What misfits after a pause shows that the state is wrong.
+        sudden = misfit & together & pause[:, None] & (x.taken >= SETTLED) & self.anchors
+        refused = np.where(sudden, np.maximum(refused, self.patience + 1), refused)
         late, first = misfit & (refused > self.patience), x.refused == self.patience
-        believed = late & together & (2 * changes >= self.patience)
+        believed = late & together & (sudden | (2 * changes >= self.patience))
         aside = np.where(late & ~believed, x.aside | first | implausible, x.aside & ~believed)
         back = waiting & used & ~misfit & (fits >= self.patience)
         aside = aside & ~back
         refused, changes = np.where(back, 0, refused), np.where(back, 0, changes)
         kept = used & ~aside & (~misfit | late)
         again = misfit & (refused > 1) & ~aside & ~implausible & (~outside | together)
-        apart = (refused > self.patience) & (refused <= self.patience + LASTING) & ~aside
-        apart = apart & (x.taken >= SETTLED) & self.anchors
+        apart = (refused > self.patience) & ~aside & (x.taken >= SETTLED) & self.anchors
+        strain = x.strain + (apart & misfit)
+        lasting = (strain > LASTING).any(axis=1)[:, None]
+        apart = apart & ~lasting
         state = replace(
             x,
+            # Constants that have to explain what lasts begin again with a poor fit.
+            taken=np.where(lasting, -LASTING, x.taken),
             refused=refused,
             changes=changes,
             fits=np.where(back, 0, fits),
             aside=aside,
             apart=apart,
+            strain=np.where(lasting, 0, strain),
             since=np.where(refused > 0, np.where(x.refused > 0, x.since, t), np.nan),
             off=np.where(misfit, d, np.where(refused > 0, x.off, np.nan)),
             last=last,
@@ -200,7 +244,7 @@ class Gate:
         # One value alone is no change of the process; a second one in a row may be.
         anchored = kept & apart.any(axis=1)[:, None]
         learned = kept & ~anchored
-        return Gated(learned, anchored, learned | again, state._used(z, kept, learned))
+        return Gated(learned, anchored, learned | again, state._rested()._used(z, kept, learned))
 
     @staticmethod
     def _out_of_range(x: Screened, z: Array, noise: Array) -> tuple[Mask, Mask]:

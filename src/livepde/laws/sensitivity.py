@@ -116,7 +116,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Innovations of more than this many expected standard deviations, times the usual size of
         normalised innovations where that exceeds 1, are not used; infinity: all are.
     gate_patience
-        After so many refusals in a row a sensor is used again: the process has really changed.
+        After so many refusals in a row a sensor is believed if most others misfit as well, else set
+        aside: see `livepde.laws.gate`.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     start_window

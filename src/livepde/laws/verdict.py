@@ -113,7 +113,8 @@ def _position(filter_: Filter, x: FilterState) -> Position:
         unknowns=names,
         moving=reduction.moves,
         aside={sensors[i]: (since[i], off[i]) for i in np.flatnonzero(screened.aside[0])},
-        apart={sensors[i]: since[i] for i in np.flatnonzero(screened.apart[0])},
+        apart=int(screened.apart[0].sum()),
+        strain=int(screened.strain[0].max()),
     )
 
 

@@ -58,6 +58,7 @@ REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 INPUT_KINDS = {
+    "start": "first values far off all that follow, and off the other channels, count as missing",
     "spike": "values far off those before and after were refused as spikes",
     "interpolated": "gaps were interpolated between the values before and after",
     "missing": "missing values were not between known ones: the last value was held",
@@ -106,9 +107,15 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
 
     Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
-    found = []
-    for name in channels:
-        counts = {kind: n for (kind, channel), n in journal.counts.items() if channel == name}
+    found, driving = [], [*channels]
+    # Wild first values are told of sensors, too: the initial state may have been made of them.
+    others = [name for kind, name in journal.counts if kind == "start"]
+    for name in dict.fromkeys([*driving, *others]):
+        counts = {
+            kind: n
+            for (kind, channel), n in journal.counts.items()
+            if channel == name and (kind == "start" or name in driving)
+        }
         parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
         if not parts:
             continue

@@ -43,6 +43,7 @@ SMALLER = 0.5
 FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
 REFUSED = 0.02  # share of the readings that a gate refuses
 MENDED = 128  # samples of a new window after which a fault may count as mended
+BRIEF = 10  # readings that contradict the model after a pause, say
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
@@ -78,8 +79,9 @@ class Position:
         Whether unknowns move.
     aside
         Sensors that are set aside: name -> (since when, last reading minus prediction).
-    apart
-        Sensors that correct the state but not the unknowns: name -> since when.
+    apart, strain
+        How many sensors correct the state but not the unknowns, and the number of readings of one
+        sensor that did so, since a disturbance began.
     """
 
     ledger: Ledger
@@ -92,7 +94,8 @@ class Position:
     unknowns: Sequence[str]
     moving: bool
     aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    apart: Mapping[str, float] = field(default_factory=dict)
+    apart: int = 0
+    strain: int = 0
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -105,7 +108,7 @@ def assess(dictionary: Dictionary, at: Position) -> Verdict:
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
-    findings += [*_noise(at), *_stuck(at), *_aside(at), *_refused(at), *_prior(at)]
+    findings += [*_noise(at), *_stuck(at), *_aside(at), *_disturbed(at), *_refused(at), *_prior(at)]
     return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
 
 
@@ -421,14 +424,20 @@ def _aside(at: Position) -> Iterator[Finding]:
             f"Check {name}. If it shows a value that stands for no reading, add it to `missing`."
         )
         yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
-    if at.apart:
-        since, number = min(at.apart.values()), float(len(at.apart))
-        text = (
-            f"Since t = {since:g}{time} most readings contradict the model: the process or an "
-            "input has changed. They correct the state; the unknowns are kept as they were before."
-        )
-        remedy = "Allow jumps with `law.jumps = true`, or model the change with `evolution`."
-        yield Finding("changed", "do not trust", text, evidence=number, remedy=remedy)
+
+
+def _disturbed(at: Position) -> Iterator[Finding]:
+    """Return whether most readings contradict the model, or did so until a short while ago."""
+    if not at.strain:
+        return
+    text = (
+        "Most readings contradict the model, or did so in the last samples: the process or an "
+        "input has changed. They correct the state; the unknowns are kept as they were before."
+    )
+    remedy = "Allow jumps with `law.jumps = true`, or model the change with `evolution`."
+    # A few readings correct a state that is wrong after a pause: unknowns may stay well.
+    severity: Severity = "do not trust" if at.apart or at.strain > BRIEF else "caution"
+    yield Finding("changed", severity, text, evidence=float(at.strain), remedy=remedy)
 
 
 def _refused(at: Position) -> Iterator[Finding]:
