@@ -58,7 +58,8 @@ class Estimate:
     diagnose
         Function that returns the diagnostics of the law; see `diagnostics`.
     held
-        Input channels whose last value was held because the sample had none.
+        Input channels whose last value was held because the sample had none; at the first sample
+        also those without a value at the initial time, whose first one was held.
     space
         The unknowns.
     judge
