@@ -71,9 +71,13 @@ class Identifier:
     q0, u0
         Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
         q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
+        Without a sample at t0, boundary channels begin with the values that u0 has on their
+        boundaries. A u0 that is left out, or varies along such a boundary, states none.
     t0
         Initial time. A first sample at exactly t0 describes the start and takes no step; a law
-        may update the unknowns of the initial state by it.
+        may update the unknowns of the initial state by it. Without one, channels of the model
+        whose value at t0 is not known hold their first one over the first interval: the estimate
+        (`Estimate.held`) and the verdict name them.
     withheld
         Sensors that are never assimilated, only scored.
     scheme, dt_max
@@ -144,6 +148,7 @@ class Identifier:
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
+        self._stated = model.boundary_readings(u0)  # at t0
         self._state: Any = None
         self._t = float(t0)
         self._z = np.full(self.observed.size, np.nan)
@@ -175,7 +180,7 @@ class Identifier:
         """
         other = copy.copy(self)
         other._state, other._t, other._z, other._samples = state, t, z, samples
-        other._gaps = InputLedger(np.zeros(1 + len(held), dtype=np.int64), held)
+        other._gaps = replace(InputLedger.start(len(held)), held=held)
         other._steps = StepLedger.start()
         begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
@@ -289,8 +294,7 @@ class Identifier:
         if noise is not None:
             self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
-        if self._state is None:
-            self._begun_by(values, t)
+        unstated = self._begun_by(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
         names, gaps = self._channels.inputs, {}
@@ -309,6 +313,7 @@ class Identifier:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
+        held = (*held, *unstated)
         estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
         return estimate, interval
 
@@ -331,8 +336,18 @@ class Identifier:
             )
         return t
 
-    def _begun_by(self, inputs: Inputs, t: float) -> None:
-        """Begin with the inputs of the first sample, unless no finite state comes of them."""
+    def _opening(self, inputs: Inputs, t: float) -> Inputs:
+        """Return the inputs at the initial time, from those at t of the first sample."""
+        if t == self._t or not self._stated:
+            return inputs
+        return Inputs({**inputs, **self._stated})
+
+    def _begun_by(self, values: Inputs, t: float) -> tuple[str, ...]:
+        """Begin with a first sample, unless no finite state comes of its inputs.
+
+        Return the channels of the model that have no value at the initial time.
+        """
+        inputs = self._opening(values, t)
         try:
             with nonfinite_allowed():
                 state = self._start(inputs)
@@ -347,6 +362,11 @@ class Identifier:
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
         self._state, self._inputs = state, inputs
+        missing = [name for name in self.model.channels if name not in self._stated]
+        unstated = tuple(missing) if t > self._t else ()
+        mask = np.array([name in unstated for name in self.inputs], dtype=float)
+        self._gaps = replace(self._gaps, unstated=mask)
+        return unstated
 
     @property
     def place(self) -> tuple[Any, ...]:
@@ -434,7 +454,8 @@ class Identifier:
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        if not names and not steps.failed and not np.count_nonzero(gaps.counts[1:]):
+        silent = not np.count_nonzero(gaps.counts[1:]) and not gaps.unstated.any()
+        if not names and not steps.failed and silent:
             return judge
 
         def found() -> Verdict:
@@ -519,7 +540,8 @@ class Identifier:
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
         state, last = self._state, self._last
         if state is None:
-            state, last = self._start(planned[0]), replace(last, inputs=planned[0])
+            opening = self._opening(planned[0], float(t[0]))
+            state, last = self._start(opening), replace(last, inputs=opening)
         blank = np.full(self.observed.size, np.nan)
         ends = [
             End(t=when, inputs=then, z=blank)
@@ -608,7 +630,7 @@ class Identifier:
         for item in stream:
             sample = sample_of(item)
             estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
-            if before is None:  # the law begins with the inputs of the first sample
+            if before is None:  # the law begins with the first sample
                 before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who.latent_belief().q)
         result = Result(self.model, self.observed, self.withheld, fields_every)
@@ -652,6 +674,7 @@ class Identifier:
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
             "steps": self._steps.counts,
+            "unstated": self._gaps.unstated,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -688,7 +711,11 @@ class Identifier:
             t, samples = float(leaves["t"]), int(leaves["samples"])
             z = checkpoint.rebuild(self._z, leaves, "z")
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
-            gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
+            gaps = InputLedger(
+                counts=leaves["held_counts"].astype(np.int64),
+                held=leaves["held"],
+                unstated=leaves["unstated"],
+            )
             steps = StepLedger(leaves["steps"].astype(np.int64))
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))

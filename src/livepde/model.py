@@ -480,6 +480,31 @@ class Model:
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)
 
+    def boundary_readings(self, u0: Any) -> dict[str, float]:
+        """Return the boundary channels whose values an initial state states, with these values.
+
+        Left out are channels on whose boundaries u0 varies by more than a thousandth of its range,
+        and those of components that u0 does not name. None states nothing.
+        """
+        if u0 is None:
+            return {}
+        u = self.state_space.interpolate(u0)
+        values: dict[str, Array] = {}
+        allowed: dict[str, float] = {}
+        for name, block in self.state_space.fields.items():
+            given = u0.get(name) if isinstance(u0, Mapping) else u0
+            if given is None:
+                continue
+            own = u[self.state_space.part(name)]
+            inside = block.at_vertices @ own
+            # Rounding counts where the state is the same everywhere.
+            spread = 1e-3 * float(np.ptp(inside)) + 1e-9 * float(np.abs(inside).max())
+            for channel, there in block.traces(given, own):
+                values[channel] = np.append(values.get(channel, []), there)
+                allowed[channel] = min(spread, allowed.get(channel, spread))
+        fits = {channel: np.ptp(there) <= allowed[channel] for channel, there in values.items()}
+        return {channel: float(there.mean()) for channel, there in values.items() if fits[channel]}
+
     def initial(self, u0: Any, moment: Moment = START) -> Array:
         """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
         return self.impose(self.state_space.interpolate(u0), moment)

@@ -379,6 +379,9 @@ class Layout:
         Sensor, withheld or not, that is at one point -> its coordinates.
     attrs
         Attributes of the dataset: title, origin (the date of t = 0), equation.
+    comments
+        Variable of a field -> what its numbers are, where that is not a mean or a standard
+        deviation.
     """
 
     time_unit: str
@@ -395,6 +398,7 @@ class Layout:
     length_unit: str = ""
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
+    comments: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as a JSON object."""
@@ -515,8 +519,9 @@ class Layout:
             return data
         for name in kept[0].profiles:
             values = np.array([snapshot.profiles[name] for snapshot in kept])
-            unit = {"units": self.units.get(name, self.units.get(bare(name), ""))}
-            data[name] = (("snapshot", "vertex"), values, unit)
+            attrs = {"units": self.units.get(name, self.units.get(bare(name), ""))}
+            attrs |= {"comment": self.comments[name]} if name in self.comments else {}
+            data[name] = (("snapshot", "vertex"), values, attrs)
         for name, (_, count) in kept[-1].told.items():
             told = np.array([snapshot.told[name][0] for snapshot in kept])
             about = {"long_name": "modes that the data have told of", "of": count}

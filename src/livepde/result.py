@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.errors import ConfigurationError
-from livepde.fem import FieldBlock, FunctionSpace, cells
+from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
 from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
@@ -43,6 +43,9 @@ __all__ = [
     "vertex_order",
 ]
 
+MEDIAN = "the median"
+FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate:
@@ -67,7 +70,8 @@ class Estimate:
     diagnose
         Function that returns the diagnostics of the law; see `diagnostics`.
     held
-        Input channels whose last value was held because the sample had none.
+        Input channels whose last value was held because the sample had none; at the first sample
+        also those without a value at the initial time, whose first one was held.
     space
         The unknowns.
     judge
@@ -179,7 +183,11 @@ class Estimate:
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none)."""
+        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none).
+
+        For a `Normal` mean and standard deviation. Under a transform the median, and the standard
+        deviation to first order; `estimate[label]` has mean and standard deviation of these, too.
+        """
         std = self.q_std
         return {
             label: (float(self.q[k]), float(std[k]) if std is not None else np.nan)
@@ -205,7 +213,7 @@ class Estimate:
         }
 
     def __getitem__(self, name: str) -> Marginal:
-        """Return the marginal of one unknown: its mean, standard deviation and intervals.
+        """Return the marginal of one unknown: median, mean, standard deviation and intervals.
 
         Parameters
         ----------
@@ -233,20 +241,37 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """The marginal distribution of one unknown in an estimate.
+    """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
 
     Attributes
     ----------
-    mean, std
-        A number each; of a field arrays of coefficients. The standard deviation is NaN for a law
-        without covariance.
+    median
+        A number; of a field an array of coefficients.
+    deviation
+        Standard deviation to first order: that of the latent value times the slope of the transform
+        at the median. NaN for a law without covariance.
     unknown
         The unknown with its prior.
     """
 
-    mean: Any
-    std: Any
+    median: Any
+    deviation: Any
     unknown: Any
+
+    @property
+    def mean(self) -> Any:
+        """Mean: the median of a `Normal`, larger than it for a `LogNormal`."""
+        return self._moments[0]
+
+    @property
+    def std(self) -> Any:
+        """Standard deviation: `deviation` of a `Normal`, larger for a `LogNormal`."""
+        return self._moments[1]
+
+    @cached_property
+    def _moments(self) -> tuple[Any, Any]:
+        mean, std = self.unknown.prior.moments(self.median, self.deviation)
+        return (float(mean), float(std)) if isinstance(self.median, float) else (mean, std)
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the ends of the central interval that holds it with probability `level`.
@@ -254,12 +279,17 @@ class Marginal:
         Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
         without covariance.
         """
-        low, high = self.unknown.interval(self.mean, self.std, level)
-        return (float(low), float(high)) if isinstance(self.mean, float) else (low, high)
+        low, high = self.unknown.interval(self.median, self.deviation, level)
+        return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
 
     def __str__(self) -> str:
-        numbers = isinstance(self.mean, float)
-        return f"{self.mean:.4g} ± {self.std:.2g}" if numbers else repr(self)
+        """Return mean and standard deviation; under a transform median and 95 % interval."""
+        if not isinstance(self.median, float):
+            return repr(self)
+        if isinstance(self.unknown.prior, Normal):
+            return f"{self.mean:.4g} ± {self.std:.2g}"
+        low, high = self.interval()
+        return f"{self.median:.4g} (95 %: {low:.4g} to {high:.4g})"
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
@@ -465,7 +495,9 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
     for label in model.parameter_space.labels:
         unknown = unknown_of(model.parameter_space, label)
         unit: dict[str, Any] = {"units": unknown.unit}
-        numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
+        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
+        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
+        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
         numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
         numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
     points = model.mesh.p[:, vertex_order(model)]
@@ -485,6 +517,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         state=[key for name, block in components for key in block.variables(name)],
         length_unit=model.length_unit,
         places={name: at.tolist() for name, at in places.items()},
+        comments=_field_comments(model),
     )
 
 
@@ -535,6 +568,15 @@ def _prior(unknown: Any) -> dict[str, float]:
     found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
     if not unknown.evolution.moves:  # one that moves is never known better for good
         found["prior_std"] = float(unknown.prior.std)
+    return found
+
+
+def _field_comments(model: Model) -> dict[str, str]:
+    """Return unknown field or its standard deviation -> what it is, where it has a transform."""
+    found: dict[str, str] = {}
+    for name, block in model.parameter_space.fields.items():
+        if not isinstance(block.field.prior, Normal):
+            found |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
     return found
 
 

@@ -48,7 +48,8 @@ class FleetEstimate:
     diagnose
         Function that returns the diagnostics of the law, numbers of shape (members,).
     held
-        Input channels whose last value was held -> which members had none, shape (members,).
+        Input channels whose last value was held, or at the first sample the first one -> which
+        members had none, shape (members,).
     space
         The unknowns.
     belief

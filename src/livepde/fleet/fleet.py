@@ -120,6 +120,12 @@ class Fleet:
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
+        # Boundary values at t0 that u0 states, shape (members, channels), NaN where it does not.
+        self._stated = np.full((len(self.members), len(self.inputs)), np.nan)
+        for k, u in enumerate(u0s):
+            if k == 0 or u is not u0s[k - 1]:
+                stated = model.boundary_readings(u)
+            self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
         self.note = law.stepped_alone(self._work)
         self._engine = self._stepper(made_of, u0s)
         count = len(self)
@@ -250,7 +256,9 @@ class Fleet:
                 "time, or take a longer dt_max."
             )
         if self._state is None:
-            self._begin(values)
+            if t > last:
+                held = {**held, **self._unstated(held)}
+            self._begin(self._opening(values) if t > last else values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         if t == last:
             span = Span(
@@ -289,6 +297,21 @@ class Fleet:
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
         return self._estimate(span, measured, withheld, report, held)
+
+    def _opening(self, inputs: Array) -> Array:
+        """Return the inputs at the initial time, from those of a later first sample."""
+        unknown = np.isnan(self._stated)
+        # The same object at both ends says that inputs are held.
+        return inputs if unknown.all() else np.where(unknown, inputs, self._stated)
+
+    def _unstated(self, held: Mapping[str, Array]) -> dict[str, Array]:
+        """Return channels of the model -> members without a value now or at the initial time."""
+        found = {}
+        for k, name in enumerate(self.inputs):
+            unknown = np.isnan(self._stated[:, k])
+            if name in self.model.channels and unknown.any():
+                found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
+        return found
 
     def _check_order(self, t: float, last: float) -> None:
         if t < last or (t == last and self._samples):
@@ -388,6 +411,7 @@ class Fleet:
         other.members = tuple(self.members[k] for k in which)
         other._engine = self._engine.subset(which)
         other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
+        other._stated = self._stated[which]
         other._t, other._z = self._t[which], self._z[which]
         other._inputs, other._held = self._inputs[which], self._held[which]
         other._state, other._samples = state, samples

@@ -263,19 +263,28 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
             reference = shown(float(attrs.get("reference", math.nan)), ".5g")
             rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
     columns = ("unknown", "value", "± std. dev.", "95 %", "unit")
+    title = f"Estimates{_first_order(data, labels)}"
     if not compared:
-        return Table("Estimates", columns, rows)
+        return Table(title, columns, rows)
     source = str(data.attrs.get("reference_source", ""))
-    title = f"Estimates; reference: {source}" if source else "Estimates"
+    title = f"{title}; reference: {source}" if source else title
     return Table(title, (*columns, "reference", "error"), rows)
+
+
+def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
+    """Return the part of a title that says which values are medians; empty if none is."""
+    found = [name for name in names if "comment" in data[name].attrs]
+    if not found:
+        return ""
+    whose = "" if len(found) == len(names) else f"{', '.join(found)}: "
+    return f" ({whose}median, std. dev. to first order)"
 
 
 def _fields(data: xr.Dataset) -> Table:
     """Return the table of the last snapshots of the unknown fields."""
     rows: list[tuple[Any, ...]] = []
-    for name in field_names(data):
-        if name not in data:
-            continue
+    names = [name for name in field_names(data) if name in data]
+    for name in names:
         last = data[name].values[-1]
         known = f"{name}_std" in data
         std = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
@@ -283,7 +292,7 @@ def _fields(data: xr.Dataset) -> Table:
         unit = data[name].attrs.get("units", "")
         rows.append((name, *numbers, shown(std, ".2g"), _left_out(data, name), unit))
     columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
-    return Table("Estimated fields", columns, rows)
+    return Table(f"Estimated fields{_first_order(data, names)}", columns, rows)
 
 
 def _channels(data: xr.Dataset) -> Table:
