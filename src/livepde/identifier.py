@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.fingerprint import Fingerprint, fingerprint
 from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
 from livepde.laws import (
@@ -154,6 +155,7 @@ class Identifier:
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._samples = 0
+        self._fingerprint = self._lazy_fingerprint()
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
         self._gaps = InputLedger.start(len(self.inputs))
         self._steps = StepLedger.start()
@@ -161,6 +163,23 @@ class Identifier:
         # then.
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
+        parts = self.law, self.problem, self.withheld
+        return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
+
+    def started(self, q0: Array, u0: Array) -> Identifier:
+        """Return an identifier of the same parts with another start; for `Fleet.identifier`.
+
+        Parameters
+        ----------
+        q0, u0
+            Latent parameter and state, shapes (m,) and (n,).
+        """
+        other = copy.copy(self)
+        other._q0, other._u0 = q0, u0
+        other._fingerprint = other._lazy_fingerprint()
+        return other
 
     def placed(
         self, state: Any, t: float, z: Array, inputs: Array, held: Array, samples: int
@@ -647,7 +666,12 @@ class Identifier:
                 "longer dt_max."
             )
 
-    def _fingerprint(self) -> dict[str, Any]:
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Numbers by which a checkpoint of this problem is known; computed when first asked for."""
+        return self._fingerprint()
+
+    def _header(self) -> dict[str, Any]:
         return {
             "format": FORMAT,
             "law": type(self.law).__name__,
@@ -663,7 +687,7 @@ class Identifier:
 
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
-        header = {**self._fingerprint(), "begun": self._state is not None}
+        header = {**self._header(), "begun": self._state is not None}
         leaves = {
             "t": self._t,
             "z": self._z,
@@ -675,6 +699,7 @@ class Identifier:
             "held": self._gaps.held,
             "steps": self._steps.counts,
             "unstated": self._gaps.unstated,
+            **self.fingerprint.leaves,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -686,7 +711,8 @@ class Identifier:
         Raises
         ------
         RunError
-            The file is damaged, or of another model, law or set of sensors.
+            The file is damaged, or of another problem: another model, prior, sensor place or
+            boundary value, say, or another option of the law.
         """
         self.restore(checkpoint.read(path), str(path))
 
@@ -694,7 +720,7 @@ class Identifier:
         """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         # Nothing of this identifier changes before all parts of the checkpoint have been read.
-        mine = self._fingerprint()
+        mine = self._header()
         for key, value in mine.items():
             if header.get(key) != value:
                 if key == "format":
@@ -706,6 +732,11 @@ class Identifier:
                     f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."
                 )
+        if differs := self.fingerprint.differing(leaves):
+            raise RunError(
+                f"{where} was saved with another {differs}. Build the identifier as it was then, "
+                "or start a new run."
+            )
         state = None
         try:
             t, samples = float(leaves["t"]), int(leaves["samples"])

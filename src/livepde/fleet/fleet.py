@@ -21,6 +21,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import MOST_SUBSTEPS, Identifier
@@ -34,7 +35,7 @@ from livepde.stepping import Advance, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 6  # of the checkpoint
+FORMAT = 7  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -135,6 +136,7 @@ class Fleet:
         self._inputs = np.full((count, len(self.inputs)), np.nan)
         self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
         self._samples = 0
+        self._starts: dict[int, Identifier] = {}
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -386,7 +388,10 @@ class Fleet:
         k = member if isinstance(member, int) else self.members.index(member)
         state = None if self._state is None else self._engine.member(self._state, k)
         t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
-        return self._one.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
+        # Kept, since its fingerprint is computed once for all checkpoints of this member.
+        start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k])
+        self._starts[k] = start
+        return start.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
@@ -407,7 +412,9 @@ class Fleet:
             How many they have taken.
         """
         other = copy.copy(self)
-        vars(other).pop("fingerprint", None)
+        other._starts = {}
+        for name in ("header", "fingerprint"):
+            vars(other).pop(name, None)
         other.members = tuple(self.members[k] for k in which)
         other._engine = self._engine.subset(which)
         other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
@@ -530,7 +537,12 @@ class Fleet:
         return values, held
 
     @cached_property
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> Fingerprint:
+        """Numbers by which a checkpoint of this fleet is known; computed when first asked for."""
+        return self._one.fingerprint.of_members(self._q0, self._u0)
+
+    @cached_property
+    def header(self) -> dict[str, Any]:
         """Properties that a fleet must share with the one whose checkpoint it takes over."""
         return {
             "format": FORMAT,
@@ -543,15 +555,23 @@ class Fleet:
             "together": self.together,
         }
 
+    def check(self, header: Mapping[str, Any], leaves: Mapping[str, Array], where: str) -> None:
+        """Raise `RunError` unless a checkpoint, named `where` in messages, is of such a fleet."""
+        other = [key for key, value in self.header.items() if header.get(key) != value]
+        if differs := other[0] if other else self.fingerprint.differing(leaves):
+            raise RunError(
+                f"{where} was saved with another {differs}; build the fleet as it was then."
+            )
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a file, from which `load` continues with bit-identical numbers."""
         checkpoint.write(path, self.dump())
 
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
-        header = {**self.fingerprint, "begun": self._state is not None}
+        header = {**self.header, "begun": self._state is not None}
         leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
-        leaves["held"] = self._held
+        leaves |= {"held": self._held, **self.fingerprint.leaves}
         if self._state is not None:
             leaves |= {
                 f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
@@ -571,12 +591,7 @@ class Fleet:
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
         """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
-        for key, value in self.fingerprint.items():
-            if header.get(key) != value:
-                raise RunError(
-                    f"{where} was saved with another {key}; build the fleet as it was when it was "
-                    "saved."
-                )
+        self.check(header, leaves, where)
         state = None
         try:
             if header["begun"]:

@@ -16,7 +16,7 @@ from livepde.laws.gate import Gate
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, ScoredSample
 

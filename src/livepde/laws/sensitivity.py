@@ -146,7 +146,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     start_window: int = 64
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
-    verdict: bool | str = True
+    # A run may be judged that was not judged before: fleets are not.
+    verdict: bool | str = field(default=True, metadata={"begins_anew": True})
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
     graded_start: ClassVar[bool] = True

@@ -562,7 +562,9 @@ class ShadowSet:
         n, k, rows = x.u.shape[1], x.C.shape[2], len(self.shadows)
         u, a = np.zeros((1, rows, n)), np.zeros((1, rows, k))
         nothing = np.zeros((1, len(self.problem.channels)))
-        s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing)
+        # A sample at the start itself counts from there, and not from time zero.
+        begun = np.full(1, 0.0 if moment is None else moment.t)
+        s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing, begun=begun)
         for shadow in self.shadows:
             s = shadow.start(s, x, moment, given)
         return s
