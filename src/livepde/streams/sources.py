@@ -122,7 +122,7 @@ class Follow(RowSource):
 
     A line is read once its end has been written. A file that is replaced by another (rotated logs)
     is read to its end before the new one; one that has become shorter is read again from its start,
-    where known samples are late. Unread rows of a file that was renamed are lost after a crash.
+    where known rows are repeated. Unread rows of a file that was renamed are lost after a crash.
 
     Parameters
     ----------
