@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
 
 __all__ = ["Gate", "Gated", "Screened"]
@@ -31,7 +32,7 @@ class Screened:
     fits
         Readings in a row that fit, of a sensor of which too many did not.
     taken
-        Readings that were used.
+        Readings that were used, at most `SETTLED`.
     aside
         Sensors that are set aside.
     apart
@@ -46,7 +47,7 @@ class Screened:
     strain
         Readings that misfit while they corrected the state, since a disturbance began.
     calm
-        Samples since a sensor was `apart`, at most `CALM`, shape (members,).
+        Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
     pace
         Longest usual interval between samples, shape (members,); 0 before.
     """
@@ -94,42 +95,42 @@ class Screened:
 
     def paused(self, length: Array) -> tuple[Screened, Mask]:
         """Return the value after intervals of a length (members,), and which were pauses."""
-        pause: Mask = (self.pace > 0.0) & (length > PAUSE * self.pace)
+        longer: Mask = length > self.pace
+        if not np.count_nonzero(longer):
+            return self, longer
+        pause = longer & (self.pace > 0.0) & (length > PAUSE * self.pace)
         # A pace that changes for good is usual after a few samples.
         usual = np.where(pause, PAUSE * self.pace, length)
-        return replace(self, pace=np.maximum(self.pace, usual)), pause
-
-    def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
-        """Return the last reading and its repetitions after a sample, and which ones it repeats."""
-        same: Mask = present & (z == self.last)
-        if np.count_nonzero(present) == present.size:
-            return z, np.where(same, self.run + 1, 0), same
-        run = np.where(present, np.where(same, self.run + 1, 0), self.run)
-        return np.where(present, z, self.last), run, same
+        return changed(self, pace=np.maximum(self.pace, usual)), pause
 
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""
         last, run, _ = self.shown(z, present)
-        return replace(self, last=last, run=run)._rested()._used(z, present, present)
+        return changed(self, last=last, run=run).used(z, present, present)
 
-    def _rested(self) -> Screened:
-        """Return the value with the end of a disturbance, where that is due."""
-        calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
-        return replace(self, calm=calm, strain=np.where(calm[:, None] < CALM, self.strain, 0))
+    def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
+        """Return the last reading and its repetitions after a sample, and which ones it repeats."""
+        same: Mask = present & (z == self.last)
+        repeats = np.count_nonzero(same) or np.count_nonzero(self.run)
+        run = np.where(same, self.run + 1, 0) if repeats else self.run
+        if np.count_nonzero(present) == present.size:
+            return z, run, same
+        return np.where(present, z, self.last), np.where(present, run, self.run), same
 
-    def _used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
+    def used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
         """Return the value with the readings that are used in the past of their sensors."""
-        taken = self.taken + learned
         if np.count_nonzero(kept) < kept.size:
             z = np.where(kept, z, np.nan)
-        longest = np.maximum(self.longest, np.where(kept, self.run, 0))
-        return replace(
-            self,
-            taken=taken,
-            low=np.fmin(self.low, z),
-            high=np.fmax(self.high, z),
-            longest=longest,
-        )
+        parts = {"low": np.fmin(self.low, z), "high": np.fmax(self.high, z)}
+        # Most samples repeat nothing, come after the first ones, and in no disturbance.
+        if np.count_nonzero(self.run):
+            parts["longest"] = np.maximum(self.longest, np.where(kept, self.run, 0))
+        if self.taken.min() < SETTLED:
+            parts["taken"] = np.minimum(self.taken + learned, SETTLED)
+        if np.count_nonzero(self.strain):
+            calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
+            parts |= {"calm": calm, "strain": np.where(calm[:, None] < CALM, self.strain, 0)}
+        return changed(self, **parts)
 
 
 class Gated(NamedTuple):
@@ -226,7 +227,7 @@ class Gate:
         strain = x.strain + (apart & misfit)
         lasting = (strain > LASTING).any(axis=1)[:, None]
         apart = apart & ~lasting
-        state = replace(
+        state = changed(
             x,
             # Constants that have to explain what lasts begin again with a poor fit.
             taken=np.where(lasting, -LASTING, x.taken),
@@ -244,7 +245,7 @@ class Gate:
         # One value alone is no change of the process; a second one in a row may be.
         anchored = kept & apart.any(axis=1)[:, None]
         learned = kept & ~anchored
-        return Gated(learned, anchored, learned | again, state._rested()._used(z, kept, learned))
+        return Gated(learned, anchored, learned | again, state.used(z, kept, learned))
 
     @staticmethod
     def _out_of_range(x: Screened, z: Array, noise: Array) -> tuple[Mask, Mask]:
