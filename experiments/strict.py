@@ -17,7 +17,7 @@ import numpy as np
 from livepde.fem import Field, dot, grad, interval, linear, maximum, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.paper import STRICT
@@ -114,15 +114,16 @@ def apart(setting: Square, newton: Newton | None = None) -> Apart:
     )
     law = GradientLaw(setting.gain, newton=newton or Newton(), gate=None)
     found, strict = _run(twin, law), _run(twin, replace(law, newton=STRICT))
-    ok = found[2] & strict[2]
-    parts = (
-        np.abs(a - b)[ok].max() / np.abs(b).max()
-        for a, b in zip(found[:2], strict[:2], strict=True)
+    ok: Mask = found[2] & strict[2]
+    q, u = (
+        float(np.abs(one - other)[ok].max() / np.abs(other).max())
+        for one, other in zip(found[:2], strict[:2], strict=True)
     )
-    return Apart(*map(float, parts), int((~found[2]).sum() + (~strict[2]).sum()))
+    failed = 2 * len(ok) - int(found[2].sum()) - int(strict[2].sum())
+    return Apart(q, u, failed)
 
 
-def _run(twin: Twin, law: GradientLaw) -> tuple[Array, Array, Array]:
+def _run(twin: Twin, law: GradientLaw) -> tuple[Array, Array, Mask]:
     """Return q, u and whether each step was taken."""
     identifier = Identifier(twin.model, twin.observation, law, q0=0.0, u0=0.0, halvings=0)
     estimates = [identifier.step(sample.t, sample.z) for sample in twin]
