@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -10,7 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.errors import ModelError, NameClashError
+from livepde.errors import ConfigurationError, ModelError, NameClashError
 from livepde.fem import (
     START,
     Channel,
@@ -184,6 +185,32 @@ class Model:
             )
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
+
+    def __copy__(self) -> Model:
+        return self  # it never changes
+
+    def __deepcopy__(self, memo: object) -> Model:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how pickle builds it again: from what it was made of.
+
+        Raises
+        ------
+        ConfigurationError
+            A function that pickle cannot find by its name.
+        """
+        parts = self.state, self.parameter, {**self._parts, **self._units}
+        try:
+            pickle.dumps(parts)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ConfigurationError(
+                "this model cannot be pickled, since pickle stores a function by its name, and a "
+                f"lambda or an inner function has none ({error}): define forms and values with def "
+                "at the top of a module, or pickle what builds the model. Estimates and results "
+                "can be pickled."
+            ) from error
+        return _rebuilt, parts
 
     def _form(
         self,
@@ -543,6 +570,10 @@ class Model:
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
         return q
+
+
+def _rebuilt(state: Any, parameter: Any, parts: dict[str, Any]) -> Model:
+    return Model(state, parameter, **parts)
 
 
 def _common_mesh(state: FunctionSpace) -> Any:

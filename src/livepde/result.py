@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
@@ -38,6 +38,7 @@ __all__ = [
     "Marginal",
     "Result",
     "interval_ends",
+    "kept",
     "layout_of",
     "unknown_of",
     "vertex_order",
@@ -45,6 +46,9 @@ __all__ = [
 
 MEDIAN = "the median"
 FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
+
+
+Kept = TypeVar("Kept")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,11 +144,17 @@ class Estimate:
             return held[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the belief itself, for a copy."""
+        """Return the values themselves, for pickle and copies."""
         # Functions of a law cannot be pickled, and hold its arrays: what they return is stored.
-        own = {"belief": self.belief, "verdict": self.verdict}
-        own["diagnose"] = partial(_same, self.diagnostics)
-        return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
+        own = {
+            "belief": self.belief,
+            "verdict": self.verdict,
+            "diagnostics": self.diagnostics,
+            "diagnose": partial(kept, self.diagnostics),
+            "judge": partial(kept, self.verdict),
+            "space": self.space.described,
+        }
+        return {k: v for k, v in vars(self).items() if k != "_read"} | own
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
@@ -339,6 +349,8 @@ class Result:
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
+        # Of a result that was pickled: its records are complete, and the model is not there.
+        self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
         self._readout = ScalarReadout(model.parameter_space)
 
@@ -436,7 +448,16 @@ class Result:
         `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
         result of `Verdict.to_dict`, as JSON.
         """
-        records, last = RecordArrays.of(self.records), None
+        data = self.layout.dataset(*self._finished())
+        if self.last is not None:
+            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+        return data
+
+    def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
+        """Return all records, and the last fields if `fields_every` has left them out."""
+        records, last = RecordArrays.of(self.records), self._last_fields
+        if self._complete:
+            return records, last
         if self.last is not None and self._settled is not None:
             snapshot = (
                 None if records.last_snapshot < len(records) - 1 else self.snapshot(self.last)
@@ -445,10 +466,23 @@ class Result:
         if self.last is not None and records.last_snapshot < len(records) - 1:
             # The last fields are part of the dataset, also where `fields_every` has left them out.
             last = self.snapshot(self.last)
-        data = self.layout.dataset(records, last)
-        if self.last is not None:
-            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
-        return data
+        return records, last
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what was found, without the model, whose functions may not be pickled."""
+        records, fields = self._finished()
+        own = {"records": records, "_last_fields": fields, "_complete": True, "smoother": None}
+        left = ("model", "observed", "withheld", "_readout", "_settled")
+        return {k: v for k, v in vars(self).items() if k not in left} | own
+
+    def __getattr__(self, name: str) -> Any:
+        # Python calls this only for names that are not there: those that `__getstate__` leaves out.
+        if name in ("model", "observed", "withheld", "_readout", "_settled"):
+            raise ConfigurationError(
+                "this result was pickled, without its model: it has its estimates, datasets and "
+                "tables. To add samples or to smooth, run an identifier again."
+            )
+        raise AttributeError(f"a Result has no attribute '{name}'.")
 
     def smoothed(self) -> xr.Dataset:
         """Return a dataset of unknowns and state over time, given all samples of the run.
@@ -603,5 +637,6 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     return rows
 
 
-def _same(diagnostics: Diagnostics[float]) -> Diagnostics[float]:
-    return diagnostics
+def kept(value: Kept) -> Kept:
+    """Return a value: with it, a function that returns it can be pickled."""
+    return value

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import NOTE, STATUS_CODES, Layout
-from livepde.result import Estimate
+from livepde.result import Estimate, kept
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -67,6 +67,17 @@ class FleetEstimate:
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the values themselves, for pickle and copies; as of an `Estimate`."""
+        each = tuple(map(self.belief, range(len(self.members))))
+        own = {
+            "read": partial(kept, self.beliefs),
+            "diagnose": partial(kept, self.diagnostics),
+            "belief": each.__getitem__,
+            "space": self.space.described,
+        }
+        return vars(self) | own
 
     @cached_property
     def beliefs(self) -> Beliefs:
