@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_banded
-from skfem import ElementLineP1, ElementQuad2, ElementVector
+from skfem import ElementVector
 
 import livepde as lp
 from livepde.runs.outcome import Check
@@ -31,12 +31,10 @@ def checks() -> list[Check]:
 
 
 def _rod() -> lp.Identifier:
+    mesh = lp.interval(0.0, 1.0, 20)
+    ends: dict[str, Any] = {"left": 0.0, "right": lp.Channel("T")}
     model = lp.Model(
-        lp.Field(
-            lp.interval(0.0, 1.0, 20),
-            ElementLineP1(),
-            dirichlet={"left": 0.0, "right": lp.Channel("T")},
-        ),
+        lp.Field(mesh, lp.fem.linear(mesh), dirichlet=ends),
         {"s": lp.Normal(0.0, std=1.0)},
         A=lambda q, u, v, x: -q.s * v,
         B=lambda u, v, x: D * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["Q"] * v,
@@ -90,7 +88,7 @@ def _refused(evolution: Any, drift: float = 0.0) -> bool:
     unknown = lp.Scalar(lp.Normal(1.0, std=0.5), **evolution)
     mesh = lp.interval(0.0, 1.0, 4)
     model = lp.Model(
-        lp.Field(mesh, ElementLineP1()), {"k": unknown}, A=lambda q, u, v, x: q.k * u * v
+        lp.Field(mesh, lp.fem.linear(mesh)), {"k": unknown}, A=lambda q, u, v, x: q.k * u * v
     )
     law = lp.SensitivityLaw(drift=drift, replay=lp.Replay())
     try:
@@ -127,12 +125,9 @@ def _exact(x: Any, t: float = 0.0) -> Any:
 
 
 def _vector() -> list[Check]:
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (5, 5))
     model = lp.Model(
-        lp.Field(
-            lp.rectangle((0.0, 1.0), (0.0, 1.0), (5, 5)),
-            ElementVector(ElementQuad2()),
-            dirichlet={"boundary": 0.0},
-        ),
+        lp.Field(mesh, ElementVector(lp.fem.quadratic(mesh)), dirichlet={"boundary": 0.0}),
         {"k": lp.LogNormal(0.03, std=0.015)},
         A=lambda q, u, v, x: q.k * lp.fem.ddot(lp.grad(u), lp.grad(v)),
     )
@@ -159,8 +154,9 @@ def _vector() -> list[Check]:
 
 def _moments() -> list[Check]:
     """Return the errors of the moments of a decay rate that one reading tells little of."""
+    mesh = lp.interval(0.0, 1.0, 4)
     model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 4), ElementLineP1()),
+        lp.Field(mesh, lp.fem.linear(mesh)),
         {"k": lp.LogNormal(1.0, std=0.8)},
         A=lambda q, u, v, x: q.k * u * v,
     )
