@@ -151,12 +151,12 @@ class Filter:
         q: Array = x.q + x.da @ self.reduction.Phi.T
         return q
 
-    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
+    def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
         """Return the filter state with the unknowns predicted over a time h; u stays as it is.
 
         Their process noise stands in new rows of the square root, in the same order for every h.
         """
-        end, noise = self.unknowns_after(x, h), self._noise(x, 0.0, h)
+        end = self.unknowns_after(x, h)
         if noise is None:
             return end
         U, past, causes = (extended(part, len(noise)) for part in (x.U, x.past, x.causes))
@@ -174,13 +174,13 @@ class Filter:
         (grows,) = np.asarray((gained > 0.0).any(axis=0)).nonzero()
         if not len(grows):
             return None
-        rates = tuple(self.reduction.rates[grows].tolist())
+        lengths = tuple((self.reduction.rates[grows] * h).tolist())
         weight = self.problem.control.scheme.weight
         return NoiseRows(
             start=start,
             length=h,
             scale=np.sqrt(gained[:, grows]),
-            rates=rates,
+            lengths=lengths,
             columns=grows,
             k=x.C.shape[2],
             weight=weight,
@@ -264,7 +264,7 @@ class Filter:
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
         noise, rows = self._noise(x, start, stop - start), x.U.shape[1]
-        end, kept = self.predict_unknowns(x, stop - start) if self.moves else x, x.kept
+        end, kept = self._with_noise(x, stop - start, noise) if self.moves else x, x.kept
         deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
         off: Mask = np.zeros(len(x.member), dtype=bool)
         if deviates:

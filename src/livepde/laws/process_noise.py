@@ -41,6 +41,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 def grades(rate: Array, length: float) -> IntArray:
     """Return in how many parts a step is taken whose readings forget at a rate, (members,)."""
+    if not np.count_nonzero(rate):
+        return np.ones(len(rate), dtype=np.int64)
     ratio = np.maximum(np.minimum(rate * length / LONGEST, 2.0**MOST), 1.0)
     return np.asarray(np.minimum(1 + np.ceil(np.log2(ratio) - 1e-9), MOST), dtype=np.int64)
 
@@ -67,8 +69,8 @@ class NoiseRows:
         Of the step.
     scale
         Standard deviation gained by each coordinate that moves in it, shape (members, moving).
-    rates
-        One over the relaxation time of each of them, zero for a random walk, shape (moving,).
+    lengths
+        The step over the relaxation time of each of them, zero for a random walk.
     columns
         Their numbers among all k coordinates, shape (moving,).
     k
@@ -80,7 +82,7 @@ class NoiseRows:
     start: float
     length: float
     scale: Array
-    rates: tuple[float, ...]
+    lengths: tuple[float, ...]
     columns: IntArray
     k: int
     weight: float
@@ -98,7 +100,7 @@ class NoiseRows:
         last = min(first + length / self.length, 1.0)
         # Whatever rounding does to the times: an inner stage is far from the end.
         inner = t < begun + 0.99 * length
-        return self._rows(_seen(self.rates, self.length, first, last, self.weight, inner))
+        return self._rows(_seen(self.lengths, first, last, self.weight, inner))
 
     def _rows(self, paths: Array) -> Array:
         """Return rows of C from the values of ramps and arches, shape (2, moving)."""
@@ -131,7 +133,7 @@ class NoiseRows:
         whole = np.linalg.norm(Y, axis=2, keepdims=True)
         seen = np.abs(np.concatenate([Y, whole], axis=2))
         ramp, arch = seen[:, :moving], seen[:, moving:]
-        means = _mean(self.rates, self.length, 0.0, 1.0)
+        means = _mean(self.lengths, 0.0, 1.0)
         # A state that forgets at a rate lambda is divided by 1 + w lambda h in each of two stages.
         rest, w = (means[0] - self.weight)[:, None], self.weight
         with np.errstate(all="ignore"):  # what no sensor sees gives no finite number
@@ -149,9 +151,9 @@ class NoiseRows:
         return np.where(needed > before, needed, slower)
 
 
-def _paths(rates: Array, length: float, s: Array) -> Array:
+def _paths(lengths: tuple[float, ...], s: Array) -> Array:
     """Return ramp and arch at shares s of a step, shape (2, moving, len(s)); `s` lies in [0, 1]."""
-    y = (rates * length)[:, None]
+    y = np.array(lengths)[:, None]
     walks, x = y < SHORT, np.maximum(y, SHORT)
     ramp = np.exp(-x * (1.0 - s)) * np.expm1(-2.0 * x * s) / np.expm1(-2.0 * x)
     bridge = np.expm1(-x * s) * np.expm1(-x * (1.0 - s)) / (1.0 + np.exp(-x))
@@ -162,19 +164,19 @@ def _paths(rates: Array, length: float, s: Array) -> Array:
 
 
 @lru_cache(maxsize=256)
-def _mean(rates: tuple[float, ...], length: float, first: float, last: float) -> Array:
+def _mean(lengths: tuple[float, ...], first: float, last: float) -> Array:
     """Return the means of ramp and arch between two shares of a step, shape (2, moving)."""
     s = first + 0.5 * (last - first) * (1.0 + NODES)
-    return np.asarray(_paths(np.array(rates), length, s) @ (0.5 * WEIGHTS))
+    return np.asarray(_paths(lengths, s) @ (0.5 * WEIGHTS))
 
 
 @lru_cache(maxsize=256)
 def _seen(
-    rates: tuple[float, ...], length: float, first: float, last: float, weight: float, inner: bool
+    lengths: tuple[float, ...], first: float, last: float, weight: float, inner: bool
 ) -> Array:
     """Return ramp and arch as a stage of a substep sees them, shape (2, moving)."""
-    mean = _mean(rates, length, first, last)
+    mean = _mean(lengths, first, last)
     if weight == 1.0:
         return mean
-    end = _paths(np.array(rates), length, np.array([last]))[..., 0]
+    end = _paths(lengths, np.array([last]))[..., 0]
     return np.asarray((mean - weight * end) / (1.0 - weight)) if inner else end
