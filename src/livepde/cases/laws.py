@@ -16,6 +16,7 @@ from livepde.laws import (
     GradientLaw,
     Guards,
     Jumps,
+    Refit,
     Replay,
     ResidualDamping,
     SensitivityLaw,
@@ -64,6 +65,7 @@ def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
         guards=_chosen(Guards, spec.guards),
         shadows=_chosen(Shadows, spec.shadows),
         verdict=spec.verdict,
+        refit=_chosen(Refit, spec.refit),
     )
 
 

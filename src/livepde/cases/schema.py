@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from livepde.fem import Scalar
-from livepde.laws import GradientLaw, Guards, Jumps, Replay, SensitivityLaw, Shadows
+from livepde.laws import GradientLaw, Guards, Jumps, Refit, Replay, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
 from livepde.runs.live_loop import Backlog, Retention
 from livepde.runs.outcome import Bound, Sense
@@ -513,6 +513,7 @@ class SensitivitySpec(FilterSpec):
     drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
     replay: StrictBool | Annotated[Replay, _options(Replay)] = False
+    refit: StrictBool | Annotated[Refit, _options(Refit)] = False
     jumps: (
         StrictBool
         | Annotated[tuple[Name, ...], Field(min_length=1)]

@@ -21,6 +21,7 @@ from livepde.laws.jumps import Jumps
 from livepde.laws.law import (
     AnyLaw,
     Belief,
+    Fit,
     FixedInterval,
     InitialReading,
     Law,
@@ -30,6 +31,7 @@ from livepde.laws.law import (
     numerical,
     stepped,
 )
+from livepde.laws.refit_options import Refit
 from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
 from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
@@ -47,6 +49,7 @@ __all__ = [
     "Diagnostics",
     "ExactBound",
     "ExcitationGate",
+    "Fit",
     "FixedInterval",
     "GradientLaw",
     "Guards",
@@ -58,6 +61,7 @@ __all__ = [
     "NoisyBound",
     "Norms",
     "Problem",
+    "Refit",
     "Replay",
     "Report",
     "Residual",

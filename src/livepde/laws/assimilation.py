@@ -96,6 +96,8 @@ class Assimilation(NamedTuple):
         Values that the gate refused, shape (members, sensors).
     worst
         Largest innovation of all members in units of the noise; 0 without.
+    anchored
+        Members whose state was corrected alone, shape (members,); None: no member's.
     """
 
     predicted: Array
@@ -104,6 +106,7 @@ class Assimilation(NamedTuple):
     finite: Mask
     refused: Mask
     worst: float
+    anchored: Mask | None = None
 
 
 @dataclass(frozen=True)
@@ -197,14 +200,16 @@ def absorb(
     if shadows is not None and off is not None:
         learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
+    corrected: Mask | None = None
     if anchored is not None and anchored.any():
+        corrected = np.asarray(anchored.any(axis=1))
         new = filter_.anchor.corrected(new, innovations, anchored, at)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
     squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
     good = x.member >= 0 if squares + worst * worst < math.inf else _finite(new, sizes)
-    return new, Assimilation(predicted, steps, OK, good, refused, worst)
+    return new, Assimilation(predicted, steps, OK, good, refused, worst, corrected)
 
 
 def _far(x: FilterState, e: Array, expected: Array, used: Mask, beyond: float) -> Mask | None:

@@ -28,6 +28,7 @@ __all__ = [
     "span_between",
     "trimmed",
     "with_readings",
+    "withdrawn",
 ]
 
 SPARE = np.inf  # time of rows that are not in use
@@ -89,6 +90,24 @@ def _extended(log: Array) -> Array:
         buffer = np.full((log.shape[0], room, log.shape[2]), SPARE)
         buffer[:, :rows] = log
     return buffer[:, : rows + 1]
+
+
+def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
+    """Return a log without the readings of some sensors since a time.
+
+    Parameters
+    ----------
+    sensors, since
+        Sensors of each member, and the time of the first reading to leave out, shapes (members,
+        sensors).
+    """
+    gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
+    readings = log[:, :, 1 : 1 + sensors.shape[1]]
+    if np.isnan(readings[gone]).all():
+        return log
+    found = log.copy()
+    found[:, :, 1 : 1 + sensors.shape[1]][gone] = np.nan
+    return found
 
 
 def trimmed(log: Array, first: int) -> Array:

@@ -22,6 +22,7 @@ from livepde.verdict import Verdict
 __all__ = [
     "Belief",
     "Deferred",
+    "Fit",
     "FixedInterval",
     "InitialReading",
     "Law",
@@ -156,6 +157,33 @@ class Problem:
             prior_factor=None if prior is None else latent.tangent(q, prior),
             rest=None if rest is None or not rest.any() else latent.deviation(q, rest),
         )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fit:
+    """A fit of all stored samples.
+
+    Attributes
+    ----------
+    samples
+        Samples with a reading that it used.
+    cost
+        Half the sum of squares of the residuals in use, in units of their noise, and of the
+        unknowns, in prior standard deviations about the prior.
+    passes
+        Passes over these samples that all fits so far needed; a pass of the state alone counts as
+        its share.
+    refused
+        Readings that were left out.
+    converged
+        False if the search did not end in a minimum, or in one that explains the samples.
+    """
+
+    samples: int
+    cost: float
+    passes: float
+    refused: int
+    converged: bool
 
 
 class Deferred(NamedTuple):
@@ -397,6 +425,10 @@ class Law(ABC, Generic[Work, State]):
         For the estimate at the end of a run; the run itself goes on from the state that it had.
         """
         return state
+
+    def fit(self, work: Work, state: State) -> Fit | None:
+        """Return the last fit of all stored samples, None for a law without."""
+        return None
 
     def weighs_readings(self) -> bool:
         """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""

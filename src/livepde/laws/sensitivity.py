@@ -28,15 +28,18 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
-from livepde.laws.law import Belief, Deferred, FixedInterval, Law, Problem, Report, finite
+from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
+from livepde.laws.refit_options import Refit
+from livepde.laws.refits import refit_due, settle
 from livepde.laws.replay import FIXED, Replay, ReplayState
 from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
+    FitState,
     Scale,
     SensitivityState,
     SensitivityWork,
@@ -49,7 +52,7 @@ from livepde.laws.sensitivity_state import (
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
-from livepde.laws.verdict import judge_of, judged
+from livepde.laws.verdict import judge_of, judged, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.model import Model
 from livepde.stepping import (
@@ -125,6 +128,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         whenever their number has doubled, about the most probable trajectory of the unknowns, until
         the linearisation holds: see `livepde.laws.iterated_smoother`. 0: never. With a `Replay`,
         which iterates as well, it has no effect.
+    refit
+        Fit the stored samples again at the start, at the end of a run, and on demand: see `Refit`.
+        Experimental: it will take the place of `replay` and `start_window`. Not together with
+        `replay`.
     guards
         Safeguards against an overconfident linearisation and a runaway estimate; None: none.
     shadows
@@ -144,6 +151,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     gate_patience: int = 10
     jumps: Jumps | None = None
     start_window: int = 64
+    refit: Refit | None = None
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
     # A run may be judged that was not judged before: fleets are not.
@@ -154,7 +162,13 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def __post_init__(self) -> None:
         stated = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
-        kinds = (("replay", Replay), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
+        kinds = (
+            ("replay", Replay),
+            ("jumps", Jumps),
+            ("guards", Guards),
+            ("shadows", Shadows),
+            ("refit", Refit),
+        )
         parts = [(getattr(self, name), name, kind) for name, kind in kinds]
         for holds, name, rule in (
             (np.isfinite(self.drift) and self.drift >= 0, "drift", "a number >= 0"),
@@ -177,6 +191,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             raise LawError(
                 "SensitivityLaw: replay keeps all of the past, memory fades it; choose one."
             )
+
+        if self.replay is not None and self.refit is not None:
+            raise LawError("SensitivityLaw: replay and refit do the same work; choose one.")
 
     @property
     def fades(self) -> bool:
@@ -241,7 +258,18 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         options = UpdateOptions(gate, self.noise == "auto")
         # A replay iterates the same linearisation: both would do the same work twice.
         iterated = 0 if self.replay else self.start_window
-        return SensitivityWork(filter_, options, self.replay, self.guards, self.jumps, iterated)
+        # Samples determine constant unknowns alone: there they are fitted, else smoothed.
+        fits = not (self.fades or filter_.moves or problem.input_noise)
+        refit = self.refit if fits else None
+        return SensitivityWork(
+            filter=filter_,
+            options=options,
+            replay=self.replay,
+            guards=self.guards,
+            jumps=self.jumps,
+            start_window=iterated if refit is None else refit.window,
+            refit=refit,
+        )
 
     def check_replay(self, model: Model) -> None:
         """Refuse a replay of unknowns that move at random; raises `LawError`."""
@@ -305,6 +333,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             due=np.array([self.replay.first if self.replay else NEVER]),
             replay=ReplayState.none(start),
             start_due=np.array([1 if work.start_window else NEVER]),
+            fit=FitState.none(),
             older=x,
             newer=x,
             since_older=zero,
@@ -425,7 +454,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if replayed is not None:
                 reports = reports.updated(replayed)
         due = new.assimilated >= new.start_due
-        if np.count_nonzero(due):
+        if work.refit is not None:  # samples without a reading need room, too
+            new = refit_due(work, new, due | (new.log.shape[1] - new.window > work.refit.window))
+        elif np.count_nonzero(due):
             new, started = iterate_starts(work, new, due)
             if started is not None:
                 taken = usual
@@ -477,7 +508,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 return state, told, usual
             x = where(usual, x, before)
             parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
-        return stored(work, state, x, span, usual, **parts), told, usual
+        return stored(work, state, x, span, usual, told.anchored, **parts), told, usual
 
     def _apart(
         self,
@@ -505,7 +536,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return new, reports.with_members(alone)
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-        return finish_replays(work, state)
+        return finish_replays(work, state) if work.refit is None else settle(work, state)
+
+    def fit(self, work: SensitivityWork, state: SensitivityState) -> Fit | None:
+        return state.fit.member(0)
 
     def suspended(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         if work.replay is None:
@@ -538,8 +572,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now = without_factors(state.now)
-        alone = without_ledger(now)
-        return Deferred(lambda: self.member_belief(work, alone, 0), judged(work.filter, now, 0))
+        alone, judge = without_ledger(now), judged(work.filter, now, 0)
+        judge = with_fit(judge, state.fit.member(0))
+        return Deferred(lambda: self.member_belief(work, alone, 0), judge)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

@@ -14,10 +14,11 @@ from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.guards import Guards
-from livepde.laws.history import added, trimmed
+from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.jumps import Jumps, Watch
-from livepde.laws.law import InitialReading
+from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, where, zeros
+from livepde.laws.refit_options import Refit
 from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
@@ -26,6 +27,7 @@ from livepde.stepping import Span
 
 __all__ = [
     "NEVER",
+    "FitState",
     "Scale",
     "SensitivityState",
     "SensitivityWork",
@@ -51,8 +53,8 @@ class SensitivityWork:
     ----------
     filter, options
         The filter, and how it takes a sample.
-    replay, guards, jumps, start_window
-        Those of the law.
+    replay, guards, jumps, start_window, refit
+        Those of the law; `refit` only where it applies.
     """
 
     filter: Filter
@@ -61,6 +63,7 @@ class SensitivityWork:
     guards: Guards | None
     jumps: Jumps | None
     start_window: int
+    refit: Refit | None = None
 
     def made_of(self, readings: Mapping[str, InitialReading], initial: Any) -> SensitivityWork:
         """Return the same for a member whose initial state was given so, and made of readings."""
@@ -117,7 +120,9 @@ class SensitivityState:
     replay
         The replay that is under way.
     start_due
-        Samples in the window at which it is iterated next; `NEVER` where a law does not.
+        Samples in the window at which it is iterated or fitted next; `NEVER` where a law does not.
+    fit
+        The last refit.
     older, newer, since_older, since_newer
         Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     log
@@ -138,6 +143,7 @@ class SensitivityState:
     due: IntArray
     replay: ReplayState
     start_due: IntArray
+    fit: FitState
     older: FilterState
     newer: FilterState
     since_older: IntArray
@@ -159,6 +165,48 @@ class SensitivityState:
         """Members that keep one reference and replay, shape (members,)."""
         replays: Mask = self.due != NEVER
         return replays
+
+
+@dataclass(frozen=True, eq=False)
+class FitState:
+    """The last refit of each member.
+
+    Attributes
+    ----------
+    samples
+        How many samples it used, 0 before the first one, shape (members,).
+    cost, refused
+        Half the sum of squares of residuals in use and of the unknowns, in standard deviations, and
+        readings that were not used; shape (members,).
+    work
+        Samples that all refits of the window have used, one with derivatives counting 1.
+    converged
+        1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
+    """
+
+    samples: IntArray
+    cost: Array
+    refused: Array
+    work: Array
+    converged: Array
+
+    @classmethod
+    def none(cls, members: int = 1) -> FitState:
+        """Return the value before any refit."""
+        zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
+        return cls(samples=nothing, cost=zero, refused=zero, work=zero, converged=zero)
+
+    def member(self, k: int) -> Fit | None:
+        """Return the last refit of one member, None before it."""
+        if not self.samples[k]:
+            return None
+        return Fit(
+            samples=int(self.samples[k]),
+            cost=float(self.cost[k]),
+            passes=float(self.work[k]) / int(self.samples[k]),
+            refused=int(self.refused[k]),
+            converged=bool(self.converged[k]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,17 +277,29 @@ def stored(
     now: FilterState,
     span: Span,
     taken: Mask,
+    anchored: Mask | None = None,
     **parts: Any,
 ) -> SensitivityState:
     """Return a state with the filter after a sample, which the members `taken` took.
 
-    `parts` are other fields to exchange.
+    Parameters
+    ----------
+    anchored
+        Members whose state was corrected alone, shape (members,).
+    parts
+        Other fields to exchange.
     """
     if not work.keeps_log:
         return changed(state, now=now, **parts)
-    parts["log"] = log = added(state.log, span, taken)
+    log = added(state.log, span, taken)
+    # A sensor that is set aside brings no measurements, from the first one that misfitted on.
+    if work.refit is not None and (aside := now.screened.aside & taken[:, None]).any():
+        log = withdrawn(log, aside, now.screened.since)
+    parts["log"] = log
     if work.replay or work.start_window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
+    if work.refit is not None and anchored is not None and (anchored & taken).any():
+        parts |= _windows_from(state, now, log.shape[1] - 1, anchored & taken)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
@@ -253,6 +313,25 @@ def stored(
                 "since_newer": np.where(due, last, state.since_newer),
             }
     return changed(state, now=now, **parts)
+
+
+def _windows_from(
+    state: SensitivityState, now: FilterState, row: int, begun: Mask
+) -> dict[str, Any]:
+    """Return the fields of windows that begin with a filter at a row, of some members.
+
+    No trajectory of constant unknowns passes through a disturbance.
+    """
+    zero = np.zeros(len(begun), dtype=np.int64)
+    return {
+        "start": where(begun, now, state.start),
+        "window": np.where(begun, row, state.window),
+        "opening": state.opening & ~begun,
+        "initial": state.initial & ~begun,
+        "assimilated": np.where(begun, zero, state.assimilated),
+        "start_due": np.where(begun, zero + 1, state.start_due),
+        "fit": where(begun, FitState.none(len(begun)), state.fit),
+    }
 
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
@@ -361,6 +440,7 @@ def new_window(
         due=zero + first,
         replay=ReplayState.none(kept),
         start_due=zero + (1 if work.start_window and first == NEVER else NEVER),
+        fit=FitState.none(),
     )
 
 
