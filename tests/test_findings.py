@@ -18,6 +18,7 @@ import test_guards as guarded
 import test_jumps as jumping
 import test_latent_ends as latent
 import test_modes_left_out as modes
+import test_refit as refits
 import test_run_warnings as warned
 import test_verdict as rods
 from factories import driven_rod, line
@@ -198,6 +199,14 @@ def banked(*, moves: bool) -> list[str]:
 
 
 @cache
+def fitted(**options: int) -> list[str]:
+    """Return the findings on a column that a refit finds, unless it may take few passes."""
+    refit = lp.laws.Refit(**options)
+    who = refits.column(refits.PRIORS["far above"], refit=refit)
+    return kinds(who.run(refits.stream()).last.verdict)
+
+
+@cache
 def filled(*, rests: bool = False, gain: float = 1.0) -> list[str]:
     """Return the findings on the gradient law, with readings of all of a rod at 1 % of noise."""
     drive = (lambda t: 1.0 * (t < 5.0)) if rests else (lambda t: 1.0)
@@ -261,6 +270,7 @@ RUNS = {
     "run_verdict: jump": Pair(partial(jumped, 0.7), partial(jumped, 1.0)),
     "equation_tests: rest": Pair(partial(filled, rests=True, gain=100.0), filled),
     "equation_tests: misfit": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
+    "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
     "step_ledger: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
 }
 

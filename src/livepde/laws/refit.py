@@ -76,7 +76,7 @@ def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | N
         search.draw()
     if search.best is None:
         return None
-    for _ in range(GATE_ROUNDS):
+    for _ in range(GATE_ROUNDS if samples.gated else 0):
         used = _plausible(search.best.residuals)
         if (used == search.used).all():
             break
@@ -98,7 +98,8 @@ class _Search:
     passes: float = 0.0
 
     def __post_init__(self) -> None:
-        self.used = _plausible(self.samples.readings, WILD)
+        limit = WILD if self.samples.gated else math.inf
+        self.used = _plausible(self.samples.readings, limit)
 
     @property
     def _ends(self) -> float:

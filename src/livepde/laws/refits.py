@@ -11,7 +11,7 @@ from livepde.laws.refit import Found, refitted
 from livepde.laws.refit_options import Refit
 from livepde.laws.sensitivity_state import FitState, SensitivityState, SensitivityWork, new_window
 from livepde.laws.stored_samples import StoredSamples
-from livepde.linalg import Mask
+from livepde.linalg import Mask, nonfinite_allowed
 
 __all__ = ["refit_due", "settle"]
 
@@ -35,6 +35,7 @@ def refit_due(work: SensitivityWork, state: SensitivityState, due: Mask) -> Sens
     return state
 
 
+@nonfinite_allowed()  # such a trajectory is refused
 def settle(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
     """Return all members after a last refit, for the end of a run."""
     options = work.refit
@@ -65,7 +66,10 @@ def _refitted(
         work=spent + found.passes * len(samples.spans),
         converged=np.array([float(found.converged)]),
     )
-    return changed(state, now=work.filter.relinearised(x), fit=fit)
+    now = work.filter.relinearised(x)
+    # A filter to go back to that was set with this sample is that after the fit.
+    newer = now if state.since_newer[0] == state.log.shape[1] - 1 else state.newer
+    return changed(state, now=now, newer=newer, fit=fit)
 
 
 def _filter(samples: StoredSamples, found: Found) -> FilterState | None:

@@ -86,6 +86,11 @@ class StoredSamples:
         """The filter of the law."""
         return self.work.filter
 
+    @property
+    def gated(self) -> bool:
+        """True if readings may be refused."""
+        return self.work.options.gate.beyond < np.inf
+
     @cached_property
     def noise(self) -> Array:
         """Standard deviation of each reading, (samples, sensors)."""

@@ -1,0 +1,261 @@
+"""The refit: the best fit of stored samples, against SciPy on a forward model of its own."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import broken_rod
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.special import erfc, erfcx
+
+import livepde as lp
+from livepde.laws.refit import refitted
+from livepde.laws.stored_samples import StoredSamples
+
+V, D, AT, NOISE = 0.258, 0.0357, 11.0, 0.01
+TIMES = np.arange(1.5, 66.1, 1.5)
+
+
+def breakthrough(v: float, d: float, times: Any = TIMES) -> np.ndarray:
+    """Concentration behind a front that washes a column out, from 1 to 0 (Ogata and Banks)."""
+    t, spread = np.asarray(times), 2.0 * np.sqrt(d * np.asarray(times))
+    ahead, behind = (AT - v * t) / spread, (AT + v * t) / spread
+    # exp(v x/D) erfc(behind) without overflow: the squares differ by v x/D.
+    return 1.0 - 0.5 * (erfc(ahead) + np.exp(-(ahead**2)) * erfcx(behind))
+
+
+@cache
+def measured(seed: int = 0) -> tuple[float, ...]:
+    noise = NOISE * np.random.default_rng(seed).standard_normal(len(TIMES))
+    return tuple((breakthrough(V, D) + noise).tolist())
+
+
+def column(prior: tuple[float, float, float, float], **options: Any) -> lp.Identifier:
+    """Return an identifier of the column with priors v, its deviation, D, its deviation."""
+    v, v_std, d, d_std = prior
+    mesh = lp.interval(0.0, 16.0, 40)
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.quadratic(mesh), dirichlet={"left": 0.0}),
+        {"v": lp.LogNormal(v, std=v_std), "D": lp.LogNormal(d, std=d_std)},
+        A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.v * lp.grad(u)[0] * v,
+    )
+    law = lp.SensitivityLaw(**{"refit": lp.laws.Refit(), "shadows": None, **options})
+    return lp.Identifier(model, lp.Points({"c": AT}, noise=NOISE), law, u0=1.0, dt_max=0.5)
+
+
+def stream(z: Any = None) -> list[tuple[float, dict[str, float]]]:
+    values = measured() if z is None else z
+    return [(t, {"c": value}) for t, value in zip(TIMES.tolist(), values, strict=True)]
+
+
+@cache
+def best(prior: tuple[float, float, float, float]) -> tuple[float, float, float]:
+    """Return v, D and the cost of SciPy's fit from the truth, by the analytic solution."""
+    v, v_std, d, d_std = prior
+    middle, widths = np.log([v, d]), np.array([v_std / v, d_std / d])
+
+    def residuals(a: np.ndarray) -> np.ndarray:
+        q = np.exp(middle + widths * a)
+        return np.concatenate([(np.array(measured()) - breakthrough(*q)) / NOISE, a])
+
+    found = least_squares(residuals, (np.log([V, D]) - middle) / widths, method="lm")
+    q = np.exp(middle + widths * found.x)
+    return float(q[0]), float(q[1]), float(found.cost)
+
+
+PRIORS = {
+    "near": (0.3, 0.1, 0.05, 0.05),
+    "far above": (0.7, 0.5, 0.1, 0.1),
+    "far below": (0.1, 0.1, 0.01, 0.01),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRIORS)
+def test_the_column_is_found_from_each_prior(name: str):
+    result = column(PRIORS[name]).run(stream())
+    v, d, cost = best(PRIORS[name])
+    fit = result.last.fit
+    assert fit.converged
+    assert fit.samples == len(TIMES)
+    assert result.last.parameters["v"][0] == pytest.approx(v, rel=2e-3)
+    assert result.last.parameters["D"][0] == pytest.approx(d, rel=3e-2)  # that of the mesh
+    assert fit.cost == pytest.approx(cost, abs=1.5)
+    assert fit.passes < 20
+
+
+def fitted(identifier: lp.Identifier) -> tuple[StoredSamples, Any]:
+    samples = StoredSamples.of(identifier._work, identifier._state)
+    return samples, refitted(samples, lp.laws.Refit(), last=True)
+
+
+def test_the_filter_goes_on_from_the_fit():
+    """One update by all samples is that of the filter sample by sample, about one trajectory."""
+    who = column(PRIORS["near"])
+    for t, z in stream():
+        who.step(t, z)
+    samples, found = fitted(who)
+    one, other = (
+        samples.updated(found.best, found.used),
+        samples.judged(found.best, found.used),
+    )
+    assert one is not None
+    assert other is not None
+    std = np.linalg.norm(other.C[0], axis=0)
+    assert np.abs(one.q - other.q).max() < 1e-12
+    assert (np.abs(one.da - other.da)[0] / std).max() < 1e-8
+    assert np.abs(one.C[0].T @ one.C[0] - other.C[0].T @ other.C[0]).max() < 1e-9 * std.max() ** 2
+    assert np.abs(one.u + one.du - other.u - other.du).max() < 1e-9
+
+
+@pytest.mark.parametrize("count", [2, 3, 5, 8])
+def test_few_samples_are_fitted(count: int):
+    late = stream()[22 : 22 + count]  # while the front passes
+    result = column(PRIORS["far above"]).run(late)
+    assert result.last.fit.converged
+    predicted = breakthrough(*(result.last.parameters[name][0] for name in ("v", "D")))
+    missed = (np.array(measured()) - predicted)[22 : 22 + count] / NOISE
+    assert np.sqrt(np.mean(missed**2)) < 3.0
+
+
+@pytest.mark.slow
+def test_outliers_are_left_out():
+    rng = np.random.default_rng(4)
+    z = np.array(measured())
+    wild = rng.choice(len(z), len(z) // 5, replace=False)
+    z[wild] += rng.choice([-1.0, 1.0], len(wild)) * NOISE * rng.uniform(10.0, 100.0, len(wild))
+    clean, spoiled = (column(PRIORS["near"]).run(stream(data)).last for data in (None, z.tolist()))
+    for name in ("v", "D"):
+        value, std = clean.parameters[name]
+        assert abs(spoiled.parameters[name][0] - value) < std
+    assert len(wild) // 2 <= spoiled.fit.refused <= len(wild) + 4
+
+
+def test_bounds_hold():
+    mesh = lp.interval(0.0, 1.0, 10)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
+        {"k": lp.Normal(0.5, std=0.5, bounds=(0.4, 2.0))},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        f=lambda x, t: 1.0 + 0.0 * x[0],
+    )
+    law = lp.SensitivityLaw(refit=lp.laws.Refit(), shadows=None)
+    who = lp.Identifier(model, lp.Points({"a": 0.5}, noise=0.01), law, u0=0.0)
+    # A steady state of k = 0.2, f L^2/(8 k), which the bound excludes.
+    last = who.run([(0.5 * k, {"a": 0.625}) for k in range(1, 9)]).last
+    assert last.parameters["k"][0] == pytest.approx(0.4, abs=1e-6)
+    assert last.verdict.level == "not judged" or last.fit is not None
+
+
+def test_a_run_continues_to_the_bit():
+    rows = stream()
+    whole, half = column(PRIORS["far above"]), column(PRIORS["far above"])
+    for t, z in rows[:20]:
+        whole.step(t, z)
+        half.step(t, z)
+    content = half.dump()
+    other = column(PRIORS["far above"])
+    other.restore(content)
+    for t, z in rows[20:]:
+        one, two = whole.step(t, z), other.step(t, z)
+        assert one.parameters == two.parameters
+    assert whole.refit().parameters == other.refit().parameters
+    assert whole.estimate().fit == other.estimate().fit
+
+
+def test_a_refit_on_demand_is_that_of_the_end():
+    rows = stream()
+    end = column(PRIORS["near"]).run(rows).last
+    who = column(PRIORS["near"])
+    for t, z in rows:
+        who.step(t, z)
+    found = who.refit()
+    assert found.parameters == end.parameters
+    assert found.fit == end.fit
+
+
+def test_a_fit_that_does_not_converge_is_reported():
+    refit = lp.laws.Refit(start=0, passes=1)
+    last = column(PRIORS["far above"], refit=refit).run(stream()).last
+    assert not last.fit.converged
+    assert last.verdict.level == "do not trust"
+    assert any(finding.what == "fit" for finding in last.verdict.findings)
+    sound = column(PRIORS["near"]).run(stream()).last
+    assert not any(finding.what == "fit" for finding in sound.verdict.findings)
+
+
+def rod(**options: Any) -> lp.Identifier:
+    mesh = lp.interval(0.0, broken_rod.LENGTH, 16)
+    ends = {"left": lp.Channel("T_left"), "right": 20.0}
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet=ends),
+        {"alpha": lp.LogNormal(5e-5, std=3e-5)},
+        A=lambda q, u, v, x: q.alpha * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    names = {f"T_{k + 1}": x for k, x in enumerate(broken_rod.AT)}
+    law = lp.SensitivityLaw(refit=lp.laws.Refit(), **options)
+    return lp.Identifier(model, lp.Points(names, noise=broken_rod.NOISE), law, u0=20.0)
+
+
+def rows(z: np.ndarray) -> list[tuple[float, dict[str, float]]]:
+    times = broken_rod.STEP * np.arange(len(z))
+    table = np.column_stack([broken_rod.left(times), z])
+    names = ("T_left", "T_1", "T_2", "T_3")
+    return [
+        (t, dict(zip(names, row, strict=True)))
+        for t, row in zip(times.tolist(), table.tolist(), strict=True)
+    ]
+
+
+@pytest.mark.slow
+def test_a_sensor_that_was_set_aside_is_not_fitted():
+    z = broken_rod.readings(200)
+    whole = rod().run(rows(z)).last["alpha"]
+    z[120:170, 1] = -127.0  # unplugged
+    last = rod().run(rows(z)).last
+    assert last.fit.converged
+    value, std = last.parameters["alpha"]
+    assert abs(value - whole.median) < 2.0 * whole.deviation
+    assert std < 1.3 * whole.deviation
+    assert abs(value - broken_rod.ALPHA) < 4.0 * std
+
+
+@pytest.mark.slow
+def test_a_member_of_a_fleet_is_fitted_as_a_single_run():
+    who, z = rod(), broken_rod.readings(40)
+    fleet = lp.Fleet(who.model, who.observed.observation, who.law, ["a", "b"], u0=20.0)
+    for t, row in rows(z):
+        one = who.step(t, row)
+        found = fleet.step(t, {name: [value, value] for name, value in row.items()})
+        for name in ("a", "b"):
+            member, single = found.member(name).parameters["alpha"], one.parameters["alpha"]
+            assert member == pytest.approx(single, rel=1e-9)
+
+
+def test_options_are_checked():
+    with pytest.raises(lp.errors.LawError, match="window must be at least 2"):
+        lp.laws.Refit(window=1)
+    with pytest.raises(lp.errors.LawError, match="passes must be at least 1"):
+        lp.laws.Refit(passes=0)
+    with pytest.raises(lp.errors.LawError, match="start must be at least 0"):
+        lp.laws.Refit(start=-1)
+    with pytest.raises(lp.errors.LawError, match="choose one"):
+        lp.SensitivityLaw(replay=lp.Replay(), refit=lp.laws.Refit())
+
+
+def test_unknowns_that_move_are_not_fitted():
+    mesh = lp.interval(0.0, 1.0, 6)
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
+        {"s": lp.Scalar(lp.Normal(0.0, std=1.0), evolution=lp.RandomWalk(0.3))},
+        A=lambda q, u, v, x: -q.s * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    sensors = lp.Points({"a": 0.5}, noise=0.01)
+    who = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=lp.laws.Refit()), u0=0.0)
+    last = who.run([(0.1 * k, {"a": 0.05 * math.sin(k)}) for k in range(1, 9)]).last
+    assert last.fit is None
