@@ -97,11 +97,11 @@ def checks() -> list[Check]:
 
 
 def _shards() -> int:
-    positional, options = _parts()
-    shard = Shard(*positional, ["a", "b"], **options)
+    (model, sensors, law), options = _parts()
+    shard = Shard(model, sensors, law, ["a", "b"], **options)
     shard.step(0, [("a", *sample) for sample in _samples()])
     saved, loaded = shard.dump(), 0
     for changed in OTHERS.values():
-        positional, options = _parts(**changed)
-        loaded += not _refuses(Shard(*positional, ["a", "b"], **options).load, saved)
+        (model, sensors, law), options = _parts(**changed)
+        loaded += not _refuses(Shard(model, sensors, law, ["a", "b"], **options).load, saved)
     return loaded
