@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from exact_walk import mean_and_end
 from factories import advanced, driven_rod, line, observe, readings
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
 import livepde as lp
+from benchmarks.silent.exact_walk import mean_and_end
 from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import bad, call, cut
-from exact_walk import mean_and_end
 from factories import driven_rod, readings, short_rod
 from skfem import ElementLineP1
 
 import livepde as lp
 from benchmarks.honest import honest
+from benchmarks.silent.exact_walk import mean_and_end
 from livepde import checkpoint, runs
 from livepde.runs import drive
 

@@ -35,7 +35,7 @@ LONGEST = 0.35  # of the last part of a step over the memory of the readings: st
 # are within 1 % of those of the exact filter then (tests/test_sparse_samples.py)
 COUNTS = 0.01  # variances of the noise of a reading by which the path has to matter for it
 HARDLY = COUNTS / 64.0  # by which it would not matter in a part of twice the length either
-MOST = 10  # parts of a step at most: the last one is a 512th then
+MOST = 20  # parts of a step at most: the last one is 2e-6 of it then
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
 
 

@@ -53,15 +53,14 @@ class Exact:
         """Return transition and process noise of (u, s) in a time h."""
         A = np.array([[-self.decay, 1.0], [0.0, -1.0 / self.time]])
         spread = self.rate**2 if self.rate else 2.0 * self.std**2 / self.time
-        # In short parts: the block exponential of a stiff process overflows.
-        parts = int(np.ceil(np.abs(A).max() * h)) or 1
+        # A short part, doubled: the block exponential of a stiff process overflows.
+        doublings = max(int(np.ceil(np.log2(np.abs(A).max() * h))), 0) if h else 0
         Q, zero = np.diag([0.0, spread]), np.zeros((2, 2))
-        block = expm(np.block([[-A, Q], [zero, A.T]]) * (h / parts))
-        step = block[2:, 2:].T
-        noise = step @ block[:2, 2:]
-        F, gained = np.eye(2), np.zeros((2, 2))
-        for _ in range(parts):
-            F, gained = step @ F, step @ gained @ step.T + noise
+        block = expm(np.block([[-A, Q], [zero, A.T]]) * (h / 2**doublings))
+        F = block[2:, 2:].T
+        gained = F @ block[:2, 2:]
+        for _ in range(doublings):
+            F, gained = F @ F, F @ gained @ F.T + gained
         return F, (gained + gained.T) / 2
 
     def drawn(self, h: float, count: int, rng: np.random.Generator) -> np.ndarray:
