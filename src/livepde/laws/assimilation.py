@@ -20,7 +20,7 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, ScoredSample
 
-__all__ = ["OK", "Assimilation", "MemberReports", "absorb", "assimilate"]
+__all__ = ["OK", "Assimilation", "Decision", "MemberReports", "absorb", "assimilate"]
 
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
@@ -79,6 +79,21 @@ class MemberReports:
         return MemberReports(tuple(statuses), predicted, steps, diagnosed)
 
 
+class Decision(NamedTuple):
+    """What a gate has decided on a sample.
+
+    Attributes
+    ----------
+    refused
+        Readings that do not correct the unknowns, shape (members, sensors).
+    anchored
+        Those of them that correct the state alone.
+    """
+
+    refused: Mask
+    anchored: Mask
+
+
 class Assimilation(NamedTuple):
     """Outcome of the assimilation of a sample.
 
@@ -97,7 +112,7 @@ class Assimilation(NamedTuple):
     worst
         Largest innovation of all members in units of the noise; 0 without.
     anchored
-        Members whose state was corrected alone, shape (members,); None: no member's.
+        Those that correct the state alone; None: none does.
     """
 
     predicted: Array
@@ -107,6 +122,12 @@ class Assimilation(NamedTuple):
     refused: Mask
     worst: float
     anchored: Mask | None = None
+
+    @property
+    def decision(self) -> Decision:
+        """What the gate has decided."""
+        none = np.zeros_like(self.refused)
+        return Decision(self.refused, none if self.anchored is None else self.anchored)
 
 
 @dataclass(frozen=True)
@@ -120,10 +141,13 @@ class UpdateOptions:
     adaptive
         True if the noise is a first guess whose multiple is found from the samples; their
         likelihood is kept then, too.
+    decision
+        An earlier decision of the gate on the sample, which holds again; None: the gate decides.
     """
 
     gate: Gate = field(default_factory=Gate)
     adaptive: bool = False
+    decision: Decision | None = None
 
 
 def assimilate(
@@ -175,7 +199,12 @@ def absorb(
         told = d + shift
     newest = anchored = None
     parts: dict[str, Any] = {}
-    if options.gate.beyond < math.inf:
+    if options.decision is not None:
+        refused, anchored = options.decision
+        used = present & ~refused
+        whole = bool(used.all())
+        e = np.where(used, e, np.nan)
+    elif options.gate.beyond < math.inf:
         expected = d / np.sqrt(variance + shift * shift)
         screened, pause = x.screened.paused(span.t1 - np.asarray(span.t0))
         far = _far(x, e, np.where(pause[:, None], e, expected), used, options.gate.beyond)
@@ -200,16 +229,14 @@ def absorb(
     if shadows is not None and off is not None:
         learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
-    corrected: Mask | None = None
     if anchored is not None and anchored.any():
-        corrected = np.asarray(anchored.any(axis=1))
         new = filter_.anchor.corrected(new, innovations, anchored, at)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
     squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
     good = x.member >= 0 if squares + worst * worst < math.inf else _finite(new, sizes)
-    return new, Assimilation(predicted, steps, OK, good, refused, worst, corrected)
+    return new, Assimilation(predicted, steps, OK, good, refused, worst, anchored)
 
 
 def _far(x: FilterState, e: Array, expected: Array, used: Mask, beyond: float) -> Mask | None:

@@ -14,7 +14,15 @@ from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = ["NO_LEDGER", "FilterState", "along", "extended", "unaccompanied", "with_rows"]
+__all__ = [
+    "NO_LEDGER",
+    "FilterState",
+    "along",
+    "extended",
+    "unaccompanied",
+    "unjudged",
+    "with_rows",
+]
 
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -112,8 +120,12 @@ def with_rows(x: FilterState, U: Array, C: Array) -> FilterState:
     return changed(x, U=U, C=C, past=past, causes=causes)
 
 
+def unjudged(x: FilterState) -> FilterState:
+    """Return a filter state without its ledger."""
+    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
+
+
 def unaccompanied(x: FilterState) -> FilterState:
     """Return a filter state without its ledger and without the errors of the discretisation."""
     members, k = x.da.shape
-    causes, shadows = np.zeros((*x.causes.shape[:2], 0)), ShadowState.none(members, x.u.shape[1], k)
-    return changed(x, causes=causes, ledger=NO_LEDGER, shadows=shadows)
+    return changed(unjudged(x), shadows=ShadowState.none(members, x.u.shape[1], k))

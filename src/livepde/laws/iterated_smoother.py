@@ -220,6 +220,9 @@ class _Samples:
     state: SensitivityState
     opening: Interval
     intervals: Sequence[Interval]
+    # The same with the errors of the discretisation, by which the gate decides; None: these have
+    # them, or the law follows none.
+    precise: _Samples | None = None
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> _Samples:
@@ -234,7 +237,9 @@ class _Samples:
         """The same samples, assimilated without ledger and discretisation errors."""
         if self.work.filter.judge is None and self.work.filter.shadows is None:
             return self
-        return replace(self, work=self.work.unaccompanied, state=self.state.unaccompanied)
+        work, state = self.work.unaccompanied, self.state.unaccompanied
+        precise = None if self.work.filter.shadows is None else self
+        return replace(self, work=work, state=state, precise=precise)
 
     def explained(self, one: _Pass) -> bool:
         """True if a pass misses the samples by no more than their noise makes usual.
@@ -255,6 +260,17 @@ class _Samples:
 
     def about(self, trajectory: Array | None) -> _Pass | None:
         """Assimilate the samples, linear about a trajectory or each estimate; None if it fails."""
+        found = self._about(trajectory)
+        return found if found or self.precise is None else self.precise.about(trajectory)
+
+    def _unlike(self, x: FilterState) -> bool:
+        """True if the gate has refused a reading that it may use in the run.
+
+        What it uses without discretisation errors it uses with them, which widen it.
+        """
+        return self.precise is not None and bool(np.count_nonzero(x.screened.refused))
+
+    def _about(self, trajectory: Array | None) -> _Pass | None:
         filter_, reduction = self.work.filter, self.work.filter.reduction
         prior = filter_.problem.model.latent.prior
         known = self.state.start.q[0]
@@ -265,6 +281,8 @@ class _Samples:
         if self.state.opening[0]:
             misfit += missed(filter_, x, self.opening)
             x, _ = absorb(filter_, x, filter_.span(self.opening), self.work.options)
+            if self._unlike(x):
+                return None
         x = self._remembered(x)
         # The prior of the start is a ~ N(0, I): minus twice its logarithm is |a|^2.
         followed = [reduction.reduced(x.q[0] - prior)]
@@ -277,7 +295,7 @@ class _Samples:
             elif filter_.moves:
                 x = expecting(filter_, x, trajectory[number], h)
             x, told = assimilate(filter_, x, filter_.span(interval), self.work.options)
-            if not (told.status.ok and told.finite[0]):
+            if self._unlike(x) or not (told.status.ok and told.finite[0]):
                 return None
             x = self._remembered(x)
             followed.append(reduction.reduced(x.q[0] - prior))

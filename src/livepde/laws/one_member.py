@@ -143,11 +143,14 @@ def _converged(
 
     The search follows neither ledger nor discretisation errors, which cost as much again.
     """
-    filter_, bare = work.filter, unaccompanied(window.start)
+    filter_, searching, start = work.filter, work.unaccompanied, unaccompanied(window.start)
     for _ in range(most):
         last, q = window, next_reference(filter_, window)
-        begin = placed(filter_, replace(window, start=bare), q)
-        x, report = _filtered(work.unaccompanied, begin, interval)
+        x, report = _filtered(searching, placed(filter_, replace(window, start=start), q), interval)
+        if np.count_nonzero(x.screened.refused):
+            # The gate may use with the errors of the discretisation what it refuses without.
+            searching, start = work, window.start
+            x, report = _filtered(work, placed(filter_, window, q), interval)
         if not report.status.ok:
             return None
         window = replace(window, now=x, reference=q)

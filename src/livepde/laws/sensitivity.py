@@ -508,7 +508,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 return state, told, usual
             x = where(usual, x, before)
             parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
-        return stored(work, state, x, span, usual, told.anchored, **parts), told, usual
+        anchored = None if told.anchored is None else np.asarray(told.anchored.any(axis=1))
+        return stored(work, state, x, span, usual, anchored, **parts), told, usual
 
     def _apart(
         self,

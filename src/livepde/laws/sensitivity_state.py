@@ -71,6 +71,11 @@ class SensitivityWork:
         return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property
+    def unjudged(self) -> SensitivityWork:
+        """The same without a ledger."""
+        return replace(self, filter=replace(self.filter, judge=None))
+
+    @cached_property
     def unaccompanied(self) -> SensitivityWork:
         """The same for a search: it keeps no ledger and follows no discretisation error."""
         return replace(self, filter=replace(self.filter, shadows=None, judge=None))

@@ -21,21 +21,21 @@ change it by less than a tenth of a standard deviation.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.laws.assimilation import absorb
-from livepde.laws.filter_state import FilterState
+from livepde.laws.assimilation import Decision, absorb
+from livepde.laws.filter_state import FilterState, unaccompanied, unjudged
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.iterated_smoother import expecting, missed, moved
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, nonfinite_allowed
-from livepde.stepping import KeptFactors
+from livepde.stepping import KeptFactors, Span
 
 __all__ = ["evidence", "smoothed"]
 
@@ -58,12 +58,18 @@ class _Point:
 class _SmootherPass:
     """The samples, filtered about a trajectory of reduced unknowns, shape (1 + intervals, k).
 
-    `misfit` is minus twice the logarithm of the trajectory's probability, up to a constant.
+    `misfit` is minus twice the logarithm of the trajectory's probability, up to a constant, and
+    `decisions` are those of the gate, the first one on the sample at the start.
     """
 
     trajectory: Array
     points: list[_Point]
     misfit: float
+    decisions: list[Decision]
+
+    @property
+    def refuses(self) -> bool:
+        return any(np.count_nonzero(one.refused) for one in self.decisions)
 
 
 def smoothed(
@@ -79,9 +85,8 @@ def smoothed(
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
     """
-    work, before = work.unaccompanied, before.unaccompanied
     with nonfinite_allowed():  # not finite: not used
-        best = _descended(_FixedInterval(work, before, after, data))
+        best = _descended(*_begun(work, before, after, data))
     return _backward(best, after)
 
 
@@ -92,17 +97,44 @@ def evidence(
 
     Minus infinity where they cannot be followed. Parameters as for `smoothed`.
     """
-    work, before = work.unaccompanied, before.unaccompanied
     with nonfinite_allowed():
-        samples = _FixedInterval(work, before, after, data)
-        samples.work = replace(work, options=replace(work.options, adaptive=True))
-        found = samples.about(samples.estimated)
+        _, found = _begun(work, before, after, data, adaptive=True)
     return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
 
 
-def _descended(samples: _FixedInterval) -> _SmootherPass:
+def _begun(
+    work: SensitivityWork,
+    before: SensitivityState,
+    after: FilterState,
+    data: FixedInterval,
+    *,
+    adaptive: bool = False,
+) -> tuple[_FixedInterval, _SmootherPass | None]:
+    """Return the samples with the gate's decisions on them, and a first pass; None if all fail.
+
+    The readings are those that the run uses, in each pass. The gate of the run knows the errors of
+    the discretisation, which widen it: what it uses without them it uses with them. So these, which
+    cost twice as much again, are followed only where it refuses a reading.
+    """
+    work = replace(work.unjudged, options=replace(work.options, adaptive=adaptive))
+    start, initial = unjudged(before.now), bool(before.initial[0])
+    whole = _FixedInterval(work, start, initial, after, data)
+    bare = _FixedInterval(work.unaccompanied, unaccompanied(start), initial, after, data)
+    best = bare.about(bare.estimated)
+    if best is None or best.refuses:
+        # Unknowns that move are estimated about each estimate in turn, those that stay about one.
+        trajectories = (None, whole.estimated) if whole.moves else (whole.estimated, None)
+        best = next((one for each in trajectories if (one := whole.about(each))), None)
+    if best is None:
+        return bare, None
+    samples = bare.decided(best.decisions)
+    if not best.refuses:
+        return samples, best
+    return samples, samples.about(samples.estimated) or samples.about(None)
+
+
+def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _SmootherPass:
     """Return the pass about a most probable trajectory."""
-    best = samples.about(samples.estimated) or samples.about(None)
     if best is None:
         raise LawError(
             "smoothed: the samples cannot be followed about any trajectory of the unknowns; take a "
@@ -168,23 +200,25 @@ def _reduced(work: SensitivityWork, x: FilterState, da: Array | float = 0.0) -> 
 
 
 class _FixedInterval:
-    """The samples of one member, ready to be filtered about trajectories of its unknowns."""
+    """The samples of one member, ready to be filtered about trajectories of its unknowns.
+
+    `decisions` are those of the gate on the samples, the first one at the start; None: it decides.
+    """
 
     def __init__(
         self,
         work: SensitivityWork,
-        before: SensitivityState,
+        start: FilterState,
+        initial: bool,
         after: FilterState,
         data: FixedInterval,
+        decisions: Sequence[Decision] | None = None,
     ) -> None:
-        options = replace(work.options, adaptive=False)  # the level is that of all samples
-        self.work = replace(work, options=options)
-        self.data = data
+        self.work, self.data, self.decisions = work, data, decisions
         self.jumps = set(data.jumps) if work.jumps is not None else set()
         self.moves = work.filter.moves or bool(self.jumps)
-        start, opening, intervals = before.now, data.opening, data.intervals
+        opening, intervals = data.opening, data.intervals
         length = intervals[-1].t1 - opening.t1 if intervals else 0.0
-        initial = bool(before.initial[0])
         self.window = Window(
             start=start,
             now=after,
@@ -193,6 +227,19 @@ class _FixedInterval:
             moment=opening.end,
             length=length,
         )
+
+    def decided(self, decisions: Sequence[Decision]) -> _FixedInterval:
+        """Return the same samples with the gate's decisions on them."""
+        start, initial, after = self.window.start, self.window.initial, self.window.now
+        return _FixedInterval(self.work, start, initial, after, self.data, decisions)
+
+    def _absorbed(self, x: FilterState, span: Span, number: int) -> tuple[FilterState, Decision]:
+        """Return the filter after the update by a sample, and the gate's decision on it."""
+        options = self.work.options
+        if self.decisions is not None:
+            options = replace(options, decision=self.decisions[number])
+        x, told = absorb(self.work.filter, x, span, options)
+        return x, told.decision
 
     @property
     def estimated(self) -> Array:
@@ -208,11 +255,11 @@ class _FixedInterval:
 
     def about(self, trajectory: Array | None) -> _SmootherPass | None:
         """Filter the samples, linear about a trajectory or each estimate; None if that fails."""
-        x, misfit = self._started(trajectory)
+        x, misfit, decision = self._started(trajectory)
         rows = x.C.shape[1]
         nothing = changed(x, past=np.eye(rows)[None], dpast=np.zeros((1, rows)))  # lies before
         points = [self._kept(nothing, 0, np.zeros((0, rows)))]
-        followed = [_reduced(self.work, x)]
+        followed, decisions = [_reduced(self.work, x)], [decision]
         filter_ = self.work.filter
         for number, interval in enumerate(self.data.intervals, start=1):
             h = interval.t1 - interval.t0
@@ -224,19 +271,20 @@ class _FixedInterval:
             x, P = self._predicted(x, number - 1)
             if P is None:
                 return None
-            x, _ = absorb(filter_, x, filter_.span(interval), self.work.options)
+            x, decision = self._absorbed(x, filter_.span(interval), number)
             if not np.isfinite((x.u + x.du).sum() + x.da.sum() + x.C.sum()):
                 return None
+            decisions.append(decision)
             points.append(self._kept(x, number, _forgotten(P)))
             followed.append(_reduced(self.work, x))
             misfit += missed(filter_, x, interval)
             misfit += moved(filter_, followed[-2], followed[-1], h, gained) if self.moves else 0.0
         if trajectory is None or not np.isfinite(misfit):
             misfit = np.inf  # a pass about each estimate in turn follows no single trajectory
-        return _SmootherPass(np.array(followed), points, misfit)
+        return _SmootherPass(np.array(followed), points, misfit, decisions)
 
-    def _started(self, trajectory: Array | None) -> tuple[FilterState, float]:
-        """Return the filter after a sample at the start, and the misfit of both."""
+    def _started(self, trajectory: Array | None) -> tuple[FilterState, float, Decision]:
+        """Return the filter after a sample at the start, the misfit, and the gate's decision."""
         filter_, opening, start = self.work.filter, self.data.opening, self.window.start
         q, shift = start.q[0], np.zeros(start.C.shape[2])
         if trajectory is not None:
@@ -247,10 +295,13 @@ class _FixedInterval:
         weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
-        if filter_.sensors.observe(x, span.end)[1].any():  # as the law begins
+        predicted, Y = filter_.sensors.observe(x, span.end)
+        none = np.zeros(predicted.shape, dtype=bool)
+        decision = Decision(none, none)
+        if Y.any():  # as the law begins
             misfit += missed(filter_, x, opening)
-            x, _ = absorb(filter_, x, span, self.work.options)
-        return x, misfit
+            x, decision = self._absorbed(x, span, 0)
+        return x, misfit, decision
 
     def _gained(self, variance: Array, number: int, h: float) -> Array:
         """Return the variance that coordinates gain in an interval, with a jump, shape (k,)."""
@@ -275,7 +326,7 @@ class _FixedInterval:
 
     def _kept(self, x: FilterState, number: int, R: Array) -> _Point:
         """Return a point with the state where it is asked for."""
-        x = changed(x, kept=KeptFactors.none(1))
+        x = changed(unaccompanied(x), kept=KeptFactors.none(1))
         if number not in self.data.fields:
             x = changed(x, u=x.u[:, :0], du=x.du[:, :0], U=x.U[:, :, :0])
         return _Point(x, R)
