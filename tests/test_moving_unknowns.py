@@ -232,7 +232,7 @@ def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Pat
     for t, z in samples(4):
         first.step(t, z)
     first.save(tmp_path / "state.bin")
-    with pytest.raises(lp.errors.RunError, match=r"state\.now\.da|state\.now\.C"):
+    with pytest.raises(lp.errors.RunError, match="saved with another option of the law"):
         other.load(tmp_path / "state.bin")
 
 
