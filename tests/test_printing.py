@@ -17,7 +17,7 @@ ROW = ["nodal, mu = 1", 0.01, 1.0, 1.0, 0.0, 419.3123, 72.85, 2.2917e-4, 2.2917e
 @pytest.mark.parametrize("width", [40, 80, 200])
 def test_numbers_are_never_cut(width: int) -> None:
     out = io.StringIO()
-    rows = [[*ROW, 5554.123], [*ROW, None]]
+    rows = [[*ROW, 5554.123, 0], [*ROW, None, 3]]
     print_table(Console(file=out, width=width), Table("a table", boiger2016.COLUMNS, rows))
     text = out.getvalue()
     assert "…" not in text

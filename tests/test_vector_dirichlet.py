@@ -95,7 +95,8 @@ def test_a_modulus_is_identified_from_a_boundary_that_moves():
     """Rollers on the left and below, a channel that pulls the right side, sensors on the top."""
     pulled = {"left": (0.0, None), "bottom": (None, 0.0), "right": (lp.Channel("pull"), None)}
     model, true = elastic(pulled), 1.6
-    points = lp.Points([[0.3, 0.9], [0.7, 0.9]], noise=1e-4)
+    at, axes = np.repeat([[0.3, 0.9], [0.7, 0.9]], 2, axis=0), [0, 1, 0, 1]  # both components
+    points = lp.Points(at, noise=1e-4, component=axes)
     observed = observe(model, points)
     forward, u, rng = ForwardStage(model), model.initial(0.0, Moment(0.0, Inputs({"pull": 0.0}))), 0
     law, scheme = lp.SensitivityLaw(), lp.ImplicitEuler()  # one stage of which makes the truth
