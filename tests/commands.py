@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,11 +24,27 @@ from livepde.errors import LivepdeError, RunError
 from livepde.runs import JOURNAL, Journal
 
 
+@contextmanager
+def unchanged_logging() -> Iterator[None]:
+    """Leave logging as it was."""
+    root = logging.getLogger()
+    before, level = list(root.handlers), root.level
+    own = {name: logging.getLogger(name).level for name in ("livepde", "asyncua")}
+    try:
+        yield
+    finally:
+        root.handlers[:] = before
+        root.setLevel(level)
+        for name, was in own.items():
+            logging.getLogger(name).setLevel(was)
+
+
 def call(
     *arguments: str | Path, stdin: str | None = None, program: typer.Typer = cli.app
 ) -> tuple[int, str]:
     """Return exit code and output of a command that ends as it should."""
-    result = CliRunner().invoke(program, list(map(str, arguments)), input=stdin)
+    with unchanged_logging():  # a live run configures it, with a stream that is closed here
+        result = CliRunner().invoke(program, list(map(str, arguments)), input=stdin)
     if result.exception and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result.exit_code, result.output

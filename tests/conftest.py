@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import signal
 from importlib.util import find_spec
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from broker import MOSQUITTO, Server
+from commands import unchanged_logging
 
 PROJECT = Path(__file__).resolve().parents[1]
 
@@ -57,13 +57,8 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture
 def logs():
     """Leave logging as it was."""
-    root = logging.getLogger()
-    before, level = list(root.handlers), root.level
-    yield
-    root.handlers[:] = before
-    root.setLevel(level)
-    for name in ("livepde", "asyncua"):
-        logging.getLogger(name).setLevel(logging.NOTSET)
+    with unchanged_logging():
+        yield
 
 
 @pytest.fixture

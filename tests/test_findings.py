@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_broken_sensors as broken
 import test_guards as guarded
 import test_jumps as jumping
 import test_latent_ends as latent
@@ -25,7 +26,7 @@ from factories import driven_rod, line
 
 import livepde as lp
 from benchmarks.silent import unjudged
-from livepde.runs import input_findings, verdict
+from livepde.runs import clock_findings, input_findings, verdict
 from livepde.stepping import Advance, simulate
 
 SOURCE = Path(lp.__file__).parent
@@ -62,6 +63,8 @@ def rod(change: str = "", **options: Any) -> list[str]:
     """Return the findings on the rod of `test_verdict`, with something done to its readings."""
     z = rods.shown() + rods.errors()
     places, names = None, {}
+    if "gate" in options:
+        options["law"] = lp.SensitivityLaw(gate=options.pop("gate"))
     match change:
         case "offset":
             z[:, 1] += 0.08
@@ -113,11 +116,19 @@ def fed(*, gaps: bool = False, hold: bool = False) -> list[str]:
     return kinds(rods.fed(values, hold=hold).verdict)
 
 
-def counted(**counts: int) -> list[str]:
-    """Return the findings on a channel of a journal with 100 rows."""
+@cache
+def disturbed(change: float) -> list[str]:
+    """Return the findings while the diffusivity of a rod, a constant, has changed by a factor."""
+    z = broken.readings(broken.FIRST + 40, change=change, after=broken.FIRST)
+    return kinds(broken.run(z)[-1].verdict)
+
+
+def counted(channel: str = "T", **counts: int) -> list[str]:
+    """Return the findings on a channel, or on the rows, of a journal with 100 rows."""
     rows: Any = type("Rows", (list,), {})(range(100))
-    rows.counts = {(kind, "T"): number for kind, number in counts.items()}
-    return [finding.what for finding in input_findings(rows, ["T"])]
+    rows.counts = {(kind, channel): number for kind, number in counts.items()}
+    found = [*clock_findings(rows), *input_findings(rows, ["T"])]
+    return [finding.what for finding in found]
 
 
 @cache
@@ -242,7 +253,10 @@ RUNS = {
     "assess: constancy": Pair(partial(rod, "drifting unknown"), rod),
     "assess: disagreement": Pair(partial(rod, "another k at one sensor"), rod),
     "assess: noise": Pair(partial(rod, stated=3.0), rod),
-    "assess: stuck": Pair(partial(rod, "stuck"), rod),
+    # A gate that refuses nothing sets no sensor aside.
+    "assess: stuck": Pair(partial(rod, "stuck", gate=np.inf), partial(rod, gate=np.inf)),
+    "assess: aside": Pair(partial(rod, "stuck"), rod),
+    "assess: changed": Pair(partial(disturbed, 0.5), partial(disturbed, 1.0)),
     "assess: refused": Pair(partial(rod, "spikes"), rod),
     "assess: prior": Pair(partial(rod, "far from the prior"), rod),
     "channel_ledgers: input": Pair(partial(fed, gaps=True), fed),
@@ -252,6 +266,7 @@ RUNS = {
     "findings: bound": Pair(partial(warned_of, NARROW), partial(warned_of, ONE)),
     "findings: flat": Pair(partial(warned_of, BESIDE), partial(warned_of, ONE)),
     "run_verdict: input": Pair(partial(counted, spike=2), counted),
+    "run_verdict: clock": Pair(partial(counted, "", clock=1), partial(counted, spike=2)),
     "run_verdict: misfit": Pair(partial(missing, 3.0), partial(missing, 0.0)),
     "run_verdict: refused": Pair(
         partial(unjudged_readings, spoiled=True), partial(unjudged_readings, spoiled=False)

@@ -11,6 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from collections import Counter
 from contextlib import closing, suppress
 from functools import cache
 from pathlib import Path
@@ -387,7 +388,7 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]
     broken[20:20] = [{"t": 0.1, "a": "none", "left": 1.0}, {"t": -1.0, "a": 1.0, "left": 1.0}] * 3
-    calm = live(whole, Rows(broken))
+    calm = live(whole, source(broken))
     calm.run()
     calm.journal.close()
     writes, seen = itertools.count(1), []
@@ -414,8 +415,11 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
         same(other, one)
         assert other.counts == one.counts
         assert other.accepted == one.accepted == 40
-        told = {(event.kind, event.channel, event.message) for event in one.events}
-        found = {(event.kind, event.channel, event.message) for event in other.events}
+        # Counted: rows that go back make the calm run unwell for a while, too.
+        told, found = (
+            Counter((event.kind, event.channel, event.message) for event in kept.events)
+            for kept in (one, other)
+        )
         assert told <= found
         assert {kind for kind, *_ in found - told} == {"disk", "well"}
 
@@ -439,6 +443,8 @@ def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
 
     class Leaving(Rows):
         def poll(self, wait):
+            if wait == 0.0:
+                return []  # no row is at hand: samples that wait are taken, and committed
             if run.journal.accepted == 10:
                 away.append(True)
             return super().poll(wait)

@@ -17,7 +17,7 @@ from commands import bad, call, estimates, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.data import passwords_of, source_of
+from livepde.cases.data import source_of
 from livepde.cases.live_case import LiveCase
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
@@ -429,51 +429,6 @@ def test_a_password_comes_from_the_environment(here, monkeypatch):
     text = case('mqtt = { rows = ["a"], username = "me", password_env = "LIVEPDE_ROD" }')
     monkeypatch.delenv("LIVEPDE_ROD", raising=False)
     assert "the environment variable LIVEPDE_ROD is not set" in bad("run", text)
-
-
-@pytest.mark.parametrize("name", ["AWS_SECRET_ACCESS_KEY", "LIVEPDE_TOKEN"])
-@pytest.mark.parametrize(
-    ("key", "data", "output"),
-    [
-        ("data.mqtt", 'mqtt = {{ rows = ["a"], port = {port}, password_env = "{name}" }}', ""),
-        (
-            "data.opcua",
-            'opcua = {{ url = "opc.tcp://127.0.0.1:{port}", columns = {{ a = "left" }}, '
-            'password_env = "{name}" }}',
-            "",
-        ),
-        (
-            "output.mqtt",
-            'file = "rows.csv"',
-            'mqtt = {{ topic = "a", port = {port}, password_env = "{name}" }}\n',
-        ),
-    ],
-)
-def test_a_case_sends_no_variable_that_the_user_has_not_allowed(
-    here, monkeypatch, name, key, data, output
-):
-    """Nothing is connected, and the value is nowhere; the option of the command allows it."""
-    monkeypatch.setenv(name, "a secret")
-    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(0.1)
-        port = server.getsockname()[1]
-        path = Path(case(data.format(port=port, name=name)))
-        path.write_text(path.read_text() + output.format(port=port, name=name))
-        command = ("run", "case.toml", "--realtime", "--speed", "inf", "--out", "run")
-        command = command if key == "output.mqtt" else command[:2]
-        said = bad(*command)
-        assert f"case.toml: {key}.password_env: the environment variable {name} would be" in said
-        assert f"add --allow-env {name}" in said
-        assert "a secret" not in said
-        with pytest.raises(TimeoutError):
-            server.accept()
-        assert not Path("run").exists()
-        loaded = cases.load("case.toml")
-        assert passwords_of(loaded, True, [name]) == {key: "a secret"}
-        assert passwords_of(loaded, False, [name] if key == "output.mqtt" else []) == (
-            {key: "a secret"} if key == "output.mqtt" else {}
-        )
 
 
 def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):

@@ -12,7 +12,7 @@ import pytest
 
 import livepde as lp
 from livepde.errors import LawError
-from livepde.runs import doubts, verdict
+from livepde.runs import doubts, drive, verdict
 from livepde.verdict import Finding, Shifts, Verdict, WithheldLedger, discretised
 from livepde.verdict.findings import flat
 
@@ -221,6 +221,22 @@ def test_a_sensor_that_stands_still_is_named():
     found = run(z)[1].verdict
     assert ("sensor", "A") in named(found)
     assert found.level == "caution"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("offset", "level"), [(0.0, "INFO"), (0.08, "WARNING")])
+def test_a_verdict_is_a_warning_in_the_log_unless_the_run_is_trusted(caplog, offset, level):
+    """A sound run, which is not judged at first, writes nothing to a terminal."""
+    caplog.set_level("INFO", "livepde.run")
+    z = shown()[:60] + errors()[:60]
+    z[:, 1] += offset
+    sensors = lp.Points(PLACES, noise=NOISE, unit="degC")
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    times = zip(TIMES.tolist(), z, strict=False)
+    drive(identifier, (lp.Sample(t, row, {"T_left": driven(t)}) for t, row in times))
+    (told,) = (one for one in caplog.records if one.kind == "verdict")
+    assert told.levelname == level
+    assert told.getMessage().startswith("verdict: trusted") == (level == "INFO")
 
 
 @pytest.mark.slow

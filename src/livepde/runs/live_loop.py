@@ -268,12 +268,14 @@ class Live:
                 # A write comes first: if it fails, no steps are taken again in vain.
                 self.journal.say_health(why)
                 again = self._recover()
+                # This is a write, too: the disk may be away again.
+                away = f"{self._clock() - begun:.1f} s ({error.__cause__})"
+                self._tell("disk", f"nothing could be written for {away}")
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
         # The source was not polled meanwhile, so that time is no silence of it.
-        self._heard = self._taken = now = self._clock()
-        self._tell("disk", f"nothing could be written for {now - begun:.1f} s ({error.__cause__})")
+        self._heard = self._taken = self._clock()
         return again
 
     def _one_at_a_time(self) -> None:
@@ -482,12 +484,12 @@ class Live:
                 self._tell(remark.kind, remark.message, remark.channel)
             self.journal.count(remark.kind, remark.channel, remark.number)
 
-    def _tell(self, kind: str, message: str, channel: str = "") -> None:
+    def _tell(self, kind: str, message: str, channel: str = "", *, harmless: bool = False) -> None:
         if len(message) > LONGEST:  # a message may quote a whole row
             message = message[:LONGEST] + "..."
         event = Event(self.identifier.t, kind, channel, message)
         self._events.append(event)
-        level = logging.INFO if kind in HARMLESS else logging.WARNING
+        level = logging.INFO if harmless or kind in HARMLESS else logging.WARNING
         about = {"kind": kind, "channel": channel, "t": event.t}  # fields of a log in JSON
         LOG.log(level, "%s%s: %s", kind, f" ({channel})" if channel else "", message, extra=about)
         self.journal.note(event)
@@ -670,7 +672,9 @@ class Live:
         if verdict.level != self._level:
             self._level = verdict.level
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
-            self._tell("verdict", f"{verdict.level}: {said.removeprefix('Not judged: ')}")
+            message = f"{verdict.level}: {said.removeprefix('Not judged: ')}"
+            # Each sound run begins as not judged, and is trusted then: that is no warning.
+            self._tell("verdict", message, harmless=verdict.level == LEVELS[0])
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""
