@@ -279,6 +279,22 @@ def test_starts_that_may_be_are_left_alone():
     assert (rows.tolist(), columns.tolist()) == ([0, 1], [1, 1])
 
 
+@pytest.mark.parametrize("others", [[], [1.0, -1.0]])
+@pytest.mark.parametrize("signs", [[1], [-1], [1, -1], [-1, 1, -1]])
+@pytest.mark.parametrize(("at", "is_wild"), [(0, True), (12, False)])
+def test_first_rows_as_large_as_numbers_are_judged_as_large_ones(others, signs, at, is_wild):
+    """Only the size of what is wild differs, by which no answer depends on it."""
+    t = 60.0 * np.arange(25)
+    calm = 20.0 + np.sin(np.arange(25.0))
+    for size in (1e100, 1.5e308):
+        values = np.stack([calm, calm + 0.5], axis=1)
+        values[at : at + len(signs), 0] = size * np.array(signs)
+        values[5 : 5 + len(others), 1] = size * np.array(others)
+        expected = np.zeros(values.shape, dtype=bool)
+        expected[at : at + len(signs), 0] = is_wild
+        np.testing.assert_array_equal(wild_first_rows(t, values, [[0, 1]]), expected)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("place", ["sensor", "boundary"])
 def test_a_live_run_waits_for_rows_that_show_a_wild_first_one(tmp_path, place):

@@ -35,13 +35,16 @@ def wild_first_rows(t: Array, values: Array, groups: Sequence[Sequence[int]]) ->
         Channels that measure the same quantity in the same unit; others are not judged.
     """
     wild = np.zeros(values.shape, dtype=bool)
-    for group in groups:
-        leaps = {k: _leap(t, values[:, k]) for k in group}
-        first = [_first(values[:, k]) for k in group if not len(leaps[k])]
-        peers = np.array(first, dtype=float)
-        for k, rows in leaps.items():
-            if len(rows) and _outside(values[:, k], rows, peers):
-                wild[rows, k] = True
+    # Wild values may be as large as numbers are: differences of them are infinite then, and
+    # compare as they should.
+    with np.errstate(over="ignore"):
+        for group in groups:
+            leaps = {k: _leap(t, values[:, k]) for k in group}
+            first = [_first(values[:, k]) for k in group if not len(leaps[k])]
+            peers = np.array(first, dtype=float)
+            for k, rows in leaps.items():
+                if len(rows) and _outside(values[:, k], rows, peers):
+                    wild[rows, k] = True
     return wild
 
 
