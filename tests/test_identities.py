@@ -315,7 +315,7 @@ def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float =
 # --- identities -----------------------------------------------------------------------------------
 
 
-@drawn(60)
+@drawn(40)
 def test_a_run_that_is_restored_continues_to_the_bit(examples):
     def same(o: Options) -> None:
         taken, who, other = samples(o), identifier(o), identifier(o)
@@ -334,7 +334,7 @@ def test_a_run_that_is_restored_continues_to_the_bit(examples):
     check(options(), examples, same)
 
 
-@drawn(60)
+@drawn(40)
 def test_a_forecast_is_the_next_prediction(examples):
     def same(o: Options) -> None:
         # A replay predicts readings linear about its reference, a forecast by the sensors.
@@ -374,7 +374,7 @@ def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     check(options(multiplies=False, guards=False), examples, same)
 
 
-@drawn(40)
+@drawn(10)
 def test_a_member_of_a_fleet_is_a_single_identifier(examples):
     def same(o: Options) -> None:
         each = [samples(o, member=k) for k in range(2)]
@@ -406,7 +406,7 @@ FRAMES = {
 }
 
 
-@drawn(20)
+@drawn(12)
 @pytest.mark.parametrize("name", FRAMES)
 def test_order_units_and_origin_change_nothing(name, examples):
     frame = FRAMES[name]
@@ -454,7 +454,7 @@ def matches(mean: Any, std: Any, belief: kalman.Gaussian) -> None:
     np.testing.assert_allclose(std, belief.std[: len(mean)], rtol=1e-9, atol=1e-9)
 
 
-@drawn(60)
+@drawn(50)
 def test_filter_and_smoother_are_those_of_an_independent_code(examples):
     def same(o: Options) -> None:
         assume(o.linear)
