@@ -54,9 +54,9 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def logs():
-    """Leave logging as it was."""
+    """Leave logging as it was: a live run configures it for its process."""
     with unchanged_logging():
         yield
 

@@ -328,7 +328,9 @@ class Filter:
         U = x.U[:, -len(noise) :]
         C = np.zeros((*U.shape[:2], x.C.shape[2]))  # a sensor of the unknown itself forgets nothing
         Y = self.sensors.rows(x, U, C, span.end)
-        return noise.rate(x.rate, Y / self.noise_of(x, span)[:, None])
+        # The noise of the sensors, not that of the readings: a forecast takes the same parts.
+        level = np.sqrt(x.level)[:, None]
+        return noise.rate(x.rate, Y / (level * self.noise)[:, None])
 
     @staticmethod
     def update(x: FilterState, Y: Array, d: Array, **parts: Any) -> tuple[FilterState, Update]:
