@@ -34,7 +34,6 @@ from livepde.streams.sources import RowSource
 
 __all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
 
-BEGUN = 3  # rows after which a live run has begun
 TOGETHER = 100  # messages that are sent before the first of them is acknowledged
 
 
@@ -75,8 +74,7 @@ def broken_messages(plan: Plan) -> Outcome:
     rows, count = rod_rows(min(plan.samples, 600)), max(plan.malformed // 20, 1)
     expected, _ = undisturbed(len(rows))
     with hearing(rows) as (_, topic, run):
-        # A run begins at its third time: an earlier one before that is its first row.
-        per_row = np.bincount(rng.integers(BEGUN, len(rows), count), minlength=len(rows))
+        per_row = np.bincount(rng.integers(0, len(rows), count), minlength=len(rows))
         begun = time.monotonic()
         for k in plan.watched(len(rows), "right rows with broken messages between them"):
             topic.supply(k + 1)

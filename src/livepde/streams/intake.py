@@ -370,24 +370,34 @@ class Intake:
         """Let a row wait for others, and use all rows that wait if they agree."""
         waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
         latest = held.t + self.policy.tolerance + max(waits, default=0.0)
-        # A row of an earlier time refutes those that have come before it.
-        self._refuse([one for one in self._ahead if one.t > latest], found)
+        # A row of an earlier time refutes those that have come before it; of the first rows none
+        # has privilege, and those that agree decide.
+        if self._begun:
+            self._refuse([one for one in self._ahead if one.t > latest], found)
         self._ahead.append(held)
-        if self._agree() or len(self._ahead) > MOST_AHEAD:
+        run = self._agreed()
+        if run or len(self._ahead) > MOST_AHEAD:
+            if run and not self._begun:
+                low, high = run[0], run[-1]
+                self._refuse([one for one in self._ahead if not low <= one.t <= high], found)
             self._received = received
             self._use_ahead(found)
 
-    def _agree(self) -> bool:
-        """Return whether the rows that wait have continued at a usual pace for long enough."""
+    def _agreed(self) -> list[float]:
+        """Return the times of waiting rows that continue at a usual pace for long enough, or none.
+
+        Rows far ahead have to be the last ones; of the first rows the longest run counts.
+        """
         times = sorted({one.t for one in self._ahead})
         steps = [b - a for a, b in pairwise(times)]
         usual, own = self._times.usual(self._ahead[-1].values), usual_of(steps)
         reach = self._reach(own if math.isnan(usual) else max(usual, own))
         # The last rows of them, without a step that would be far ahead itself.
         breaks = [k for k, step in enumerate(steps, start=1) if step > reach]
-        last = times[breaks[-1] :] if breaks else times
+        runs = [times[k:stop] for k, stop in pairwise([0, *breaks, len(times)])]
+        last = runs[-1] if self._begun else max(runs, key=len)
         span = 0.0 if math.isnan(usual) else AGREE * usual
-        return len(last) >= FEWEST and last[-1] - last[0] >= span
+        return last if len(last) >= FEWEST and last[-1] - last[0] >= span else []
 
     def _use_ahead(self, found: IntakeOutcome) -> None:
         """Use the rows that wait."""
@@ -406,8 +416,8 @@ class Intake:
         """Refuse rows that have waited, as too far ahead."""
         refused = {id(one) for one in rows}
         for one in rows:
-            before = f" of the newest row at {self._newest:g}" if self._begun else ""
-            found.remark("leap", "", f"t = {one.t:g} is far ahead{before}", one.token)
+            far = f"ahead of the newest row at {self._newest:g}" if self._begun else "from others"
+            found.remark("leap", "", f"t = {one.t:g} is far {far}", one.token)
             found.spent.append(one.token)
         self._ahead = [one for one in self._ahead if id(one) not in refused]
 
