@@ -172,6 +172,11 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
             for k, one in enumerate(separate)
         ]
         assert_equal(estimate, others)
+    for k, one in enumerate(separate):  # verdicts count failed steps and gaps of each
+        mine = fleet.identifier(k)
+        assert mine._steps.counts.tolist() == one._steps.counts.tolist()
+        for name in ("counts", "held", "unstated"):
+            assert getattr(mine._gaps, name).tolist() == getattr(one._gaps, name).tolist()
     return fleet, estimate
 
 

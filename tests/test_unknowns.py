@@ -357,7 +357,7 @@ def test_an_initial_state_is_given_once():
 
 
 @pytest.mark.long
-def test_the_gate_refuses_outliers_and_believes_what_lasts():
+def test_the_gate_refuses_outliers_and_a_sensor_that_stays_away():
     times = np.arange(0.0, 8.0, 0.05)
     samples = data(lambda t: 0.3, times)
     for k in (50, 80, 81, 110):
@@ -374,8 +374,9 @@ def test_the_gate_refuses_outliers_and_believes_what_lasts():
         z[1] += 0.5 if t else 0.0
     lasting = estimates(model, lp.SensitivityLaw(gate=5.0, gate_patience=7), samples)
     refused = [e.diagnostics.refused > 0.0 for e in lasting]
-    assert sum(refused[60:67]) == 7
-    assert not refused[67]
+    # One of several sensors is not believed because it insists.
+    assert all(refused[60:])
+    assert abs(lasting[-1].parameters["a"][0] - 0.3) < 0.003
 
 
 @pytest.mark.parametrize(

@@ -181,27 +181,26 @@ class Identifier:
         other._fingerprint = other._lazy_fingerprint()
         return other
 
-    def placed(
-        self, state: Any, t: float, z: Array, inputs: Array, held: Array, samples: int
-    ) -> Identifier:
+    def placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
         """Return an identifier of the same parts that stands elsewhere; for `Fleet.identifier`.
 
         Parameters
         ----------
         state
-            Of the law; None before it has begun.
-        t, z, inputs
-            Time, measurements and input channels of the last accepted sample.
-        held
-            Duration of the gap of each input channel by then, shape (channels,).
+            Of the law; None before the first sample.
+        ends
+            Time, measurements, inputs, their gaps and what verdicts count, as `Fleet.ends` has
+            them for one member.
         samples
             How many were taken.
         """
         other = copy.copy(self)
-        other._state, other._t, other._z, other._samples = state, t, z, samples
-        other._gaps = replace(InputLedger.start(len(held)), held=held)
-        other._steps = StepLedger.start()
-        begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
+        other._state, other._samples = state, samples
+        other._t, other._z = float(ends["t"]), ends["z"]
+        other._gaps = InputLedger(ends["held_counts"], ends["held"], ends["unstated"])
+        other._steps = StepLedger(ends["steps"])
+        values = ends["inputs"].tolist()
+        begun = zip(self.inputs, values, strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
         return other
 

@@ -29,13 +29,14 @@ from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
 from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
+from livepde.records import STATUS_CODES
 from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
 from livepde.stepping import Advance, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 7  # of the checkpoint
+FORMAT = 8  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -135,6 +136,10 @@ class Fleet:
         self._z = np.full((count, self.observed.size), np.nan)
         self._inputs = np.full((count, len(self.inputs)), np.nan)
         self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
+        # What verdicts count, member by member, as `InputLedger` and `StepLedger` do.
+        self._held_counts = np.zeros((count, 1 + len(self.inputs)), dtype=np.int64)
+        self._unstated = np.zeros((count, len(self.inputs)))
+        self._steps = np.zeros((count, len(STATUS_CODES)), dtype=np.int64)
         self._samples = 0
         self._starts: dict[int, Identifier] = {}
         if not self.inputs:
@@ -259,7 +264,7 @@ class Fleet:
             )
         if self._state is None:
             if t > last:
-                held = {**held, **self._unstated(held)}
+                held = {**held, **self._held_at_start(held)}
             self._begin(self._opening(values) if t > last else values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         if t == last:
@@ -291,10 +296,15 @@ class Fleet:
             )
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
+        codes = [STATUS_CODES.index(status.code) for status in report.statuses]
+        self._steps = self._steps + np.eye(len(STATUS_CODES), dtype=np.int64)[codes]
         # A member whose step failed keeps its time and values: its next step covers both intervals.
-        good = np.array([status.ok for status in report.statuses])
+        good = np.array([status.taken for status in report.statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing
         self._held = np.where(good[:, None], lasting, self._held)
+        if self.inputs:
+            each = np.column_stack([np.ones(len(self)), missing > 0.0]).astype(np.int64)
+            self._held_counts = self._held_counts + each * good[:, None]
         self._t = np.where(good, t, self._t)
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
@@ -306,12 +316,13 @@ class Fleet:
         # The same object at both ends says that inputs are held.
         return inputs if unknown.all() else np.where(unknown, inputs, self._stated)
 
-    def _unstated(self, held: Mapping[str, Array]) -> dict[str, Array]:
+    def _held_at_start(self, held: Mapping[str, Array]) -> dict[str, Array]:
         """Return channels of the model -> members without a value now or at the initial time."""
         found = {}
         for k, name in enumerate(self.inputs):
             unknown = np.isnan(self._stated[:, k])
             if name in self.model.channels and unknown.any():
+                self._unstated[:, k] = unknown
                 found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
         return found
 
@@ -387,11 +398,11 @@ class Fleet:
         """
         k = member if isinstance(member, int) else self.members.index(member)
         state = None if self._state is None else self._engine.member(self._state, k)
-        t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
+        ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Kept, since its fingerprint is computed once for all checkpoints of this member.
         start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k])
         self._starts[k] = start
-        return start.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
+        return start.placed(state, ends, self._samples)
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
@@ -419,8 +430,8 @@ class Fleet:
         other._engine = self._engine.subset(which)
         other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
         other._stated = self._stated[which]
-        other._t, other._z = self._t[which], self._z[which]
-        other._inputs, other._held = self._inputs[which], self._held[which]
+        for name, values in self.ends.items():
+            setattr(other, f"_{name}", values[which])
         other._state, other._samples = state, samples
         if state is None and not self.inputs:
             other._begin(other._inputs)
@@ -428,14 +439,15 @@ class Fleet:
 
     def adopt(self, which: IntArray, part: Fleet) -> Any:
         """Take over times and values of a subset, and return its state; for `Shard`."""
-        self._t[which], self._z[which] = part._t, part._z
-        self._inputs[which], self._held[which] = part._inputs, part._held
+        for name, values in part.ends.items():
+            self.ends[name][which] = values
         return part._state
 
     @property
     def ends(self) -> dict[str, Array]:
-        """Times, measurements, inputs and their gaps at the last sample of each member."""
-        return {"t": self._t, "z": self._z, "inputs": self._inputs, "held": self._held}
+        """Times, measurements, inputs, their gaps and what verdicts count, by member."""
+        names = ("t", "z", "inputs", "held", "held_counts", "unstated", "steps")
+        return {name: getattr(self, f"_{name}") for name in names}
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
@@ -570,8 +582,7 @@ class Fleet:
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
         header = {**self.header, "begun": self._state is not None}
-        leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
-        leaves |= {"held": self._held, **self.fingerprint.leaves}
+        leaves = {"samples": self._samples, **self.ends, **self.fingerprint.leaves}
         if self._state is not None:
             leaves |= {
                 f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
@@ -603,15 +614,15 @@ class Fleet:
                     if path.startswith("state/")
                 }
                 state = self._engine.restored(template, inner)
-            ends = leaves["t"], leaves["z"], leaves["inputs"]
-            held, samples = leaves["held"], int(leaves["samples"])
+            ends, samples = {name: leaves[name] for name in self.ends}, int(leaves["samples"])
         except (KeyError, ValueError) as error:
             raise RunError(
                 f"{where} does not fit this fleet ({error}): build it with the law's options as "
                 "they were when it was saved."
             ) from error
-        (self._t, self._z, self._inputs), self._held, self._samples = ends, held, samples
-        self._state = state
+        for name, values in ends.items():
+            setattr(self, f"_{name}", values)
+        self._state, self._samples = state, samples
         if state is None and not self.inputs:
             self._begin(self._inputs)
 
