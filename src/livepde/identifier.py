@@ -197,8 +197,10 @@ class Identifier:
         other = copy.copy(self)
         other._state, other._samples = state, samples
         other._t, other._z = float(ends["t"]), ends["z"]
-        other._gaps = InputLedger(ends["held_counts"], ends["held"], ends["unstated"])
-        other._steps = StepLedger(ends["steps"])
+        other._gaps = InputLedger(
+            ends["held_counts"].astype(np.int64), ends["held"], ends["unstated"]
+        )
+        other._steps = StepLedger(ends["steps"].astype(np.int64))
         values = ends["inputs"].tolist()
         begun = zip(self.inputs, values, strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
