@@ -121,7 +121,7 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     scheme = lp.ImplicitEuler()
     clean = samples(model, 2.0, 90, scheme=scheme)
     stream = [(t, z + size * (40 <= k < 40 + length)) for k, (t, z) in enumerate(clean)]
-    options = {"scheme": scheme, "drift": 0.1, "gate": np.inf, "start_window": 0}
+    options = {"scheme": scheme, "drift": 0.1, "gate": np.inf, "refit": None}
     stuck = run(model, stream, **options, guards=None)
     assert sum(not estimate.status.ok for estimate in stuck) > 40  # of the 50 that are left
     assert abs(stuck[-1].parameters["q"][0] - 2.0) > 5.0
@@ -190,7 +190,7 @@ def test_no_burst_follows_a_rest():
         stream = samples(process, 0.3, 320, seed, scheme=scheme)
         for guards, found in ends.items():
             # With shadows the gate knows the error of the step, and lets the burst be corrected.
-            options = {"guards": guards, "start_window": 0}
+            options = {"guards": guards, "refit": None}
             estimates = run(model, stream, scheme, halvings=0, **options)
             found.append([e.parameters["a"][0] for e in estimates[240:]])
     assert np.min(ends[None]) < 0.0  # a burst, and then negative and sure of it

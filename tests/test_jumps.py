@@ -156,7 +156,7 @@ def test_settings_that_cannot_be_meant_are_refused(options: Any):
 @pytest.mark.long
 @pytest.mark.parametrize("guess", [1e-3, 1e-1, 1.0])
 def test_the_noise_is_found_from_any_first_guess(guess: float):
-    law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16), shadows=None)
+    law = lp.SensitivityLaw(noise="auto", shadows=None)
     found = run(law, samples(lambda t: 0.3, 250, 0), guess)
     assert found[-1].diagnostics.noise_level * guess == pytest.approx(NOISE, rel=0.2)
     value, std = found[-1].parameters["a"]

@@ -158,7 +158,7 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
 )
 def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
     model = linear_model(EVOLUTIONS[name])
-    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0, start_window=4, shadows=None)
+    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0, refit=lp.laws.Refit(start=4), shadows=None)
     stream = samples(8, missing=False)
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
@@ -225,7 +225,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
 
     model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
     points = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(model, points, law)
     errors = []
     for t, z in readings(rod(lp.Normal(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
@@ -375,7 +375,7 @@ def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: 
 
     monkeypatch.setattr(replay_slices, "placed", counted)
     law = lp.SensitivityLaw(
-        modes=7, replay=lp.Replay(first=4, iterations=50, slice=64), shadows=None
+        modes=7, shadows=None
     )
     identifier = lp.Identifier(linear_model(EVOLUTIONS[name]), sensors(), law)
     for t, z in samples():
@@ -397,7 +397,7 @@ def test_replays_find_the_most_probable_parameter():
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(model, sensors(), law, halvings=0)
     latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
 
@@ -467,7 +467,7 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
             seed=seed,
             scheme=lp.SensitivityLaw.scheme,
         )
-        law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+        law = lp.SensitivityLaw(shadows=None)
         identifier = lp.Identifier(model, points, law, u0=0.0)
         estimate = identifier.run(twin).last
         assert identifier._state.now.innovations.inflation < 1.3

@@ -97,7 +97,7 @@ def test_replay_makes_the_result_independent_of_the_prior():
     for prior in (0.5, 1.0, 4.0):
         model = conductivity(prior)
         sensors, samples = stream(model, 2.0, 0.05 * np.arange(81), noise=0.01)
-        ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=10)))
+        ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
         last = ident.run(samples).last
         assert abs(last.q[0] - 2.0) < 3 * last.q_std[0]
         assert last.q_std[0] < 0.03
@@ -109,7 +109,7 @@ def test_replay_makes_the_result_independent_of_the_prior():
 def test_a_full_window_goes_on_from_the_estimate():
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.05 * np.arange(121), noise=0.01)
-    law = lp.SensitivityLaw(replay=lp.Replay(window=20, first=5))
+    law = lp.SensitivityLaw()
     ident = lp.Identifier(model, sensors, law)
     stored = []
     for t, z, inputs in samples:
@@ -236,7 +236,7 @@ def test_a_sensor_that_sees_a_parameter():
     ("replay", "scheme"), [(None, lp.Alexander2()), (lp.Replay(first=3), lp.ImplicitEuler())]
 )
 def test_passes_the_shipped_check(replay, scheme):
-    model, law = conductivity(), lp.SensitivityLaw(replay=replay, start_window=4)
+    model, law = conductivity(), lp.SensitivityLaw(replay=replay, refit=lp.laws.Refit(start=4))
     sensors, samples = stream(model, 2.0, 0.1 * np.arange(9))
     check_law(
         law, lambda law: lp.Identifier(model, sensors, law, scheme=scheme), samples
@@ -256,7 +256,7 @@ def test_a_nonlinear_model_finds_its_rate():
     sensors = lp.Points([0.2, 0.8], noise=0.001)
     G = sensors.matrix(model.state_space)
     states = truth(model, np.array([1.6]), start, times, SCHEME)
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=5)), u0=start)
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=start)
     for t, u in zip(times[1:], states[1:], strict=True):
         estimate = ident.step(t, G @ u)
     assert estimate.q[0] == pytest.approx(1.6, abs=1e-3)
@@ -266,7 +266,7 @@ def test_a_replay_that_fails_keeps_the_linear_estimate(monkeypatch):
     """Told in the notes; the stream goes on, and the next replay is tried when doubled."""
     model = conductivity()
     sensors, samples = stream(model, 2.0, 0.1 * np.arange(12))
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=lp.Replay(first=4)))
+    ident = lp.Identifier(model, sensors, lp.SensitivityLaw())
 
     def no_luck(filter_, x, span, options):
         zero, lost = np.zeros(1), Status("not_converged", "no luck")
@@ -293,7 +293,7 @@ class TestRefusals:
         with pytest.raises(lp.errors.LawError, match="noise"):
             lp.SensitivityLaw(noise=0.0)
         with pytest.raises(lp.errors.LawError, match="choose one"):
-            lp.SensitivityLaw(memory=1.0, replay=lp.Replay())
+            lp.SensitivityLaw(memory=1.0)
         with pytest.raises(lp.errors.LawError, match="first"):
             lp.Replay(window=5, first=6)
         with pytest.raises(lp.errors.LawError, match="iterations"):

@@ -255,7 +255,7 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> No
 def test_a_replay_restarts_its_shadows() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
     plain = ran(identifier(8, scheme=ImplicitEuler()), samples())
-    law = lp.SensitivityLaw(replay=lp.Replay())
+    law = lp.SensitivityLaw()
     replayed = ran(identifier(8, law, scheme=ImplicitEuler()), samples())
     for kind in ("step", "mesh"):
         one, other = shifts(plain, kind), shifts(replayed, kind)
@@ -304,7 +304,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
 
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:
     """Neither gate nor verdict take its part, and no number of the filter moves."""
-    law = lp.SensitivityLaw(start_window=0)
+    law = lp.SensitivityLaw(refit=None)
     spoiled, whole = identifier(8, law), identifier(8, law)
     ran(spoiled, samples()[:15]), ran(whole, samples()[:15])
     now = spoiled._state.now

@@ -106,7 +106,7 @@ def compared(law, evolution, samples):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_smoothed_is_the_least_squares_solution_over_all_times(name):
-    law = Plain(rank=9, gate=np.inf, start_window=0)
+    law = Plain(rank=9, gate=np.inf, refit=None)
     (mean, std), (exact, deviations) = compared(law, EVOLUTIONS[name], irregular())
     np.testing.assert_allclose(mean, exact, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(std, deviations, rtol=1e-8, atol=1e-8)
@@ -116,7 +116,7 @@ def test_smoothed_is_the_least_squares_solution_over_all_times(name):
 def test_a_square_root_of_fewer_rows_is_as_good():
     """The default rank forgets directions of the state that hardly count."""
     samples = irregular()
-    law = Plain(gate=np.inf, start_window=0)
+    law = Plain(gate=np.inf, refit=None)
     (mean, std), (exact, deviations) = compared(law, EVOLUTIONS["walk"], samples)
     seen = deviations > 0.0
     assert np.abs((mean - exact)[seen] / deviations[seen]).max() < 0.01

@@ -399,6 +399,7 @@ class Identifier:
             held=held,
             space=self.model.parameter_space,
             judge=self._judge(judge, lambda: report.diagnostics),
+            fit=self.law.fit(self._work, self._state),
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
@@ -448,17 +449,35 @@ class Identifier:
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
     def settled(self, estimate: Estimate) -> Estimate:
-        """Return the last estimate with parameter and state after the law's work in parts.
+        """Return the last estimate after a fit of all stored samples, for the end of a run.
 
-        For the end of a run: such work is a replay in slices, say. The identifier does not change:
-        the next sample finds it as it was.
+        The identifier does not change: the next sample finds it as it was. See `refit`.
         """
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
         latent, judge = self.law.deferred(self._work, state)
-        belief = self.problem.physical(latent())
-        return replace(estimate, belief=belief, judge=self._judge(judge, estimate.diagnose))
+        return replace(
+            estimate,
+            belief=self.problem.physical(latent()),
+            judge=self._judge(judge, estimate.diagnose),
+            fit=self.law.fit(self._work, state),
+        )
+
+    def refit(self) -> Estimate:
+        """Fit all stored samples again, continue from there, and return the estimate.
+
+        The most probable unknowns given these samples: see `livepde.laws.Refit`. For a law that
+        stores no samples the estimate is as it was.
+
+        Raises
+        ------
+        MissingInputError
+            As for `estimate`.
+        """
+        if self._state is not None:
+            self._state = self.law.settled(self._work, self._state)
+        return self.estimate()
 
     def forecast(self, times: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> Forecast:
         """Return predicted readings if nothing more is measured; nothing is learned.
@@ -590,7 +609,7 @@ class Identifier:
                 "taken none."
             )
         if why := self.unsmoothed:
-            raise LawError(f"smoothed: {why}; take SensitivityLaw or AutoLaw.")
+            raise LawError(f"smoothed: {why}; use SensitivityLaw.")
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)

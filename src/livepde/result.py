@@ -12,7 +12,7 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, cells
-from livepde.laws import Belief, Status
+from livepde.laws import Belief, Fit, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
@@ -63,6 +63,8 @@ class Estimate:
         The unknowns.
     judge
         Function that returns the verdict of the law on the run so far; see `verdict`.
+    fit
+        The last fit of all stored samples; None before it, and for laws without.
     """
 
     t: float
@@ -75,6 +77,7 @@ class Estimate:
     held: tuple[str, ...]
     space: FunctionSpace
     judge: Callable[[], Verdict] = Verdict.unjudged
+    fit: Fit | None = None
 
     @classmethod
     def deferred(
@@ -90,6 +93,7 @@ class Estimate:
         held: tuple[str, ...],
         space: FunctionSpace,
         judge: Callable[[], Verdict],
+        fit: Fit | None = None,
     ) -> Estimate:
         """Return an estimate whose belief is computed when it is first read, and kept then.
 
@@ -110,6 +114,7 @@ class Estimate:
             held=held,
             space=space,
             judge=judge,
+            fit=fit,
         )
         return estimate
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
-from livepde.laws.auto import AutoLaw
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.damping_bounds import (
     Constants,
@@ -21,6 +20,7 @@ from livepde.laws.jumps import Jumps
 from livepde.laws.law import (
     AnyLaw,
     Belief,
+    Fit,
     FixedInterval,
     InitialReading,
     Law,
@@ -30,15 +30,14 @@ from livepde.laws.law import (
     numerical,
     stepped,
 )
+from livepde.laws.refit_options import Refit
 from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
-from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows
 from livepde.laws.step_diagnostics import Diagnostics
 
 __all__ = [
     "AnyLaw",
-    "AutoLaw",
     "BaumeisterLaw",
     "Belief",
     "ConstantDamping",
@@ -47,6 +46,7 @@ __all__ = [
     "Diagnostics",
     "ExactBound",
     "ExcitationGate",
+    "Fit",
     "FixedInterval",
     "GradientLaw",
     "Guards",
@@ -58,7 +58,7 @@ __all__ = [
     "NoisyBound",
     "Norms",
     "Problem",
-    "Replay",
+    "Refit",
     "Report",
     "Residual",
     "ResidualDamping",

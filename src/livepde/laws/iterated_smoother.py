@@ -27,7 +27,7 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 from livepde.stepping import Interval
 
-__all__ = ["expecting", "iterate_starts", "missed", "moved"]
+__all__ = ["HOLDS", "apart", "expecting", "iterate_starts", "missed", "moved", "usual"]
 
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
@@ -90,10 +90,10 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
         # as much again.
         searched = samples.unaccompanied
         best = iterated_smoother(searched)
-        moved = math.inf if best is None else _apart(work.filter, best.x, state.now)
+        moved = math.inf if best is None else apart(work.filter, best.x, state.now)
         found = None if best is None else best.x
         if best is not None and searched is not samples:
-            if moved <= holds and _usual(state.now) and _is_square(state.now):
+            if moved <= holds and usual(state.now) and _is_square(state.now):
                 found = _accompanied(best.x, state.now)
             else:
                 whole = samples.about(best.trajectory)
@@ -102,10 +102,10 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
             state = changed(state, now=work.filter.relinearised(_without_past(found)))
         stays = shares[-1] < HALF and not work.filter.moves
         if stays and count >= ENOUGH and moved <= holds:
-            return changed(state, start_due=np.array([NEVER])), moved
-    if count >= work.start_window:
+            return changed(state, due=np.array([NEVER])), moved
+    if count >= work.window:
         return new_window(work, state.now, state), moved
-    return changed(state, start_due=2 * state.assimilated), moved
+    return changed(state, due=2 * state.assimilated), moved
 
 
 def iterated_smoother(samples: _Samples) -> _Pass | None:
@@ -142,7 +142,7 @@ def _accompanied(x: FilterState, now: FilterState) -> FilterState:
     return changed(x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
 
 
-def _usual(x: FilterState) -> bool:
+def usual(x: FilterState) -> bool:
     """True if the innovations of one member are no larger than their noise makes usual."""
     count, squares = x.innovations.sums[0, 0], x.innovations.sums[0, 2]
     return bool(squares <= count + 3.0 * math.sqrt(2.0 * count))
@@ -200,7 +200,7 @@ def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
     return None
 
 
-def _apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
+def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
     """Return how far estimates of two filters are apart, in standard deviations of the first."""
     shift = filter_.reduction.reduced(filter_.estimate(x) - filter_.estimate(other))[0]
     return _deviations(x, shift)

@@ -59,7 +59,8 @@ class MemberSensors:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
         if self.fixed:
             members, r, n = U.shape
-            return np.asarray(self._G.dot(U.reshape(-1, n).T).T.reshape(members, r, -1))
+            seen = self._G.dot(U.reshape(-1, n).T).T
+            return np.asarray(seen.reshape(members, r, seen.shape[1]))
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 

@@ -11,13 +11,13 @@ from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
-from livepde.laws.law import Problem
+from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
 
-__all__ = ["judge_of", "judged"]
+__all__ = ["judge_of", "judged", "with_fit"]
 
 
 def judge_of(
@@ -76,6 +76,17 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
             return assess(judge.dictionary, at)
 
     return found
+
+
+def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+    """Return a verdict with a finding where the last fit of the samples has not converged."""
+    if fit is None or fit.converged:
+        return judge
+    text = (
+        f"The fit of the first {fit.samples} samples did not converge: start from another prior, "
+        "or check the model."
+    )
+    return lambda: judge().with_findings([Finding("fit", "do not trust", text)])
 
 
 def _unseen() -> Finding:

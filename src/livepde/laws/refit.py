@@ -1,0 +1,320 @@
+"""The refit: the most probable constant unknowns given the stored samples, from any honest prior.
+
+Levenberg-Marquardt steps within a trust region in prior standard deviations (More 1978, Conn, Gould
+and Toint 2000). Where the end does not explain the samples, the search begins again at the best of
+some screened points. The gate acts once a search has ended, and may take back readings.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import scipy
+
+from livepde.laws.refit_options import Refit
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.linalg import Array, Mask
+
+__all__ = ["Found", "refitted"]
+
+DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
+ENDS = 0.1  # posterior standard deviations of a last step
+ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
+ACCEPTED = 1e-4  # least ratio of actual and predicted decrease of the cost
+POOR, GOOD = 0.25, 0.75  # ratios below and above which the trust region changes
+SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
+LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
+UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
+QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
+SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
+LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
+GATE_ROUNDS = 4
+GATE = 4.0  # usual deviations from the neighbours beyond which a residual is refused
+WILD = 30.0  # the same for readings, before there is a fit
+NEIGHBOURS = 3  # to each side
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """End of a search.
+
+    Attributes
+    ----------
+    best
+        The samples about the trajectory where it ended.
+    used
+        Readings in use, shape (samples, sensors).
+    converged
+        True if no step lowers the cost any more, and samples that are not explained pin all
+        unknowns: then the model is in error, not the search.
+    passes
+        Passes over the samples that it took.
+    """
+
+    best: Passed
+    used: Mask
+    converged: bool
+    passes: float
+
+
+def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | None:
+    """Return the end of a search from the present estimate; None if no trajectory is possible.
+
+    Parameters
+    ----------
+    last
+        True for the end of a run: the search converges. Else it ends within a standard deviation,
+        as the same samples are fitted again later.
+    """
+    search = _Search(samples, options, last)
+    search.descend(samples.reached)
+    if search.suspicious:
+        search.screen()
+    if last and search.lost:
+        search.draw()
+    if search.best is None:
+        return None
+    for _ in range(GATE_ROUNDS):
+        used = _plausible(search.best.residuals)
+        if (used == search.used).all():
+            break
+        search.begin(used)
+    converged = search.settled and not search.lost
+    return Found(best=search.best, used=search.used, converged=converged, passes=search.passes)
+
+
+@dataclass(eq=False)
+class _Search:
+    """A search for the most probable trajectory; it keeps the best one, and counts its passes."""
+
+    samples: StoredSamples
+    options: Refit
+    last: bool
+    used: Mask = field(init=False)
+    best: Passed | None = None
+    settled: bool = False
+    passes: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.used = _plausible(self.samples.readings, WILD)
+
+    @property
+    def _ends(self) -> float:
+        return ENDS if self.last else ENDS_EARLY
+
+    def begin(self, used: Mask) -> None:
+        """Search again from the best trajectory, with other readings in use."""
+        before, self.used, self.best = self.best, used, None
+        if before is not None:
+            self._descend(before)
+
+    def descend(self, xi: Array) -> None:
+        """Search from a trajectory, and keep where that ends if it is better."""
+        start = self._about(self.samples.within_bounds(xi))
+        if start is None and xi.any():
+            start = self._about(np.zeros_like(xi))
+        if start is not None:
+            self._descend(start)
+
+    def _about(self, xi: Array) -> Passed | None:
+        self.passes += 1.0
+        return self.samples.about(xi)
+
+    def _descend(self, start: Passed) -> None:
+        """Take Levenberg-Marquardt steps from a pass, and keep the end if it is the best."""
+        end, settled = start, False
+        budget, delta = self.passes + self.options.passes, DELTA
+        while self.passes < budget:
+            if math.sqrt(2.0 * self._decrease(end)) < self._ends:
+                settled = True
+                break
+            better, delta = self._stepped(end, delta, budget)
+            if better is None:
+                break
+            end = better
+        if self.best is None or end.cost(self.used) < self.best.cost(self.used):
+            self.best, self.settled = end, settled
+
+    def _model(self, one: Passed) -> tuple[Array, Array]:
+        """Return Hessian and direction of descent of the cost."""
+        J, r = one.slopes[self.used], one.residuals[self.used]
+        return np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
+
+    def _decrease(self, one: Passed) -> float:
+        """Return by how much the quadratic model of the cost falls to its minimum."""
+        H, g = self._model(one)
+        free = self._free(one, g)
+        along = free.T @ g
+        return 0.5 * float(along @ np.linalg.solve(free.T @ H @ free, along))
+
+    def _free(self, one: Passed, g: Array) -> Array:
+        """Return a basis of the directions in which no bound is in the way, (r, free)."""
+        samples = self.samples
+        reduction, start = samples.filter.reduction, samples.state.start
+        lower, upper = reduction.ends
+        q = start.q[0] + reduction.Phi @ (start.C[0].T @ one.xi)
+        along = reduction.Phi @ (start.C[0].T @ g)
+        span = np.abs(reduction.Phi).max(axis=1, initial=0.0)
+        low, high = q <= lower + 1e-9 * span, q >= upper - 1e-9 * span
+        held = (low & (along < 0.0)) | (high & (along > 0.0))
+        if not held.any():
+            return np.eye(len(g))
+        rows = (reduction.Phi @ start.C[0].T)[held]
+        basis: Array = scipy.linalg.null_space(rows)
+        return basis
+
+    def _stepped(self, one: Passed, delta: float, budget: float) -> tuple[Passed | None, float]:
+        """Return the pass after an accepted step, None if there is none, and the trust region."""
+        H, g = self._model(one)
+        free, cost = self._free(one, g), one.cost(self.used)
+        sizes, axes = np.linalg.eigh(free.T @ H @ free)
+        axes = free @ axes
+        while self.passes < budget:
+            step = axes @ _within(sizes, axes.T @ g, delta)
+            xi = self.samples.within_bounds(one.xi + step)
+            step = xi - one.xi
+            predicted = float(g @ step - 0.5 * step @ H @ step)
+            length = float(np.linalg.norm(step))
+            if length < SHORTEST or predicted < LEAST * cost:
+                return None, delta
+            found, taken = self.samples.costs(xi[None], self.used, cost)
+            self.passes += taken
+            ratio = (cost - float(found[0])) / predicted
+            if ratio < POOR:
+                delta = length * (0.5 if ratio > 0.0 else 0.25)
+            elif ratio > GOOD:
+                delta = max(delta, 2.0 * length)
+            if ratio > ACCEPTED:
+                better = self._about(xi)
+                if better is not None:
+                    return better, delta
+        return None, delta
+
+    @property
+    def suspicious(self) -> bool:
+        """True if the best trajectory does not explain the samples, as a wrong minimum does not."""
+        return self.lost or self._square > LARGE
+
+    @property
+    def lost(self) -> bool:
+        """True if samples that are not explained leave an unknown as uncertain as its prior."""
+        if self.best is None:
+            return True
+        if self._square <= DOUBTFUL:
+            return False
+        H, _ = self._model(self.best)
+        return 1.0 / math.sqrt(np.linalg.eigvalsh(H)[0]) > UNSURE
+
+    @property
+    def _square(self) -> float:
+        """Misfit of the best trajectory."""
+        if self.best is None:
+            return math.inf
+        return _misfit(self.best.residuals, self.samples.readings, self.used)
+
+    def screen(self) -> None:
+        """Search from the best of some points of the prior."""
+        points = SPREAD * _normal(SCREENED, self.samples.state.start.C.shape[1])
+        points = np.array([self.samples.within_bounds(one) for one in points])
+        costs, taken = self.samples.costs(points, self.used)
+        self.passes += taken
+        order = np.argsort(costs)
+        # At the end of a run a misfit that pins all unknowns is most likely an error of the model.
+        fitted = 1 if self.last and not self.lost else FITTED
+        for place in order[:fitted].tolist():
+            if not np.isfinite(costs[place]) or self._known(points[place]):
+                continue
+            self.descend(points[place])
+            if not self.suspicious:
+                return
+
+    def _known(self, xi: Array) -> bool:
+        """True if a point is at the best trajectory, within a posterior standard deviation."""
+        if self.best is None:
+            return False
+        H, _ = self._model(self.best)
+        away = xi - self.best.xi
+        return float(away @ H @ away) < 1.0
+
+    def draw(self) -> None:
+        """Search from drawn points, before it is given up."""
+        size = self.samples.state.start.C.shape[1]
+        for xi in LAST_SPREAD * np.random.default_rng(0).standard_normal((LAST, size)):
+            self.descend(xi)
+            if not self.suspicious:
+                return
+
+
+def _within(sizes: Array, g: Array, delta: float) -> Array:
+    """Return the minimum of a quadratic model within a ball, in its principal axes.
+
+    Parameters
+    ----------
+    sizes, g
+        Eigenvalues of the Hessian, at least 1, and the descent direction, shapes (r,).
+    delta
+        Radius of the ball.
+    """
+    step = g / sizes
+    if np.linalg.norm(step) <= delta:
+        return step
+    # The length falls with the shift; the bracket holds since |g|/(shift + 1) bounds the length.
+    low, high = 0.0, float(np.linalg.norm(g)) / delta
+    for _ in range(60):
+        shift = 0.5 * (low + high)
+        step = g / (sizes + shift)
+        low, high = (shift, high) if np.linalg.norm(step) > delta else (low, shift)
+    return np.asarray(g / (sizes + high))
+
+
+def _normal(count: int, size: int) -> Array:
+    """Return Sobol points of N(0, I), shape (count, size)."""
+    sobol = scipy.stats.qmc.Sobol(size, seed=0)
+    return np.asarray(scipy.special.ndtri(np.clip(sobol.random(count), 1e-6, 1.0 - 1e-6)))
+
+
+def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
+    """Return a high quantile of mean squares of residuals, over sensors and blocks of samples.
+
+    In units of the noise that is stated, or that second differences show if that is larger.
+    """
+    shown = np.where(used, readings, np.nan)
+    squares = []
+    for k in range(readings.shape[1]):
+        seen = shown[np.isfinite(shown[:, k]), k]
+        bends = np.diff(seen, n=2)
+        noise = max(1.0, float((bends**2).mean()) / 6.0) if len(bends) else 1.0
+        for block in np.array_split(residuals[used[:, k], k], BLOCKS):
+            if len(block):
+                squares.append(float((block**2).mean()) / noise)
+    return float(np.quantile(squares, QUANTILE)) if squares else 0.0
+
+
+def _plausible(values: Array, limit: float = GATE) -> Mask:
+    """Return which values of each sensor lie near the median of their neighbours.
+
+    A model error, which changes slowly, stays; `values` are in units of the noise, NaN: missing.
+    """
+    used = np.isfinite(values)
+    for k, column in enumerate(values.T):
+        (places,) = np.isfinite(column).nonzero()
+        seen = column[places]
+        if len(seen) <= 2 * NEIGHBOURS:
+            continue
+        away = np.abs(seen - _of_neighbours(seen))
+        usual = max(1.0, 1.4826 * float(np.median(away)))  # of normal values: the deviation
+        used[places, k] = away <= limit * usual
+    return used
+
+
+def _of_neighbours(values: Array) -> Array:
+    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
+    count, reach = len(values), NEIGHBOURS
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
+    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
+    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
+    first = [np.median(values[which]) for which in edges.values()]
+    last = [np.median(values[count - 1 - which]) for which in edges.values()]
+    return np.concatenate([first, inner, last[::-1]])

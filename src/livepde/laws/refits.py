@@ -1,0 +1,82 @@
+"""When the stored samples are taken again, and what becomes of the filter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from livepde.laws.filter_state import FilterState
+from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
+from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.refit import Found, refitted
+from livepde.laws.refit_options import Refit
+from livepde.laws.sensitivity_state import FitState, SensitivityState, SensitivityWork, new_window
+from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.stored_samples import StoredSamples
+from livepde.linalg import Array, Mask
+
+__all__ = ["refit_due", "settle"]
+
+
+def refit_due(
+    work: SensitivityWork, state: SensitivityState, due: Mask
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
+    """Return all members after the refits that are due, and diagnostics if there was one."""
+    if not work.fits:
+        return iterate_starts(work, state, due)
+    if (options := work.refit) is None:
+        return state, None
+    for k in np.flatnonzero(due).tolist():
+        one = take(state, k)
+        count = int(one.assimilated[0])
+        if max(count, one.log.shape[1] - 1 - int(one.window[0])) >= options.window:
+            one = new_window(work, one.now, one)
+        else:
+            # A window but the first begins with what is known: it has nothing to search for.
+            if count <= options.start:
+                one = _refitted(work, options, one, last=False)
+            later = 2 * count if 2 * count <= options.start else options.window
+            one = changed(one, due=np.array([later]))
+        state = put(state, k, one)
+    return state, None
+
+
+def settle(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+    """Return all members after a last refit, for the end of a run."""
+    options = work.refit
+    if options is None or not work.fits:
+        return state
+    for k in range(len(state)):
+        one = take(state, k)
+        if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
+            state = put(state, k, _refitted(work, options, one, last=True))
+    return state
+
+
+def _refitted(
+    work: SensitivityWork, options: Refit, state: SensitivityState, *, last: bool
+) -> SensitivityState:
+    """Return one member after a refit."""
+    samples = StoredSamples.of(work, state)
+    found = refitted(samples, options, last=last)
+    count, spent = state.assimilated, state.fit.work
+    x = None if found is None else _filter(samples, found)
+    if found is None or x is None:
+        fit = changed(state.fit, samples=count, converged=np.zeros(1))
+        return changed(state, fit=fit)
+    fit = FitState(
+        samples=count,
+        cost=np.array([found.best.cost(found.used)]),
+        refused=np.array([float((np.isfinite(samples.readings) & ~found.used).sum())]),
+        work=spent + found.passes * len(samples.spans),
+        converged=np.array([float(found.converged)]),
+    )
+    return changed(state, now=work.filter.relinearised(x), fit=fit)
+
+
+def _filter(samples: StoredSamples, found: Found) -> FilterState | None:
+    """Return the filter that continues from the end of a search; None if a step fails."""
+    now = samples.state.now
+    best = samples.updated(found.best, found.used)
+    if best is not None and usual(now) and apart(samples.filter, best, now) <= HOLDS:
+        return best
+    return samples.judged(found.best, found.used)

@@ -1,0 +1,263 @@
+"""The stored samples of one member, followed about one trajectory of constant unknowns.
+
+With xi the coordinates of the start on the rows of its square root, a = a_0 + C_0^T xi and
+u = u_0 + U_0^T xi, a trajectory is a point xi. A pass gives the residuals of all readings and their
+derivatives in xi; nothing is updated on the way, so that the matrix of a step stays the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from livepde.laws.assimilation import absorb, assimilate
+from livepde.laws.filter import Filter, contraction
+from livepde.laws.filter_state import FilterState
+from livepde.laws.history import first_interval, intervals_since
+from livepde.laws.member_arrays import changed
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.linalg import Array, BlockFactor, Mask
+from livepde.stepping import Span, StageOfMembers, advance
+
+__all__ = ["Passed", "StoredSamples"]
+
+FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage
+AT_ONCE = 32  # trajectories that are followed as one array
+
+
+@dataclass(frozen=True, eq=False)
+class Passed:
+    """The samples about one trajectory.
+
+    Attributes
+    ----------
+    xi
+        Coordinates of the trajectory, shape (r,).
+    residuals
+        Readings less predictions, in units of the noise, shape (samples, sensors); NaN: missing.
+    slopes
+        Derivatives of the predictions in xi, in units of the noise, (samples, sensors, r).
+    end
+        State, unknowns, and their derivatives in xi as rows, after the last sample.
+    """
+
+    xi: Array
+    residuals: Array
+    slopes: Array
+    end: FilterState
+
+    def cost(self, used: Mask) -> float:
+        """Return half the sum of squares of residuals in use and of xi."""
+        return 0.5 * float((self.residuals[used] ** 2).sum() + self.xi @ self.xi)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredSamples:
+    """The samples of one member since the start of its window.
+
+    Attributes
+    ----------
+    work, state
+        Parts of the law, and the member as it is now.
+    spans
+        Intervals that lead to each sample; the first is without length if it is at the start.
+    """
+
+    work: SensitivityWork
+    state: SensitivityState
+    spans: Sequence[Span]
+
+    @classmethod
+    def of(cls, work: SensitivityWork, state: SensitivityState) -> StoredSamples:
+        """Return the samples in the window of one member."""
+        filter_, log = work.filter, state.log[:, int(state.window[0]) :]
+        channels = filter_.problem.channels
+        intervals = intervals_since(log, channels)
+        if state.opening[0]:
+            intervals = [first_interval(log, channels), *intervals]
+        return cls(work, state, [filter_.span(interval) for interval in intervals])
+
+    @property
+    def filter(self) -> Filter:
+        """The filter of the law."""
+        return self.work.filter
+
+    @cached_property
+    def noise(self) -> Array:
+        """Standard deviation of each reading, (samples, sensors)."""
+        return np.array([self.filter.noise_of(self.state.now, span)[0] for span in self.spans])
+
+    @cached_property
+    def readings(self) -> Array:
+        """All readings in units of their noise, (samples, sensors); NaN: missing."""
+        return np.array([span.z1[0] for span in self.spans]) / self.noise
+
+    @property
+    def reached(self) -> Array:
+        """Coordinates xi of the present estimate, shape (r,)."""
+        now, start, reduction = self.state.now, self.state.start, self.filter.reduction
+        shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
+        return self.coordinates(shift)
+
+    def coordinates(self, shift: Array) -> Array:
+        """Return the least xi that moves the reduced unknowns by a shift, (k,)."""
+        found: Array = np.linalg.lstsq(self.state.start.C[0].T, shift, rcond=None)[0]
+        return found
+
+    def within_bounds(self, xi: Array) -> Array:
+        """Return xi, moved the least so that the unknowns are within their bounds."""
+        start, reduction = self.state.start, self.filter.reduction
+        shift = start.C[0].T @ xi
+        q = start.q[0] + reduction.Phi @ shift
+        inside = reduction.bounded(q)
+        if inside is q:
+            return xi
+        return xi + self.coordinates(reduction.reduced(inside - start.q[0]) - shift)
+
+    def placed(self, points: Array, rows: bool) -> FilterState:
+        """Return the start of trajectories, shape (points, r), with or without derivatives."""
+        start, reduction = self.state.start, self.filter.reduction
+        count, (r, k), n = len(points), start.C[0].shape, start.u.shape[1]
+        shifts = points @ start.C[0]
+        q = start.q + shifts @ reduction.Phi.T
+        C = np.broadcast_to(start.C, (count, r, k))
+        if self.state.initial[0]:
+            model, moment = self.filter.problem.model, self.spans[0].at(float(self.spans[0].t0[0]))
+            at = moment.member(0)
+            u = np.array([model.initial_state(one, at) for one in q])
+            slopes = [model.initial_directions(one, reduction.Phi, at).T for one in q]
+            U = C @ np.array(slopes)
+        else:
+            u = start.u + points @ start.U[0]
+            U = np.broadcast_to(start.U, (count, r, n))
+        return changed(
+            start,
+            member=np.zeros(count, dtype=np.int64),
+            q=q,
+            u=u,
+            du=np.zeros((count, n)),
+            da=np.zeros((count, k)),
+            U=U if rows else U[:, :0],
+            C=C if rows else C[:, :0],
+            past=np.zeros((count, r if rows else 0, 0)),
+            kept=self.filter.stage.kept(count),
+        )
+
+    def _followed(self, x: FilterState) -> Iterator[tuple[FilterState, Span]]:
+        """Yield trajectories after each span; ends early where a step fails."""
+        filter_, factors, kept = self.filter, dict[float, BlockFactor](), x.kept
+        along = filter_.reduction.directions(x.q, x.C)
+        exact = np.zeros(len(x.member), dtype=bool)
+        columns = np.concatenate([x.u[None], x.U.transpose(1, 0, 2)])
+        for span in self.spans:
+            if len(factors) > FACTORS:
+                factors.clear()
+
+            def stage(columns: Array, t: float, h: float, span: Span = span) -> Array:
+                nonlocal kept
+                work = StageOfMembers(x.member, x.q, along, h, span.at(t), kept, exact, factors)
+                y, kept = filter_.stage.advance(columns, work)
+                return y
+
+            if span.t1 > span.start:
+                control = filter_.problem.control
+                columns, _, failure = advance(control, stage, columns, span.start, span.t1)
+                if failure is not None:
+                    return
+            yield changed(x, u=columns[0], U=columns[1:].transpose(1, 0, 2), kept=kept), span
+
+    def about(self, xi: Array) -> Passed | None:
+        """Return the samples about one trajectory with derivatives; None if a step fails."""
+        residuals, slopes, x = [], [], None
+        for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=True))):
+            predicted, Y = self.filter.sensors.observe(x, span.end)
+            residuals.append((span.z1[0] - predicted[0]) / self.noise[number])
+            slopes.append(Y[0].T / self.noise[number][:, None])
+        if x is None or len(residuals) < len(self.spans):
+            return None
+        J = np.array(slopes)
+        finite = np.isfinite(J).all() and np.isfinite(x.u).all() and np.isfinite(x.U).all()
+        return Passed(xi=xi, residuals=np.array(residuals), slopes=J, end=x) if finite else None
+
+    def costs(self, points: Array, used: Mask, limit: float = np.inf) -> tuple[Array, float]:
+        """Return the costs of trajectories, and how much of a pass they took.
+
+        States alone are followed. Where all costs exceed the limit, the rest is left out.
+        """
+        found = 0.5 * (points**2).sum(axis=1)
+        whole, taken = np.zeros(len(points), dtype=bool), 0
+        for first in range(0, len(points), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            steps = self._followed(self.placed(points[part], rows=False))
+            for number, (x, span) in enumerate(steps):
+                predicted, _ = self.filter.sensors.observe(x, span.end)
+                missed = np.where(used[number], span.z1 - predicted, 0.0) / self.noise[number]
+                found[part] += 0.5 * (missed * missed).sum(axis=1)
+                taken += len(predicted)
+                if not (found[part] < limit).any():
+                    break
+                whole[part] = number + 1 == len(self.spans)
+        columns = 1 + self.state.start.C.shape[1]
+        cost = np.where(whole & np.isfinite(found), found, np.inf)
+        return cost, taken / (columns * max(len(self.spans), 1))
+
+    def updated(self, one: Passed, used: Mask) -> FilterState | None:
+        """Return the filter after all readings in use, linear about a trajectory.
+
+        Ledger and discretisation errors are those of the present filter, which has to be near by:
+        None if its square root has other rows.
+        """
+        end, now = one.end, self.state.now
+        if now.C.shape != end.C.shape:
+            return None
+        J = one.slopes[used]
+        # The prior of xi is N(0, I); about the trajectory its mean is -xi.
+        W, half, _ = contraction(J.T[None], (one.residuals[used] + J @ one.xi)[None])
+        mean = W[0] @ half[0] - one.xi
+        C, U = W[0].T @ end.C[0], W[0].T @ end.U[0]
+        # Causes are coordinates on the rows of the square root, which is one up to a rotation: the
+        # one that brings these rows nearest to those of the present filter.
+        left, _, right = np.linalg.svd(now.C[0] @ np.linalg.pinv(C))
+        turn = left @ right
+        return changed(
+            now,
+            q=end.q,
+            u=end.u,
+            da=(mean @ end.C[0])[None],
+            du=(mean @ end.U[0])[None],
+            C=(turn @ C)[None],
+            U=(turn @ U)[None],
+        )
+
+    def judged(self, one: Passed, used: Mask) -> FilterState | None:
+        """Return the filter that has taken the readings in use one by one, about a trajectory.
+
+        It has ledger and discretisation errors, which `updated` has not; None if a step fails.
+        """
+        state, filter_ = self.state, self.filter
+        now = state.now
+        at = self.placed(one.xi[None], rows=True)
+        start = changed(
+            state.start,
+            q=at.q,
+            u=at.u,
+            U=at.U,
+            da=-(one.xi @ at.C[0])[None],
+            du=-(one.xi @ at.U[0])[None],
+            level=now.level,
+            samples=now.samples,
+            kept=now.kept,
+        )
+        x, options = start, replace(self.work.options, gate=np.inf)
+        for span, kept in zip(self.spans, used, strict=True):
+            chosen = replace(span, z1=np.where(kept, span.z1, np.nan))
+            if span.t1 > span.start:
+                x, told = assimilate(filter_, x, chosen, options)
+            else:
+                x, told = absorb(filter_, x, chosen, options)
+            if not (told.status.ok and told.finite[0]):
+                return None
+        return changed(x, refused=now.refused)
