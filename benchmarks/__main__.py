@@ -199,7 +199,9 @@ def scale(
     return benchmark.scale(sizes, gain or benchmark.GAINS, cube or ())
 
 
-@program.command(quick="Only the smallest square, one data set, and the smallest cost.")
+@program.command(
+    quick="The smallest square, one data set, the smallest cost, one reaction on partial data."
+)
 def auto(
     *,
     size: Annotated[
@@ -215,9 +217,12 @@ def auto(
     """
     from benchmarks.auto import COSTS, SIZES
     from benchmarks.auto import auto as benchmark
+    from benchmarks.partial import LEVELS, PROCESSES
 
     sizes = size or (SIZES[:1] if quick else SIZES)
-    return benchmark(sizes, seeds, (min(COSTS),) if quick else tuple(COSTS))
+    costs = (min(COSTS),) if quick else tuple(COSTS)
+    reactions = tuple(PROCESSES)[: 1 if quick else None]
+    return benchmark(sizes, seeds, costs, reactions, LEVELS[-1:] if quick else LEVELS)
 
 
 @program.command(quick="Few nodes: q is compared, and costs are too small for their bounds.")

@@ -51,7 +51,9 @@ SAMPLES = 1000  # for which that time is promised
 # --- our laws ------------------------------------------------------------------------------------
 
 
-def _sensitivity(replay: Replay | None, data: Data) -> tuple[Observation, AnyLaw]:
+def _sensitivity(replay: Replay | None, data: Data) -> tuple[Observation, AnyLaw] | None:
+    if replay is not None and data.process.model.latent.random:
+        return None  # refused: samples of unknowns that move are not replayed
     return data.observation, SensitivityLaw(modes=data.modes, replay=replay)
 
 

@@ -5,6 +5,8 @@ from data with white noise. The law is told nothing: neither a gain nor how larg
 error is that of q in L2, relative to that of q = 0. With exact data it is held against the best of
 a grid of constant gains and c_1, chosen by the truth. Its cost is that of the processes of
 `python -m benchmarks step`, in steps of the forward model.
+
+Reactions on partial data are those of `benchmarks.partial`.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks import scale
+from benchmarks import partial, scale
 from benchmarks import step as steps
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
@@ -107,7 +109,11 @@ class Square:
 
 
 def auto(
-    sizes: Sequence[int] = SIZES, seeds: int = SEEDS, costs: Sequence[int] = tuple(COSTS)
+    sizes: Sequence[int] = SIZES,
+    seeds: int = SEEDS,
+    costs: Sequence[int] = tuple(COSTS),
+    reactions: Sequence[str] = (),
+    levels: Sequence[float] = partial.LEVELS,
 ) -> Outcome:
     """Check the promises of the law that tunes itself.
 
@@ -119,6 +125,8 @@ def auto(
         Data sets for each level of noise.
     costs
         Numbers of nodes where the cost is measured, of `COSTS`.
+    reactions, levels
+        Processes of `benchmarks.partial` on partial data, and their noise.
     """
     rows: list[tuple[object, ...]] = []
     checks: list[Check] = []
@@ -147,7 +155,11 @@ def auto(
         "ok; failed: samples with another. Constant gains: "
         f"{', '.join(f'{gain:g}' for gain in GAINS)} with c1 {DAMPINGS[0]:g} and {DAMPINGS[1]:g}."
     )
-    return Outcome(tables=[table, times], checks=[*checks, *bounds], notes=[note])
+    tables, checks = [table, times], [*checks, *bounds]
+    if reactions:
+        hidden, more = partial.partial(reactions, levels, seeds)
+        tables, checks = [*tables, hidden], [*checks, *more]
+    return Outcome(tables=tables, checks=checks, notes=[note])
 
 
 def _best(square: Square) -> tuple[float, str]:

@@ -310,7 +310,7 @@ def _states(model: Model, path: Array, times: Array) -> Iterator[Array]:
     u = model.initial(0.0, Moment(times[0], nothing))
     yield u
     for q, (t0, t1) in zip(path[1:], pairwise(times), strict=True):
-        interval = Interval(t0, t1, nothing, nothing, none, none)
+        interval = Interval(t0=t0, t1=t1, inputs0=nothing, inputs1=nothing, z0=none, z1=none)
 
         def stage(c: Array, t: float, h: float, q: Array = q, at: Any = interval.at) -> Array:
             return forward.solve(c, q, h, at(t))

@@ -137,14 +137,23 @@ class Trajectory:
         hidden = np.full((len(times), self.withheld.size if self.withheld else 0), np.nan)
         jacobian = np.zeros((*self.data.z.shape, width))
         y = np.zeros((model.X.dim, 1 + width))
-        at = Interval(times[0], times[0], self.inputs(0), self.inputs(0), none, none)
+        at = Interval(
+            t0=times[0],
+            t1=times[0],
+            inputs0=self.inputs(0),
+            inputs1=self.inputs(0),
+            z0=none,
+            z1=none,
+        )
         y[:, 0] = model.initial(process.u0, at.end)
         for k, (t0, t1) in enumerate(pairwise(times), start=1):
             q = self.latent(a, k)
             # Later increments of a walk do not act yet.
             live = min(width, self.Phi.shape[1] + k * len(self.moving))
             D = self.directions(k)[:, :live]
-            interval = Interval(t0, t1, self.inputs(k - 1), self.inputs(k), none, none)
+            interval = Interval(
+                t0=t0, t1=t1, inputs0=self.inputs(k - 1), inputs1=self.inputs(k), z0=none, z1=none
+            )
 
             def stage(
                 c: Array, t: float, h: float, q: Array = q, D: Array = D, of: Interval = interval

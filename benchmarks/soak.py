@@ -244,7 +244,7 @@ def _samples(model: Model) -> Iterator[Sample]:
     for k in count():
         noise = NOISE * rng.standard_normal(len(SENSORS))
         z = {n: x + e for n, x, e in zip(SENSORS, seen[k % PERIOD], noise.tolist(), strict=True)}
-        yield Sample(DT * k, {**z, "left": float(left[1 + k % PERIOD])})
+        yield Sample(t=DT * k, z={**z, "left": float(left[1 + k % PERIOD])})
 
 
 def _memory() -> tuple[float, float]:

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.failed_steps import FailedSteps
 from experiments.seed_excited_noise import WhiteNoise
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
@@ -32,6 +33,7 @@ from livepde.streams import Twin
 LEVELS = (0.0, 0.01, 0.05, 0.10)
 SEEDS = tuple(range(100, 110))
 TARGET = 1.3
+STEPS = FailedSteps()  # of the law that tunes itself
 EXAMPLES: dict[str, tuple[Any, float, tuple[float, ...], tuple[float, ...]]] = {
     # module, prior deviation of q, gains, c1; a gain counts in units of 1/std^2
     "seed": (seed, 0.01, (1e2, 1e4, 1e6, 1e8), (0.1, 1.0, 10.0, 100.0)),
@@ -45,11 +47,13 @@ EXAMPLES: dict[str, tuple[Any, float, tuple[float, ...], tuple[float, ...]]] = {
 
 
 def final(twin: Twin, samples: Any, observation: Any, law: GradientLaw, u0: Any) -> float:
-    """Return the relative L2 error of q after the last sample."""
+    """Return the relative L2 error of q after the last sample; infinity if that step failed."""
     identifier = Identifier(twin.model, observation, law, q0=0.0, u0=u0)
     error = np.inf
     for sample in samples:
         estimate = identifier.step(sample.t, sample.z)
+        if law.gain == "auto":
+            STEPS.seen(estimate)
         error = twin.error(estimate.q) if estimate.status.ok else np.inf
     return error
 
@@ -98,6 +102,7 @@ def main(names: Sequence[str], seeds: Sequence[int]) -> None:
         )
     print(f"\n{'example':14s} noise       auto       best  ratio, median (range)")
     print("\n".join(rows))
+    STEPS.report()
 
 
 if __name__ == "__main__":

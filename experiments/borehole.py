@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.failed_steps import FailedSteps
 from livepde.cases import load
 from livepde.plots import interval_95
 from livepde.runs import drive
@@ -41,12 +42,14 @@ CHANGES: dict[str, dict[str, Any]] = {
 
 
 def main() -> None:
+    steps = FailedSteps()
     chosen = {title: CHANGES[title] for title in sys.argv[1:] or CHANGES}
     print(f"{'changed':20}{'k':>14}{'6 h':>14}{'10 h':>14}{'within 5 %':>12}{'covered':>9}")
     for title, settings in chosen.items():
         case = load(CASE, settings=settings)
         prepared = case.prepare()
         data = drive(prepared.identifier, prepared.stream).result.to_xarray()
+        steps.add(data.sizes["time"], int((data["status"] != 0).sum()))
         true, hours = case.references["k"], data["time"].values / 3600
         k, std = data["k"].values, data["k_std"].values
         off = hours[np.abs(k / true - 1) > 0.05]
@@ -57,6 +60,7 @@ def main() -> None:
         at = [int(np.abs(hours - hour).argmin()) for hour in (hours[-1], 6.0, 10.0)]
         row = "".join(f"{k[i]:7.2f} ± {std[i]:.2f}" for i in at)
         print(f"{title:20}{row}{within:>12}{covered:9.1%}", flush=True)
+    steps.report()
 
 
 if __name__ == "__main__":

@@ -16,11 +16,15 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 import livepde as lp
+from experiments.failed_steps import FailedSteps
 from livepde.observation import Discrepancy, Tikhonov
 from livepde.reproduce import seed
 from livepde.streams import RelativeNoise, Twin
 
-STEPS = (0.1, 1.0, 10.0, 100.0, 1000.0)
+GRID = (0.1, 1.0, 10.0, 100.0, 1000.0)
+
+
+STEPS = FailedSteps()
 
 
 @dataclass(frozen=True)
@@ -35,20 +39,20 @@ class Tried:
 def try_out(twin: Twin, law: lp.GradientLaw, gains: tuple[float, ...]) -> Tried:
     """Run a law and return its objective; infinity if a step failed."""
     X, R = twin.model.X, twin.observed.split().R
-    identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=seed.start)
+    identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=seed.start, halvings=0)
     squares = []
     for sample in twin:
-        estimate = identifier.step(sample.t, sample.z)
+        estimate = STEPS.seen(identifier.step(sample.t, sample.z))
         if not estimate.status.ok:
             return Tried(gains, np.inf, np.nan)
         squares.append(X.norm(R @ (estimate.u - twin.u(sample.t))) ** 2)
     return Tried(gains, float(trapezoid(squares, twin.times)), twin.error(estimate.q))
 
 
-def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = STEPS) -> list[Tried]:
+def partial(gain: float, samples: int = 101, steps: tuple[float, ...] = GRID) -> list[Tried]:
     """Search c_1 for the paper's first experiment."""
-    twin = seed.twin_of(times=seed.TIMES[:samples])
-    laws = {c1: lp.GradientLaw(gain, lp.laws.ResidualDamping(c1)) for c1 in steps}
+    twin = seed.twin_of(clamped=True, times=seed.TIMES[:samples])
+    laws = {c1: lp.paper.law(gain, lp.laws.ResidualDamping(c1), seed.D) for c1 in steps}
     return [try_out(twin, law, (c1,)) for c1, law in laws.items()]
 
 
@@ -56,17 +60,17 @@ def noisy(
     level: float,
     gain: float,
     samples: int = 126,
-    steps: tuple[float, ...] = STEPS,
+    steps: tuple[float, ...] = GRID,
     smooth: bool = False,
 ) -> list[Tried]:
     """Search mu and nu for the paper's second experiment, with alpha = 0 or G_alpha in V~."""
-    twin = seed.twin_of(times=0.6 * np.arange(samples), noise=RelativeNoise(level))
+    twin = seed.twin_of(clamped=True, times=0.6 * np.arange(samples), noise=RelativeNoise(level))
     if smooth:
         rule = Tikhonov("V", Discrepancy(level=level))
         twin = replace(twin, observation=replace(twin.observation, reconstruction=rule))
     found = []
     for mu, nu in product(steps, steps):
-        law = lp.GradientLaw(gain, lp.laws.ConstantDamping(mu), nu=nu)
+        law = lp.paper.law(gain, lp.laws.ConstantDamping(mu), seed.D, nu)
         found.append(try_out(twin, law, (mu, nu)))
     return found
 
@@ -96,6 +100,7 @@ def main() -> None:
             tried = noisy(level, 1.0, smooth=smooth)
             how = "G_alpha in V~" if smooth else "alpha = 0 as in the paper"
             show(f"noise {level:.0%}, {how}, gain 1, t = 75", ("mu", "nu"), tried)
+    STEPS.report()
 
 
 if __name__ == "__main__":

@@ -13,8 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 import livepde as lp
+from experiments.failed_steps import FailedSteps
 from livepde.stepping import ForwardStage
 
+STEPS = FailedSteps()
 TIMES = np.arange(0.0, 40.05, 0.05)
 JUMP, BEFORE, AFTER = 20.0, 0.3, 0.36
 NOISE, SEEDS = 0.01, 5
@@ -56,7 +58,7 @@ def measured(law: lp.laws.Law[Any, Any], unknown: lp.fem.Unknown, exact: Any, se
     G, values = identifier.observed.G, []
     for t, u in exact:
         z = G @ u + noise * rng.standard_normal(G.shape[0])
-        values.append(identifier.step(t, z).parameters["a"][0])
+        values.append(STEPS.seen(identifier.step(t, z)).parameters["a"][0])
     a = np.array(values)
     before = np.sqrt(np.mean((a - BEFORE)[(TIMES > 15) & (TIMES < JUMP)] ** 2))
     end = np.sqrt(np.mean((a - AFTER)[TIMES > 35] ** 2))
@@ -96,6 +98,7 @@ def main() -> None:
         found = np.array([measured(law, unknown, exact, seed) for seed in range(SEEDS)])
         table.add_row(name, *(f"{value:.3g}" for value in found.mean(axis=0)))
     Console(width=100).print(table)
+    STEPS.report()
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 import livepde as lp
+from experiments.failed_steps import FailedSteps
 from livepde.diagnostics import Errors, Spaces, TwinTracker, bounds, conditions, constants
 from livepde.laws.damping_bounds import (
     Constants,
@@ -27,6 +28,7 @@ from livepde.reproduce import seed
 from livepde.streams import RelativeNoise, Twin
 
 FLOOR = 1e-8
+STEPS = FailedSteps()
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def follow(name: str, twin: Twin, law: lp.GradientLaw, c: Constants, u0: Any, nu
     samples = list(twin)
     tracker = TwinTracker(twin, spaces, law.gain, law.damping)
     identifier = lp.Identifier(twin.model, twin.observation, law, q0=0.0, u0=u0)
-    estimate = identifier.step(samples[0].t, samples[0].z)
+    estimate = STEPS.seen(identifier.step(samples[0].t, samples[0].z))
     errors = tracker.add(estimate, samples[0].z)
     largest = law.nu
     for before, sample in pairwise(samples):
@@ -85,9 +87,9 @@ def follow(name: str, twin: Twin, law: lp.GradientLaw, c: Constants, u0: Any, nu
             identifier = lp.Identifier(
                 twin.model, twin.observation, law, q0=estimate.q, u0=estimate.u, t0=before.t
             )
-            identifier.step(before.t, before.z)
+            STEPS.seen(identifier.step(before.t, before.z))
             tracker.damping = law.damping
-        estimate = identifier.step(sample.t, sample.z)
+        estimate = STEPS.seen(identifier.step(sample.t, sample.z))
         errors = tracker.add(estimate, sample.z)
     return Found(name, law, tracker.errors, twin.error(estimate.q), largest)
 
@@ -125,6 +127,7 @@ def main() -> None:
     print(f"\n{found.name}:")
     print(bounds(found.errors, c))
     print(conditions(found.errors, c, floor=FLOOR))
+    STEPS.report()
 
 
 if __name__ == "__main__":

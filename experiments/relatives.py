@@ -19,7 +19,7 @@ from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, BaumeisterLaw, KueglerLaw, ResidualDamping
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
-from livepde.reproduce.experiment import Track, track
+from livepde.reproduce.experiment import Track, failures, track
 from livepde.runs.outcome import Check, Outcome, Table
 
 __all__ = ["EXPECTED", "LAWS", "law", "relatives"]
@@ -72,12 +72,12 @@ def compare(
                         )
                     except LawError as error:
                         refusal = str(error)
-                        rows.append([*head, "refused", *[None] * 4])
+                        rows.append([*head, "refused", *[None] * 5])
                         break
                     found = track(identifier, twin, f"{name}, {problem}, {seen}", progress)
                     tracks[problem, seen, name, pull] = found
                     errors = [found.error(t) for t in (1.0, 6.0, 60.0)]
-                    rows.append([*head, *errors, found.u_error, found.divided])
+                    rows.append([*head, *errors, found.u_error, found.divided, found.failed])
     return tracks, rows, refusal
 
 
@@ -95,7 +95,7 @@ def relatives(*, quick: bool = False, progress: bool = False) -> Outcome:
     columns = ["data", "seen", "law", "gain", "pull", "q = 0", "t = 1", "t = 6", "t = 60"]
     table = Table(
         "relative L2 error of q; pull: c1 (Boiger, Kaltenbacher) or mu",
-        [*columns, "error of u", "divided steps"],
+        [*columns, "error of u", "divided steps", "failed steps"],
         rows,
     )
     checks = [
@@ -108,6 +108,7 @@ def relatives(*, quick: bool = False, progress: bool = False) -> Outcome:
         for (problem, seen, name), bound in EXPECTED.items()
         if problem == "seed" or not quick
     ]
+    checks.append(failures(tracks.values()))
     checks.append(Check("Baumeister et al. refuse partial data", float(bool(refusal)), 1.0, ">="))
     return Outcome(
         tables=[table],

@@ -28,6 +28,7 @@ from livepde.linalg import Array
 from livepde.observation import Discrepancy, Full, Pseudoinverse, Tikhonov
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
+from livepde.reproduce.experiment import failures
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
 
@@ -59,7 +60,7 @@ class WhiteNoise:
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             size = np.sqrt(z @ gram @ z)
             noise = self.level * size * (root @ rng.standard_normal(len(z)))
-            yield Sample(float(t), z + noise)
+            yield Sample(t=float(t), z=z + noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +79,11 @@ class NoisyRun:
     times: Array
     errors: Array
     d_rate: float
+
+    @property
+    def failed(self) -> int:
+        """Number of samples with a failed step."""
+        return int(np.isnan(self.errors).sum())
 
     @property
     def error(self) -> float:
@@ -169,7 +175,7 @@ class _Noisy:
         rng = np.random.default_rng(self.seed)
         for t, z in zip(self.twin.times, self.twin.exact_data, strict=True):
             std = self.noise.std(z, self.twin.weights)
-            yield Sample(float(t), z + std * rng.standard_normal(len(z)))
+            yield Sample(t=float(t), z=z + std * rng.standard_normal(len(z)))
 
 
 def seed_excited_noise(*, quick: bool = False, progress: bool = False) -> Outcome:
@@ -204,6 +210,7 @@ def seed_excited_noise(*, quick: bool = False, progress: bool = False) -> Outcom
             for level, factor in worse.items()
         ),
     ]
+    checks.append(failures(one for found in runs.values() for one in found))
     notes = list(NOTES)
     if not quick:
         tuned = _hindsight(progress)
@@ -231,11 +238,12 @@ def _table(runs: Runs, seeds: int, baseline: float) -> Table:
                 float(errors.std(ddof=1)) if seeds > 1 else None,
                 float(errors.max()),
                 float(np.mean(rates)) if smoothing else None,
+                sum(one.failed for one in found),
             ]
         )
     return Table(
         f"relative L2 error of q at t = 60, {seeds} seeds, gain {GAIN:g}, c1 = {C1:g}",
-        ["noise", "model", "smoothing", "q = 0", "mean", "spread", "largest", "sup |d~|"],
+        ["noise", "model", "smoothing", "q = 0", "mean", "spread", "largest", "sup |d~|", "failed"],
         rows,
     )
 

@@ -12,12 +12,14 @@ from typing import Any
 import numpy as np
 
 import livepde as lp
+from experiments.failed_steps import FailedSteps
 from livepde.diagnostics import OnlineTracker, TwinTracker, constants, stopping_time
 from livepde.observation import Discrepancy, Tikhonov
 from livepde.reproduce import seed_excited as excited
 from livepde.streams import RelativeNoise, Twin
 
 SEEDS = range(5)
+STEPS = FailedSteps()
 GAIN = 1000.0
 WITHIN = 2.0
 
@@ -70,7 +72,7 @@ def run(setting: Setting, seed: int, samples: int | None = None) -> tuple[float,
     online = OnlineTracker(identifier, 0.1, noise=lambda z: noise.std(z, data.weights))
     truth = TwinTracker(data, online.spaces, law.gain, law.damping)
     for sample in data:
-        estimate = identifier.step(sample.t, sample.z)
+        estimate = STEPS.seen(identifier.step(sample.t, sample.z))
         online.add(estimate, sample)
         truth.add(estimate, sample.z)
     c = constants(online.spaces, data.q, data.states[::20], gain=GAIN)
@@ -102,6 +104,7 @@ def main() -> None:
             f"{setting.level:6.3f} {setting.c1:6g} {alpha:>11} {setting.h:5g} "
             f"{exact:8.3f} {surrogate:9.3f} {ratio:8.2f}{verdict}"
         )
+    STEPS.report()
 
 
 if __name__ == "__main__":

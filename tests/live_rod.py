@@ -58,6 +58,7 @@ def live(folder: Path, source=None, *, verdict: bool = True, **options) -> Live:
         source = Follow(folder / "data.csv", position=kept.position)
     OPENED.append(source)
     intake = Intake(COLUMNS, CLOCK, origin=0.0, last=kept.last)
+    intake.past = kept
     return Live(
         identifier(verdict=verdict), Gathered(source, intake), kept, fields_every=10, **options
     )

@@ -44,6 +44,8 @@ def test_the_command_prints_every_check(monkeypatch):
     monkeypatch.setattr(bench, "SAMPLES", 5)
     monkeypatch.setattr(bench, "LEVELS", (0.0,))
     monkeypatch.setattr(bench, "GAINS", (1.0,))
+    monkeypatch.setattr(bench.partial, "GAINS", (1e4,))
+    monkeypatch.setattr(bench.partial, "END", 1.0)
     found = CliRunner().invoke(app, ["auto", "--quick", "--json"])
     content = json.loads(found.stdout)
     assert content["command"] == "python -m benchmarks auto --quick"
@@ -52,4 +54,8 @@ def test_the_command_prints_every_check(monkeypatch):
         "largest error with status ok",
         "error / best constant gain",
         "step / forward step, median",
+        "error / best constant gain",
+        "error at the end / at half of the time",
+        "largest error with status ok",
+        "operators of 28 refused or accepted wrongly",
     ]

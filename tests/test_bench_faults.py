@@ -129,7 +129,15 @@ def test_every_kind_of_broken_line_is_no_right_one(kind):
 
 def record(t: float, value: float = 1.0) -> Record:
     nothing = np.zeros(0)
-    return Record(t, np.array([value]), nothing, nothing, 0, 1, {})
+    return Record(
+        t=t,
+        numbers=np.array([value]),
+        innovation=nothing,
+        withheld_error=nothing,
+        status=0,
+        steps=1,
+        notes={},
+    )
 
 
 def found(*records: Record, state: bytes = b"x") -> damage.Found:
@@ -160,7 +168,7 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     monkeypatch.setattr(broken, "BYTES", {})
     case, rows = cases.load(tmp_path / "case.toml"), rod.rod_rows(20)
     fed = broken.fed(case, rows, tmp_path / "rows.jsonl", 20, np.random.default_rng(0))
-    assert fed.reasons == {"late": 20}
+    assert fed.reasons == {"repeated": 20}
     monkeypatch.setattr(
         broken, "JSON", {"new": lambda row, write, rng: write({**row, "time": "2027-01-01"})}
     )

@@ -319,8 +319,8 @@ def test_workers_that_die_again_and_again_end_the_command(here, monkeypatch):
     """With a sentence for each member, a summary, and no run that seems to go on."""
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
     call("fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods")
-    record = Path("rods/plain/run.json")
-    record.write_text(record.read_text().replace('"finished"', '"running"'))
+    opened = runs.open(Path("rods/plain"))
+    runs.RunWriter(opened.path, opened.record | {"status": "running"})._save_record()
     died = []
 
     def parallel(self, tasks):

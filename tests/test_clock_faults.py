@@ -1,4 +1,8 @@
-"""Clocks that leap, are set back, or show an hour twice: told, and no run is silenced by them."""
+"""Clocks that leap, go back, or show an hour twice: times are never changed, and each is reported.
+
+The right samples of each run follow from a definition: of the rows that come, those whose times are
+later than all used ones are used, each at the time that it states, and once.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +14,10 @@ import numpy as np
 import pytest
 from live_rod import COLUMNS, OPENED, live, rows
 
-from livepde.runs.feeds import Gathered, shifted
+from livepde.runs.feeds import Gathered
 from livepde.runs.live_loop import Live
 from livepde.streams.clock import Clock
-from livepde.streams.intake import AGREE, INSIST, Intake, Policy
+from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Rows
 
 DAY = 86400.0
@@ -26,11 +30,17 @@ def closed():
         OPENED.pop().close()
 
 
-def run_of(folder, given, policy=None) -> Live:
-    """Return a run of rows whose intake knows what was taken."""
-    run = live(folder, Rows(given), verdict=False)  # of rows that are no rod's
+class AtOnce(Rows):
+    """Brings many rows in one poll, as a file does: they wait in the queue of the run."""
+
+    def poll(self, wait):
+        return [row for _ in range(100) for row in super(AtOnce, self).poll(wait)]
+
+
+def run_of(folder, given, policy=None, source=Rows) -> Live:
+    """Return a run of rows."""
+    run = live(folder, source(given), verdict=False)  # of rows that are no rod's
     run.feed.intake.policy = policy or Policy(leap=30 * DAY)
-    run.feed.intake.past = run.journal
     return run
 
 
@@ -51,154 +61,376 @@ def times(run: Live) -> list[float]:
     return [record.t for record in run.journal]
 
 
-@pytest.mark.slow
-def test_a_row_days_ahead_of_fast_ones_is_refused(tmp_path):
-    given = right(60)
-    given.insert(30, {**given[30], "t": 29 * DAY})
-    run = run_of(tmp_path, given)
-    run.run()
-    assert times(run) == [row["t"] for row in right(60)]
-    assert run.journal.counts == {("leap", ""): 1}
-    assert run.health["ok"]
+def used(given) -> list[dict]:
+    """Return the rows that are later than all rows before them."""
+    found, newest = [], -math.inf
+    for row in given:
+        if row["t"] > newest:
+            found.append(row)
+            newest = row["t"]
+    return found
 
 
-@pytest.fixture(scope="module")
-def fifty(tmp_path_factory) -> Live:
-    """A run of fifty right rows, finished."""
-    run = run_of(tmp_path_factory.mktemp("fifty"), right(50))
-    run.run()
-    return run
+def numbers(run: Live) -> list[np.ndarray]:
+    return [record.numbers for record in run.journal]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("wrong", "step"), [(1, 0.1), (2, 0.1), (2, 1000.0), (AGREE, 0.1), (AGREE, 1000.0)]
-)
-def test_rows_far_ahead_that_agree_are_taken_back(tmp_path, fifty, wrong, step):
-    """As if they had never come: the estimates are those of the right rows, bit by bit."""
-    given = right(50)
-    ahead = moved(given[30 : 30 + wrong], 3650 * DAY)
-    ahead = [{**row, "t": row["t"] + step * k} for k, row in enumerate(ahead)]
-    run = run_of(tmp_path, [*given[:30], *ahead, *given[30:]])
-    run.run()
-    assert times(run) == times(fifty)
-    for one, other in zip(run.journal, fifty.journal, strict=True):
-        np.testing.assert_array_equal(one.numbers, other.numbers)
-    assert run.identifier.dump() == fifty.identifier.dump()
-    assert ("clock" in told(run)) == (wrong > 1)
-    assert run.health["ok"]
+def same_run(run: Live, given, folder) -> None:
+    """Assert that a run is that of some rows alone, to the bit."""
+    folder.mkdir()
+    alone = run_of(folder, given)
+    alone.run()
+    assert times(run) == times(alone) == [row["t"] for row in given]
+    np.testing.assert_array_equal(numbers(run), numbers(alone))
+    assert run.identifier.dump() == alone.identifier.dump()
+
+
+# --- rows that come again ------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_a_gap_that_the_next_row_confirms_loses_nothing(tmp_path):
-    given = [*right(40), *moved(right(80, 40), 5000.0)]
-    run = run_of(tmp_path, given)
-    run.run()
-    assert times(run) == [row["t"] for row in given]
-    assert run.journal.counts == {}
-
-
-@pytest.mark.slow
-def test_a_clock_that_was_set_back_is_told_and_time_goes_on(tmp_path):
+@pytest.mark.parametrize("source", [Rows, AtOnce])
+def test_a_block_that_comes_again_is_used_once(tmp_path, source):
+    """Whether it is in the journal already, or waits in the queue of the run."""
     given = right(200)
-    given[100:] = moved(given[100:], -5.0)
+    run = run_of(tmp_path, [*given[:100], *given[60:100], *given[100:]], source=source)
+    run.run()
+    assert run.journal.counts == {("repeated", ""): 40}
+    assert run.health["ok"]
+    assert told(run) == ["repeated"]
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_a_block_that_comes_again_with_new_rows(tmp_path):
+    """New rows at its end are used; one amid it, of a time that is over, is late."""
+    given = right(120)
+    lost = {**given[70], "t": given[70]["t"] + 0.05}
+    block = [*given[60:71], lost, *given[71:110]]
+    run = run_of(tmp_path, [*given[:100], *block, *given[110:]], source=AtOnce)
+    run.run()
+    assert run.journal.counts == {
+        ("repeated", ""): 40,
+        **{("late", name): 1 for name in COLUMNS},
+    }
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wait", [0.0, 0.35])
+def test_each_row_twice(tmp_path, wait):
+    """The second of each meets the sample while it is open, or when it is released."""
+    given = right(100)
+    doubled = [row for row in given for _ in range(2)]
+    run = run_of(tmp_path, doubled, Policy(wait=wait), AtOnce)
+    run.run()
+    assert run.journal.counts == {("repeated", ""): 100}
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_other_values_for_a_known_time_are_a_conflict_and_the_first_stay(tmp_path):
+    given = right(100)
+    other = [{**row, "a": row["a"] + 1.0} for row in given[60:90]]
+    run = run_of(tmp_path, [*given, *other], source=AtOnce)
+    run.run()
+    assert run.journal.counts == {("conflict", "a"): 30, ("clock", ""): 1}
+    assert "went back" in run.health["why"]
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_a_block_comes_twice_after_a_resume(tmp_path):
+    """What was accepted before the run ended is known after it."""
+    given = right(120)
+    first = run_of(tmp_path, given[:80])
+    first.run()
+    first.journal.close()
+    run = run_of(tmp_path, [*given[40:80], *given[40:100], *given[100:]], source=AtOnce)
+    run.resume()
+    run.run()
+    assert run.journal.counts == {("repeated", ""): 80}
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_what_the_journal_has_is_no_longer_remembered(tmp_path, monkeypatch):
+    """The memory of the intake is bounded, and old rows are found in the journal."""
+    monkeypatch.setattr("livepde.streams.intake.REMEMBERED", 10)
+    given = right(150)
+    run = run_of(tmp_path, [*given[:100], *given[:100], *given[100:]])
+    run.run()
+    assert len(run.feed.intake._accepted) <= 22
+    assert run.journal.counts == {("repeated", ""): 100}
+
+
+def test_a_spike_that_was_bridged_comes_again():
+    """The sample has another value than its row then; the row is known by the others."""
+    policy = Policy(wait=2.5, channels={"left": Habit(interpolated=True, screened=True)})
+    intake = Intake(COLUMNS, Clock("t"), policy, last=-1.0)
+    given = [{"t": float(k), "a": 0.1 * k, "b": 0.0, "left": math.sin(0.1 * k)} for k in range(40)]
+    given[20]["left"] = 50.0
+    kinds = [remark.kind for row in given for remark in intake.take(row).remarks]
+    assert "spike" in kinds
+    again = [remark for row in given for remark in intake.take(row).remarks]
+    assert [(one.kind, one.channel) for one in again] == [("repeated", "")] * 40
+
+
+def test_another_value_of_a_bridged_channel_is_a_conflict():
+    """What came is remembered as it came, also of channels whose gaps and spikes are bridged."""
+    habit = Habit(interpolated=True, screened=True)
+    intake = Intake(COLUMNS, Clock("t"), Policy(channels={"left": habit}), last=-1.0)
+    row = {"a": 0.1, "b": 0.0, "left": 1.0}
+    for k in range(20):
+        intake.take({"t": float(k), **row})
+    (remark,) = intake.take({"t": 10.0, **row, "left": 2.0}).remarks
+    assert (remark.kind, remark.channel) == ("conflict", "left")
+
+
+# --- clocks that go back -------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("by", [5.0, 5.05, 1000.0])
+def test_a_clock_that_was_set_back_makes_rows_late_until_they_are_new(tmp_path, by):
+    given = right(200)
+    given[100:] = moved(given[100:], -by)
     run = run_of(tmp_path, given)
     run.run()
-    assert len(run.journal) == 200
-    np.testing.assert_allclose(np.diff(times(run)), 0.1, atol=1e-9)
-    assert told(run) == ["clock"]
-    assert any("set back" in event.message for event in run.journal.events)
+    assert times(run) == [row["t"] for row in used(given)]
+    late = 200 - len(used(given))
+    counts = run.journal.counts
+    assert counts["clock", ""] == 1
+    assert sum(number for (_, name), number in counts.items() if name == "a") == late
+    # False while rows are late, with the reason and the remedy; true when they are new again.
+    assert run.health["ok"] == (by < 1000.0)
+    assert by < 1000.0 or "intake.shift" in run.health["why"]
+    assert told(run).count("unwell") == 1
+    same_run(run, used(given), tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_a_clock_that_goes_back_again_and_again(tmp_path):
+    """By 3.5 steps every 30 rows."""
+    given = [{**row, "t": row["t"] - 0.35 * (k // 30)} for k, row in enumerate(right(300))]
+    run = run_of(tmp_path, given, source=AtOnce)
+    run.run()
+    assert run.journal.counts["clock", ""] == 9
+    assert run.journal.counts["late", "a"] == 300 - len(used(given)) == 27
+    same_run(run, used(given), tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_a_stated_shift_corrects_a_clock(tmp_path):
+    given = right(200)
+    back = moved(given[100:], -5.0)
+    first = run_of(tmp_path, [*given[:100], *back[:10]])
+    first.run()
+    assert not first.health["ok"]
+    first.journal.close()
+    run = run_of(tmp_path, back[10:], Policy(shift=5.0))
+    run.resume()
+    run.run()
     assert run.health["ok"]
+    np.testing.assert_allclose(times(run), [row["t"] for row in [*given[:100], *given[110:]]])
+
+
+def test_a_shift_of_dates_moves_start_and_t0():
+    intake = Intake(COLUMNS, Clock("t", start="2026-01-01 01:00"), Policy(shift=3600.0))
+    row = {"a": 0.0, "b": 0.0, "left": 0.0}
+    stated = ["2025-12-31 23:59", *(f"2026-01-01 00:{k:02d}" for k in range(4))]
+    kinds = [one.kind for t in stated for one in intake.take({"t": t, **row}).remarks]
+    assert kinds == ["outside"]
+    assert str(intake.start) == "2026-01-01 01:00:00"
+    assert intake.flush().ready == []
 
 
 @pytest.mark.slow
-def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
-    """Nobody can tell which time is right: times go on, and a shift is told."""
-    given = right(60 + INSIST)
-    run = run_of(tmp_path, [*given[:20], *moved(given[20:50], 4000.0), *given[50:]])
+def test_one_channel_whose_clock_went_back_is_named(tmp_path):
+    """Rows of one channel each, of two loggers."""
+    given = [
+        {"t": row["t"] - (5.0 if name == "b" and k >= 40 else 0.0), name: row[name]}
+        for k, row in enumerate(right(60))
+        for name in COLUMNS
+    ]
+    run = run_of(tmp_path, given, Policy(wait=0.15))
     run.run()
-    assert len(run.journal) == 60 + INSIST
-    assert told(run) == ["clock"]
-
-
-@pytest.mark.slow
-def test_rows_that_come_again_are_known(tmp_path):
-    """A broker or a logger that repeats itself is no clock that was set back."""
-    given = right(100)
-    run = run_of(tmp_path, [*given, *given[40:], *right(120, 100)])
-    run.run()
-    assert times(run) == [row["t"] for row in right(120)]
-    assert run.journal.counts == {("repeated", ""): 60}
+    assert "times of b went back" in run.health["why"]
+    assert run.journal.counts["clock", ""] == 1
+    assert max(times(run)) < 6.0
 
 
 @pytest.mark.slow
 def test_the_backlog_of_a_logger_is_late(tmp_path):
     """Rows of a time in which none has been taken, between rows of now."""
     given = right(200)
-    live_rows, backlog = given[60:], given[20:60]
-    mixed = [row for pair in zip(live_rows[:40], backlog, strict=True) for row in pair]
-    run = run_of(tmp_path, [*given[:20], *mixed, *live_rows[40:]], Policy(leap=DAY))
+    live_rows, backlog = given[29:], given[20:29]
+    mixed = [row for pair in zip(live_rows[:9], backlog, strict=True) for row in pair]
+    run = run_of(tmp_path, [*given[:20], *mixed, *live_rows[9:]], Policy(leap=DAY))
     run.run()
     assert times(run) == [row["t"] for row in [*given[:20], *live_rows]]
-    assert run.journal.counts == {("late", name): 40 for name in COLUMNS}
+    assert run.journal.counts == {("late", name): 9 for name in COLUMNS}
+    assert run.health["ok"]
 
 
 @pytest.mark.slow
-def test_a_shift_survives_a_restart(tmp_path):
-    """Times go on with it, and rows are read again with that of their place."""
+def test_a_clock_that_went_back_survives_restarts(tmp_path):
+    """A file that grows: what is used does not depend on where the run ended."""
     path = tmp_path / "data.csv"
     given = right(200)
     given[100:] = moved(given[100:], -5.0)
     lines = ["t,a,b,left", *(",".join(map(repr, row.values())) for row in given)]
-
-    def gone_on(count: int) -> Live:
+    for count in (90, 103, 150, 201):
         path.write_text("\n".join(lines[:count]) + "\n")
         run = live(tmp_path, Rows(()), verdict=False)
-        shift, place = shifted(run.journal.position)
-        source = Follow(path, position=place)
+        source = Follow(path, position=run.journal.position)
         OPENED.append(source)
-        intake = Intake(COLUMNS, Clock("t"), origin=0.0, last=run.journal.last, shift=shift)
+        intake = Intake(COLUMNS, Clock("t"), origin=0.0, last=run.journal.last)
         intake.past = run.journal
         run.feed = Gathered(source, intake)
         run.resume()
         run.run()
-        return run
-
-    for count in (90, 103, 150, 201):
-        run = gone_on(count)
         found = times(run)
         run.journal.close()
-    # The two rows that waited for others when the file ended for the second time were refused.
-    assert len(found) == 198
-    assert np.diff(found).max() < 0.31
-    assert np.diff(found).min() > 0.09
+    assert found == [row["t"] for row in used(given)]
 
 
-def test_the_hour_that_clocks_show_twice(tmp_path):
-    """Local times without a zone of their own, in the zone of the case."""
-    zone = ZoneInfo("Europe/Berlin")
-    start = datetime(2026, 10, 24, 23, tzinfo=ZoneInfo("UTC"))
-    moments = [start + timedelta(minutes=k) for k in range(240)]
-    texts = [str(moment.astimezone(zone).replace(tzinfo=None)) for moment in moments]
-    assert len(set(texts)) == 180
-    columns = {name: COLUMNS[name] for name in ("a", "b", "left")}
-    intake = Intake(columns, Clock("t", zone=zone))
-    found = []
-    for k, (text, row) in enumerate(zip(texts, rows(240), strict=True)):
-        outcome = intake.take({**row, "t": text}, (k, None))
-        assert not outcome.remarks
-        found += [ready.t for ready in outcome.ready]
-    assert found == [60.0 * k for k in range(240)]
+# --- clocks that are ahead -----------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_the_hour_twice_without_a_zone_is_a_clock_set_back(tmp_path):
+@pytest.mark.parametrize(
+    ("at", "wrong", "ahead"),
+    [
+        *((0, 1, 60.0), (0, 1, 1e9), (1, 1, 60.0), (2, 1, 1e9), (3, 8, 1e9)),
+        *((30, 1, 60.0), (30, 2, 3600.0), (30, 8, 29 * DAY), (30, 8, 1e9)),
+    ],
+)
+def test_rows_far_ahead_cost_nothing(tmp_path, at, wrong, ahead):
+    """Also the first row, and as many as eight: as if they had never come, to the bit."""
+    given = right(60)
+    mixed = [*given[:at], *moved(given[at : at + wrong], ahead), *given[at:]]
+    run = run_of(tmp_path, mixed)
+    run.run()
+    assert run.journal.counts == {("leap", ""): wrong}
+    assert run.health["ok"]
+    same_run(run, given, tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_every_25th_row_far_ahead(tmp_path):
     given = right(200)
+    wrong = [{**row, "t": row["t"] + (6.0 if k % 25 == 24 else 0.0)} for k, row in enumerate(given)]
+    run = run_of(tmp_path, wrong)
+    run.run()
+    assert run.journal.counts == {("leap", ""): 8}
+    same_run(run, [row for k, row in enumerate(given) if k % 25 != 24], tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_one_reading_of_one_channel_far_ahead(tmp_path):
+    """One channel a row: the others lose nothing."""
+    given = [
+        {"t": row["t"] + 0.001 * n, name: row[name]}
+        for k, row in enumerate(right(60))
+        for n, name in enumerate(COLUMNS)
+    ]
+    wrong = [*given[:91], {"t": 12.0, "b": 0.4}, *given[91:]]
+    policy = Policy(leap=30 * DAY, tolerance=0.01)
+    run = run_of(tmp_path, wrong, policy)
+    run.run()
+    assert run.journal.counts == {("leap", ""): 1}
+    assert len(times(run)) == 60
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pause", [2.0, 5000.0])
+@pytest.mark.parametrize("rest", [1, 2, 40])
+def test_a_pause_loses_nothing(tmp_path, pause, rest):
+    """Rows after it wait for a while, and are used when they agree or the source ends."""
+    given = [*right(40), *moved(right(40 + rest, 40), pause)]
+    run = run_of(tmp_path, given)
+    run.run()
+    lost = 1 if rest == 1 else 0  # nothing confirms a single row at the end
+    assert times(run) == [row["t"] for row in given][: len(given) - lost]
+    assert run.journal.counts == ({("leap", ""): 1} if lost else {})
+
+
+def test_a_pause_that_has_passed_is_no_leap():
+    """A row may be ahead by the time that passed on this machine since the row before it."""
+    intake = Intake(COLUMNS, Clock("t"), last=-1.0)
+    row = {"a": 0.0, "b": 0.0, "left": 0.0}
+    for k in range(20):
+        assert intake.take({"t": float(k), **row}, received=100.0 + k).ready
+    assert not intake.why
+    (ready,) = intake.take({"t": 3619.0, **row}, received=3720.0).ready
+    assert ready.t == 3619.0
+    for t in (7000.0, 7001.0):
+        assert not intake.take({"t": t, **row}, received=3721.0).ready
+    assert "far ahead of t = 3619, from t = 7000 on" in intake.why
+
+
+def test_a_row_after_a_pause_confirms_those_that_wait():
+    """The pause has passed on this machine for it, and not for the first rows after it."""
+    intake = Intake(COLUMNS, Clock("t"), last=-1.0)
+    row = {"a": 0.0, "b": 0.0, "left": 0.0}
+    for k in range(20):
+        intake.take({"t": float(k), **row}, received=100.0 + k)
+    assert not intake.take({"t": 119.0, **row}, received=120.0).ready
+    found = intake.take({"t": 219.0, **row}, received=420.0)
+    assert [ready.t for ready in found.ready] == [119.0, 219.0]
+    assert not found.remarks
+
+
+@pytest.mark.slow
+def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
+    """Nobody can know which time is right: rows are late until they are new."""
+    given = right(160)
+    wrong = [*given[:20], *moved(given[20:50], 4.0), *given[50:]]
+    run = run_of(tmp_path, wrong)
+    run.run()
+    assert times(run) == [row["t"] for row in used(wrong)]
+    assert run.journal.counts["clock", ""] == 1
+    assert run.health["ok"]
+
+
+# --- hours that are shown twice ------------------------------------------------------------------
+
+
+def berlin(count: int) -> list[str]:
+    """Return local times of the night in which clocks are set back, each minute."""
+    zone = ZoneInfo("Europe/Berlin")
+    start = datetime(2026, 10, 24, 23, tzinfo=ZoneInfo("UTC"))
+    moments = [start + timedelta(minutes=k) for k in range(count)]
+    return [str(moment.astimezone(zone).replace(tzinfo=None)) for moment in moments]
+
+
+@pytest.mark.parametrize("again", [(), range(100, 110), range(70, 120), range(130, 200)])
+def test_the_hour_that_clocks_show_twice(again):
+    """Local times without a zone of their own, in the zone of the case; also with rows again."""
+    texts = berlin(240)
+    assert len(set(texts)) == 180
+    given = [{**row, "t": text} for text, row in zip(texts, rows(240), strict=True)]
+    columns = {name: COLUMNS[name] for name in ("a", "b", "left")}
+    intake = Intake(columns, Clock("t", zone=ZoneInfo("Europe/Berlin")))
+    end = again[-1] + 1 if again else 240
+    found, remarks = [], []
+    for row in [*given[:end], *(given[k] for k in again), *given[end:]]:
+        outcome = intake.take(row)
+        remarks += [one.kind for one in outcome.remarks]
+        found += [ready.t for ready in outcome.ready]
+    assert found == [60.0 * k for k in range(240)]
+    assert remarks == ["repeated"] * len(again)
+
+
+@pytest.mark.slow
+def test_the_hour_twice_without_a_zone_makes_rows_late(tmp_path):
+    given = right(300)
     given[100:] = moved(given[100:], -10.0)
     run = run_of(tmp_path, given)
     run.run()
-    assert len(run.journal) == 200
-    assert told(run) == ["clock"]
+    assert times(run) == [row["t"] for row in used(given)]
+    assert run.journal.counts["clock", ""] == 1
 
 
 @pytest.mark.slow
@@ -214,3 +446,28 @@ def test_rows_of_several_channels_are_no_leaps(tmp_path, leap):
     run.run()
     assert len(run.journal) == 40
     assert run.journal.counts == {}
+
+
+def test_a_burst_of_rows_a_minute_is_no_leap():
+    """Twenty channels a moment apart: the pace is that of each channel, not of the rows."""
+    from livepde.streams.table import Column
+
+    names = [f"T_{k}" for k in range(20)]
+    intake = Intake({name: Column((name,)) for name in names}, Clock("t"), Policy(tolerance=1.0))
+    found = []
+    for k in range(30):
+        for n, name in enumerate(names):
+            outcome = intake.take({"t": 60.0 * k + 0.01 * n, name: 1.0})
+            assert not outcome.remarks
+            found += [ready.t for ready in outcome.ready]
+            assert k < 2 or not intake.why
+    assert found == [60.0 * k for k in range(30)]
+
+
+def test_memory_does_not_grow_with_rows_that_wait():
+    intake = Intake(COLUMNS, Clock("t"), last=-1.0)
+    for k in range(20):
+        intake.take({"t": float(k), "a": 0.0, "b": 0.0, "left": 0.0})
+    for k in range(3000):
+        intake.take({"t": 1e6, "a": float(k), "b": 0.0, "left": 0.0})
+        assert len(intake.waiting) <= 1001

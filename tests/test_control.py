@@ -14,6 +14,7 @@ from skfem import ElementLineP1
 import livepde as lp
 import livepde.control as ct
 from livepde.stepping import ForwardStage
+from livepde.verdict import Finding, Verdict
 
 PERIOD, ROOM = 60.0, 20.0
 SENSORS = lp.Points({"T_5": 0.05, "T_10": 0.10}, noise=0.2)
@@ -561,6 +562,7 @@ def told(**changes: Any) -> Any:
         "diagnostics": lp.laws.Diagnostics(innovation_ratio=1.2),
         "q": np.array([26.0]),
         "q_std": np.array([1.0]),
+        "verdict": Verdict.of(()),
         **changes,
     }
     return SimpleNamespace(**given)
@@ -579,6 +581,8 @@ def told(**changes: Any) -> Any:
         ({"q_std": np.array([np.nan])}, "only"),
         ({"q_std": None}, "no covariance"),
         ({"q": np.array([0.0]), "q_std": np.array([0.0])}, "lies at its bound"),
+        ({"verdict": Verdict.of([Finding("flat", "caution", "f")])}, ""),
+        ({"verdict": Verdict.unjudged()}, "Not judged: whether the model"),
     ],
 )
 def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):

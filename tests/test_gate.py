@@ -75,13 +75,33 @@ def test_a_noise_that_is_stated_too_small_does_not_close_the_gate():
     assert abs(value - 0.06) < 3 * std < 0.06
 
 
+def lasting(changed, constant=False):
+    """Readings that are far off from sample 100 on, of some sensors."""
+    for k, (t, z) in enumerate(readings()):
+        off = np.where(changed, 3.0 if not constant else 40.0 - z, 0.0) if k >= 100 else 0.0
+        yield t, z + off
+
+
 @pytest.mark.long
-def test_what_lasts_is_believed():
+def test_what_lasts_is_believed_if_most_sensors_show_it():
+    identifier = rod(lp.SensitivityLaw(gate_patience=5, jumps=None))
+    found = [identifier.step(t, z) for t, z in lasting([True, True])]
+    assert [estimate.diagnostics.refused for estimate in found[100:105]] == [2.0] * 5
+    # The state follows the readings, so that these fit again, and the unknowns are kept till then.
+    assert found[115].diagnostics.refused == 0.0
+    before, after = (found[k].parameters["alpha"] for k in (99, 105))
+    assert after[0] == before[0]
+    assert after[1] == pytest.approx(before[1], rel=0.01)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("constant", [False, True])
+def test_what_one_sensor_shows_alone_is_set_aside(constant):
     identifier = rod(lp.SensitivityLaw(gate_patience=5))
-    found = [identifier.step(t, z) for t, z in spoiled(readings(), set(range(100, 120)), 40.0)]
-    refused = [estimate.diagnostics.refused for estimate in found]
-    assert refused[100:105] == [1.0] * 5
-    assert refused[105] == 0.0
+    found = [identifier.step(t, z) for t, z in lasting([True, False], constant)]
+    assert [estimate.diagnostics.refused for estimate in found[100:]] == [1.0] * 100
+    (aside,) = (one for one in found[-1].verdict.findings if one.what == "aside")
+    assert aside.subject == "z0"
 
 
 @pytest.mark.long

@@ -225,8 +225,12 @@ def test_the_log_reaches_back_far_enough_and_stays_short():
 
 
 def test_a_log_that_is_continued_twice_keeps_both_apart():
-    span = Span.of(Interval(0.0, 1.0, {}, {}, np.zeros(1), np.ones(1)), ())
-    other = Span.of(Interval(0.0, 1.0, {}, {}, np.zeros(1), np.full(1, 2.0)), ())
+    span = Span.of(
+        Interval(t0=0.0, t1=1.0, inputs0={}, inputs1={}, z0=np.zeros(1), z1=np.ones(1)), ()
+    )
+    other = Span.of(
+        Interval(t0=0.0, t1=1.0, inputs0={}, inputs1={}, z0=np.zeros(1), z1=np.full(1, 2.0)), ()
+    )
     taken = np.ones(1, dtype=bool)
     log = added(opened(empty_log(1, 1, 0), span), span, taken)
     one, two = added(log, span, taken), added(log, other, taken)

@@ -115,6 +115,62 @@ def test_an_unknown_is_read_by_its_label():
     assert (estimate["a"].mean < high).all()
 
 
+@pytest.mark.parametrize("spread", [0.01, 0.3, 1.5])
+@pytest.mark.parametrize("lower", [0.0, -2.0])
+def test_moments_of_a_log_normal_are_the_closed_form(spread: float, lower: float):
+    """Those of exp(N(log m, s^2)), as in any textbook, about a lower bound."""
+    prior = lp.LogNormal(1.0, std=0.5, bounds=(lower, np.inf))
+    above = 0.7
+    mean, std = prior.moments(lower + above, spread * above)
+    assert mean == pytest.approx(lower + above * np.exp(spread**2 / 2), rel=1e-13)
+    expected = above * np.exp(spread**2 / 2) * np.sqrt(np.exp(spread**2) - 1)
+    assert std == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.05, 1.0, 6.0])
+def test_moments_under_a_transform_are_those_of_samples(spread: float):
+    latent = 0.4 + spread * np.random.default_rng(0).standard_normal(400_000)
+    share = 1.0 / (1.0 + np.exp(-latent))
+    prior = lp.LogitNormal(0.5, std=0.2, bounds=(-1.0, 3.0))
+    median = 1.0 / (1.0 + np.exp(-0.4))
+    found = prior.moments(-1.0 + 4.0 * median, spread * 4.0 * median * (1.0 - median))
+    expected = -1.0 + 4.0 * share.mean(), 4.0 * share.std()
+    assert found == pytest.approx(expected, abs=5.0 * 4.0 * share.std() / 400_000**0.5)
+
+
+def test_moments_at_the_end_of_a_range_are_that_end():
+    for prior, end in (
+        (lp.LogNormal(1.0, std=0.5), 0.0),
+        (lp.LogitNormal(0.5, std=0.2, bounds=(0.0, 1.0)), 1.0),
+    ):
+        assert prior.moments(end, 0.0) == (end, 0.0)
+        assert np.isnan(prior.moments(0.5, np.nan)[1])
+
+
+@pytest.mark.slow
+def test_what_is_reported_under_a_transform_says_what_it_is():
+    estimate, data = run(identifier(a=lp.LogNormal(0.3, 0.1)))
+    value, first_order = estimate.parameters["a"]
+    marginal, spread = estimate["a"], first_order / value
+    assert (marginal.median, marginal.deviation) == (value, first_order)
+    assert marginal.mean == pytest.approx(value * np.exp(spread**2 / 2), rel=1e-12)
+    assert marginal.std > first_order
+    low, high = marginal.interval()
+    assert str(marginal) == f"{value:.4g} (95 %: {low:.4g} to {high:.4g})"
+    assert data["a"].attrs["comment"] == "the median"
+    assert data["a_std"].attrs["comment"].startswith("to first order")
+    assert tables(data)[0].title == "Estimates (median, std. dev. to first order)"
+    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.3, std=0.2))
+    estimate, data = run(identifier(a=field))
+    spread = estimate["a"].deviation / estimate["a"].median
+    assert estimate["a"].mean == pytest.approx(estimate.q * np.exp(spread**2 / 2))
+    assert data["a"].attrs["comment"] == "the median"
+    assert data["a_std"].attrs["comment"].startswith("to first order")
+    _, data = run(identifier(a=lp.Normal(0.3, 0.1)))
+    assert tables(data)[0].title == "Estimates"
+    assert "comment" not in data["a"].attrs
+
+
 def test_bad_questions():
     estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1)))
     with pytest.raises(lp.errors.ConfigurationError, match=r"no unknown 'b'; there are \['a'\]"):

@@ -136,10 +136,10 @@ def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
     work, state = identifier._work, identifier._state
     log = state.log
     taken = iterated_smoother._Samples(
-        work,
-        state,
-        iterated_smoother.first_interval(log, ()),
-        iterated_smoother.intervals_since(log, ()),
+        work=work,
+        state=state,
+        opening=iterated_smoother.first_interval(log, ()),
+        intervals=iterated_smoother.intervals_since(log, ()),
     )
     found = taken.about(np.zeros((9, 1))).smoothed[:, 0]
 

@@ -219,7 +219,7 @@ class Watched(AtHand):
 
     def __init__(self, path: Path, rows) -> None:
         super().__init__(rows)
-        self._found = [Row(row.values, row.values["t"]) for row in self._found]
+        self._found = [Row(row.values, token=row.values["t"]) for row in self._found]
         self.path, self.acknowledged, self.told = path, [], []
 
     def acknowledge(self, tokens) -> None:

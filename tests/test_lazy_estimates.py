@@ -159,10 +159,44 @@ def test_arrays_give_back_the_records_that_they_took():
     whole = Snapshot(profile, {"q": (1.5, 3)}, rng.normal(size=(2, 2)))
     nothing = np.zeros(0)
     given = [
-        Record(0.5, rng.normal(size=3), rng.normal(size=2), nothing, 0, 1, {"a": 1.0}, plain),
-        Record(1.0, rng.normal(size=3), rng.normal(size=2), nothing, 4, 2, {}),
-        Record(1.5, rng.normal(size=3), rng.normal(size=2), nothing, 1, 0, {"b": 2.0}, whole),
-        Record(2.0, rng.normal(size=3), rng.normal(size=2), nothing, 0, 9, {"b": 3.0, "a": 4.0}),
+        Record(
+            t=0.5,
+            numbers=rng.normal(size=3),
+            innovation=rng.normal(size=2),
+            withheld_error=nothing,
+            status=0,
+            steps=1,
+            notes={"a": 1.0},
+            snapshot=plain,
+        ),
+        Record(
+            t=1.0,
+            numbers=rng.normal(size=3),
+            innovation=rng.normal(size=2),
+            withheld_error=nothing,
+            status=4,
+            steps=2,
+            notes={},
+        ),
+        Record(
+            t=1.5,
+            numbers=rng.normal(size=3),
+            innovation=rng.normal(size=2),
+            withheld_error=nothing,
+            status=1,
+            steps=0,
+            notes={"b": 2.0},
+            snapshot=whole,
+        ),
+        Record(
+            t=2.0,
+            numbers=rng.normal(size=3),
+            innovation=rng.normal(size=2),
+            withheld_error=nothing,
+            status=0,
+            steps=9,
+            notes={"b": 3.0, "a": 4.0},
+        ),
     ]
     kept = RecordArrays.of(given)
     assert RecordArrays.of(kept) is kept

@@ -63,7 +63,7 @@ def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, m
         return
     channels, n = model.channels, model.X.dim
     rows = 300.0 + rng.standard_normal((members if many else 1, len(channels)))
-    at = Moments(0.7, channels, rows)
+    at = Moments(t=0.7, channels=channels, inputs=rows)
     columns = rng.standard_normal((1 + r, members, n))
     columns[1:, :, model.state_space.fixed] = 0.0  # what is given has no tangent
     q = np.array([0.2, 0.5]) + 0.05 * rng.standard_normal((members, 2))
@@ -90,7 +90,7 @@ def test_other_stages_step_members_one_by_one():
     columns = 1.0 + 0.01 * rng.random((3, 2, model.X.dim))
     q = np.array([[0.2], [0.3]])
     columns[1:, :, model.state_space.fixed] = 0.0
-    directions, at = np.ones((2, 2, 1)), Moments(0.1, (), np.zeros((1, 0)))
+    directions, at = np.ones((2, 2, 1)), Moments(t=0.1, channels=(), inputs=np.zeros((1, 0)))
     numbers, off = np.array([4, 1]), np.zeros(2, dtype=bool)
     work = StageOfMembers(numbers, q, directions, 0.1, at, stage.kept(2), off, {})
     new, _ = stage.advance(columns, work)
@@ -116,12 +116,12 @@ def test_a_driven_vector_is_what_it_was_made_from(vector: Any, affine: bool, ass
     assert driven.affine is affine
     assert (driven.responses is not None) is assembled
     for p in (-3.0, 0.0, 1e6):
-        one = driven(Moments(0.3, ("p",), np.array([[p]])))
+        one = driven(Moments(t=0.3, channels=("p",), inputs=np.array([[p]])))
         wanted = vector(Moment(0.3, Inputs({"p": p})))
         np.testing.assert_allclose(one, wanted[None], rtol=1e-13)
     if affine:
         rows = np.array([[2.0], [5.0], [-1.0]])
-        found = driven(Moments(0.3, ("p",), rows))
+        found = driven(Moments(t=0.3, channels=("p",), inputs=rows))
         wanted = np.array([vector(Moment(0.3, Inputs({"p": float(p)}))) for (p,) in rows])
         np.testing.assert_allclose(np.broadcast_to(found, (3, 2)), wanted, rtol=1e-13)
 
@@ -276,7 +276,9 @@ def test_each_member_has_its_own_noise_level_and_is_finite_by_itself():
 
     def absorbed(x: Any, z: float, scale: float = 1.0) -> Any:
         t, values, nothing = np.full(len(x), 0.3), np.full((len(x), 1), z), np.zeros((1, 0))
-        span = Span(t, 0.3, (), nothing, nothing, values, values)
+        span = Span(
+            t0=t, t1=0.3, channels=(), inputs0=nothing, inputs1=nothing, z0=values, z1=values
+        )
         return absorb(replace(work.filter, noise=scale * work.filter.noise), x, span, work.options)
 
     louder, _ = absorbed(changed(x, level=np.array([1.0, 4.0])), 0.5)

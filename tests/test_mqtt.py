@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from broker import MOSQUITTO, Server
-from live_rod import COLUMNS, live, rows
+from live_rod import COLUMNS, live, rows, same
 from patience import PATIENCE
 
 import livepde as lp
@@ -291,7 +291,7 @@ def test_more_messages_than_the_broker_sends_ahead(server, tmp_path, monkeypatch
     heard.close()
 
 
-def test_what_the_broker_could_not_be_told_is_late_and_never_used_twice(
+def test_what_the_broker_could_not_be_told_is_known_and_never_used_twice(
     server, tmp_path, monkeypatch
 ):
     heard = source(server)
@@ -309,7 +309,30 @@ def test_what_the_broker_could_not_be_told_is_late_and_never_used_twice(
     assert [round(record.t, 6) for record in again.journal] == [
         round(0.1 * k, 6) for k in range(20)
     ]
-    assert again.journal.counts == {("late", name): taken for name in COLUMNS}
+    assert again.journal.counts == {("repeated", ""): taken}
+    again.feed.close()
+    again.journal.close()
+
+
+def test_a_block_that_a_gateway_sends_again_changes_nothing(server, tmp_path):
+    """Each message of it is new to the broker; a run that is resumed knows it, too."""
+    given = list(rows(60))
+    heard = source(server)
+    publish(server, [*given[:40], *given[20:40], *given[40:50]])
+    run = live(tmp_path, heard, verdict=False)
+    until(run, 50)
+    heard.close()
+    run.journal.close()
+    again = live(tmp_path, source(server), verdict=False)
+    again.resume()
+    publish(server, [*given[10:50], *given[50:]])
+    until(again, 60)
+    assert [record.t for record in again.journal] == [row["t"] for row in given]
+    assert again.journal.counts == {("repeated", ""): 60}
+    (tmp_path / "alone").mkdir()
+    alone = live(tmp_path / "alone", Rows(given), verdict=False)
+    alone.run()
+    same(again.journal, alone.journal)
     again.feed.close()
     again.journal.close()
 

@@ -7,6 +7,7 @@ import math
 import re
 import signal
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -258,7 +259,10 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
     (tmp_path / "run.json").write_text('{"format": 99}')
     with pytest.raises(lp.errors.RunError, match="not a record of this version"):
         runs.open(tmp_path)
-    (tmp_path / "run.json").write_text(json.dumps({"format": 1, "status": "running"}))
+    (tmp_path / "run.json").write_text(json.dumps({"format": 2, "status": "running"}))
+    with pytest.raises(lp.errors.RunError, match="is damaged: it is not as it was written"):
+        runs.open(tmp_path)
+    RunWriter(tmp_path, {"format": 2, "status": "running"})._save_record()
     run = runs.open(tmp_path)
     assert run.title == tmp_path.name
     assert run.checks == []
@@ -268,7 +272,7 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
     with pytest.raises(lp.errors.RunError, match="is damaged"):
         _ = run.dataset
     for checks in ([{"name": "k"}], {"name": "k"}, 5):
-        (tmp_path / "run.json").write_text(json.dumps({"format": 1, "checks": checks}))
+        RunWriter(tmp_path, {"format": 2, "checks": checks})._save_record()
         with pytest.raises(lp.errors.RunError, match=r"run\.json is damaged"):
             _ = runs.open(tmp_path).checks
 
@@ -335,6 +339,111 @@ def test_markdown_and_plain():
         "a": [1.5, None, 2], "1": [None],
     }  # fmt: skip
     json.dumps(plain({"x": np.float32(0.5)}), allow_nan=False)
+
+
+# --- what is read back is as it was written ------------------------------------------------------
+
+
+def flipped(content: bytes, bit: int) -> bytes:
+    """Return bytes with one bit changed."""
+    changed = bytearray(content)
+    changed[bit // 8] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+@pytest.mark.slow
+def test_each_bit_of_the_estimates_counts(tmp_path, driven):
+    written(tmp_path / "run", driven)
+    path = tmp_path / "run" / "estimates.nc"
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
+    for bit in rng.integers(0, 8 * len(whole), 200):
+        path.write_bytes(flipped(whole, int(bit)))
+        with pytest.raises(
+            lp.errors.RunError, match=r"is damaged: its bytes .* run the case again"
+        ):
+            _ = runs.open(tmp_path / "run").dataset
+    path.write_bytes(whole)
+    assert runs.open(tmp_path / "run").dataset.sizes["time"] == len(driven.result)
+    (tmp_path / "run" / "journal.sqlite").write_bytes(b"")
+    path.write_bytes(flipped(whole, 0))
+    with pytest.raises(lp.errors.RunError, match=r"export .* FILE\.nc --salvage' writes them"):
+        _ = runs.open(tmp_path / "run").dataset
+
+
+@pytest.mark.slow
+def test_each_bit_of_the_record_counts(tmp_path, driven):
+    """No other record is read: a change is refused, unless it is in the layout of the text."""
+    written(tmp_path / "run", driven)
+    path, rng = tmp_path / "run" / "run.json", np.random.default_rng(0)
+    whole, record = path.read_bytes(), runs.open(tmp_path / "run").record
+    refused = 0
+    for bit in rng.integers(0, 8 * len(whole), 200):
+        path.write_bytes(flipped(whole, int(bit)))
+        try:
+            assert runs.open(tmp_path / "run").record == record
+        except lp.errors.RunError:
+            refused += 1
+    assert refused > 150
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_kill_while_estimates_are_replaced_leaves_a_whole_run(
+    tmp_path, driven, monkeypatch, when
+):
+    """Of the file that was there before, or of the new one."""
+    written(tmp_path / "run", driven)
+    data = driven.result.to_xarray().isel(time=slice(3))
+    replace = Path.replace
+
+    def killed(self, target):
+        if Path(target).name == "estimates.nc":
+            if when == "after":
+                replace(self, target)
+            raise KeyboardInterrupt
+        return replace(self, target)
+
+    writer = RunWriter(tmp_path / "run", dict(runs.open(tmp_path / "run").record))
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", killed)
+        with pytest.raises(KeyboardInterrupt):
+            writer.finish(status="finished", dataset=data)
+    expected = 3 if when == "after" else len(driven.result)
+    assert runs.open(tmp_path / "run").dataset.sizes["time"] == expected
+
+
+def test_a_copy_of_a_case_that_was_changed_is_not_run(tmp_path):
+    RunWriter.create(tmp_path / "run", version="1", command=[], title="", case="a = 1\n")
+    assert runs.open(tmp_path / "run").case_file() == tmp_path / "run" / "case.toml"
+    (tmp_path / "run" / "case.toml").write_text("a = 2\n")
+    with pytest.raises(lp.errors.RunError, match="is not the case that was run"):
+        runs.open(tmp_path / "run").case_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "settings", "same"),
+    [
+        ('[intake]\nshift = "60 s"\nwait = 1\n', [], True),
+        ("[intake]\nwait = 1\n", ["intake.shift=60 s"], True),
+        ("[intake]\nwait = 2\n", [], False),
+        ("[intake]\nwait = 1\n", ["intake.wait=1"], False),
+        ("[intake\n", [], False),
+    ],
+)
+def test_a_run_goes_on_with_another_correction_of_its_clock(tmp_path, text, settings, same):
+    folder, case = tmp_path / "run", "[intake]\nwait = 1\n"
+    RunWriter.create(folder, version="1", command=[], title="", case=case)
+    (folder / "journal.sqlite").write_bytes(b"")
+    again = {"version": "2", "command": [], "case": text, "settings": settings, "original": case}
+    if not same:
+        with pytest.raises(lp.errors.RunError, match="another case or other settings"):
+            RunWriter.reopen(folder, **again)
+        return
+    RunWriter.reopen(folder, **again)
+    opened = runs.open(folder)
+    assert opened.settings == settings
+    assert opened.case_file().read_text() == text
+    assert "intake.shift" in opened.record["resumed"][0]
 
 
 @pytest.mark.slow

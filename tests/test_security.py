@@ -144,6 +144,10 @@ def hostile(tmp_path, monkeypatch):
     equation = tomllib.loads(text)["equation"]
     (folder / "case.toml").write_text(text.replace(f'"{equation}"', '"evil.py:equation"'))
     assert "evil.py" in (folder / "case.toml").read_text()
+    # A stranger makes the digests fit.
+    digest = hashlib.sha256((folder / "case.toml").read_bytes()).hexdigest()
+    record = runs.open(folder).record | {"case_copy_sha256": digest}
+    runs.RunWriter(folder, record)._save_record()
     for place in (folder, tmp_path, tmp_path / "mycase"):
         (place / "evil.py").write_text(CODE)
     return folder
@@ -190,17 +194,17 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
 @pytest.mark.long
 def test_a_damaged_dataset_is_one_sentence(hostile):
     path = hostile / "estimates.nc"
-    whole, rng, refused = path.read_bytes(), np.random.default_rng(0), 0
+    whole, rng = path.read_bytes(), np.random.default_rng(0)
     for _ in range(200):
         content = bytearray(whole)
         for place in rng.integers(0, 3000, 2):
             content[place] = rng.integers(0, 256)
-        path.write_bytes(content[: len(content) - int(rng.integers(0, 2)) * 1000])
-        try:
+        content = content[: len(content) - int(rng.integers(0, 2)) * 1000]
+        path.write_bytes(content)
+        if content == whole:
+            continue
+        with pytest.raises(lp.errors.RunError, match="is damaged"):
             _ = runs.open(hostile).dataset
-        except lp.errors.RunError:
-            refused += 1
-    assert refused > 100
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from commands import bad, call, estimates, start, stopped, until
 
 import livepde as lp
 from livepde import cases, runs
-from livepde.cases.data import source_of
+from livepde.cases.data import passwords_of, source_of
 from livepde.cases.live_case import LiveCase
 from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
@@ -144,7 +144,7 @@ def test_what_a_process_sends_does_not_end_a_run(here):
         assert len(journal) == 12
         assert journal.counts == {
             ("invalid", "T_3"): 1,
-            ("late", "T_3"): 1,
+            ("conflict", "T_3"): 1,
             ("malformed", ""): 3,
             ("missing", "T_3"): 1,
         }
@@ -166,6 +166,50 @@ def test_what_is_sent_again_to_standard_input_is_used_once(here):
     expected, resumed = (runs.open(name).dataset for name in ("whole", "run"))
     assert np.array_equal(resumed["time"], expected["time"])
     assert np.array_equal(resumed["alpha"], expected["alpha"])
+
+
+@pytest.mark.parametrize("source", ["file", "lines"])
+def test_a_block_that_comes_again_changes_nothing(here, source):
+    """More rows than one commit has; rows 80 to 139 come again after row 159, and are counted."""
+    whole = [row(k) for k in range(220)]
+    again = [*whole[:160], *whole[80:140], *whole[160:]]
+    found = {}
+    for name, given in (("whole", whole), ("again", again)):
+        if source == "file":
+            Path("rows.csv").write_text(HEADER + table(*given))
+            command = ("run", case('file = "rows.csv"'), "--realtime", "--speed", "inf")
+            assert call(*command, "--out", name)[0] == 0
+        else:
+            lines = "".join(json.dumps(one) + "\n" for one in given)
+            command = ("run", case(), "--realtime", "--data", "-", "--out", name)
+            assert call(*command, stdin=lines)[0] == 0
+        found[name] = runs.open(name).dataset
+        with Journal.open(Path(name) / JOURNAL) as journal:
+            assert journal.counts == ({} if name == "whole" else {("repeated", ""): 60})
+    for variable in ("time", "alpha", "alpha_std", "innovation"):
+        expected = found["whole"][variable]
+        assert np.array_equal(found["again"][variable], expected, equal_nan=True)
+
+
+def test_a_run_goes_on_with_a_stated_shift(here):
+    """A clock goes back by twenty minutes: rows are late, then corrected by what the user says."""
+    back = [{**row(k), "time": row(k - 20)["time"]} for k in range(20, 40)]
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(20)), *back[:10]))
+    command = ("run", case('file = "rows.csv"'), "--realtime", "--speed", "inf")
+    command = (*command, "--out", "run", "--resume")
+    assert call(*command)[0] == 0
+    found = runs.open("run")
+    assert found.dataset.sizes["time"] == 20
+    assert any("Times of rows went back once" in note for note in found.notes)
+    with Journal.open(Path("run") / JOURNAL) as journal:
+        assert "intake.shift" in journal.health
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(20)), *back))
+    assert call(*command, "--set", "intake.shift=20 min")[0] == 0
+    expected = [60.0 * k for k in (*range(20), *range(30, 40))]
+    assert runs.open("run").dataset["time"].values.tolist() == expected
+    assert runs.open("run").record["resumed"][0]["intake.shift"] == "20 min"
+    with pytest.raises(lp.errors.CaseError, match=r"intake\.shift"):
+        call(*command, "--set", "intake.shift=20 K")
 
 
 def test_what_is_not_valid_is_counted_in_files_too(here):
@@ -382,9 +426,54 @@ def test_what_belongs_to_a_live_run(here, option):
 
 
 def test_a_password_comes_from_the_environment(here, monkeypatch):
-    text = case('mqtt = { rows = ["a"], username = "me", password_env = "ROD_PASSWORD" }')
-    monkeypatch.delenv("ROD_PASSWORD", raising=False)
-    assert "the environment variable ROD_PASSWORD is not set" in bad("run", text)
+    text = case('mqtt = { rows = ["a"], username = "me", password_env = "LIVEPDE_ROD" }')
+    monkeypatch.delenv("LIVEPDE_ROD", raising=False)
+    assert "the environment variable LIVEPDE_ROD is not set" in bad("run", text)
+
+
+@pytest.mark.parametrize("name", ["AWS_SECRET_ACCESS_KEY", "LIVEPDE_TOKEN"])
+@pytest.mark.parametrize(
+    ("key", "data", "output"),
+    [
+        ("data.mqtt", 'mqtt = {{ rows = ["a"], port = {port}, password_env = "{name}" }}', ""),
+        (
+            "data.opcua",
+            'opcua = {{ url = "opc.tcp://127.0.0.1:{port}", columns = {{ a = "left" }}, '
+            'password_env = "{name}" }}',
+            "",
+        ),
+        (
+            "output.mqtt",
+            'file = "rows.csv"',
+            'mqtt = {{ topic = "a", port = {port}, password_env = "{name}" }}\n',
+        ),
+    ],
+)
+def test_a_case_sends_no_variable_that_the_user_has_not_allowed(
+    here, monkeypatch, name, key, data, output
+):
+    """Nothing is connected, and the value is nowhere; the option of the command allows it."""
+    monkeypatch.setenv(name, "a secret")
+    Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(4))))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.1)
+        port = server.getsockname()[1]
+        path = Path(case(data.format(port=port, name=name)))
+        path.write_text(path.read_text() + output.format(port=port, name=name))
+        command = ("run", "case.toml", "--realtime", "--speed", "inf", "--out", "run")
+        command = command if key == "output.mqtt" else command[:2]
+        said = bad(*command)
+        assert f"case.toml: {key}.password_env: the environment variable {name} would be" in said
+        assert f"add --allow-env {name}" in said
+        assert "a secret" not in said
+        with pytest.raises(TimeoutError):
+            server.accept()
+        assert not Path("run").exists()
+        loaded = cases.load("case.toml")
+        assert passwords_of(loaded, True, [name]) == {key: "a secret"}
+        assert passwords_of(loaded, False, [name] if key == "output.mqtt" else []) == (
+            {key: "a secret"} if key == "output.mqtt" else {}
+        )
 
 
 def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):

@@ -95,9 +95,9 @@ def test_a_log_in_json_has_the_fields_of_an_event(tmp_path, capsys, logs):
     logging.getLogger("another").info("not said")
     *events, lost = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
     assert {(event["kind"], event["channel"]) for event in events} == {
-        ("late", "a"),
-        ("late", "b"),
-        ("late", "left"),
+        ("conflict", "a"),
+        ("conflict", "b"),
+        ("conflict", "left"),
     }
     assert events[0]["level"] == "WARNING"
     assert all(isinstance(event["t"], float) for event in events)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from commands import bad, call, cut
+from exact_walk import mean_and_end
 from factories import driven_rod, readings, short_rod
 from skfem import ElementLineP1
 
@@ -54,7 +55,8 @@ def irregular(count=30):
 def dense(model, samples):
     """Return means and deviations of (s, c) and of u at all samples, by least squares.
 
-    The unknowns are s and c at the start and what s gains in each interval, each N(0, 1).
+    The unknowns are s and c at the start, and for each interval mean and end of what s gains in it,
+    as their Cholesky factor makes them of N(0, 1): the one stage of the scheme sees the mean.
     """
     n, count = model.X.dim, len(samples) - 1
     M, zero = model.mass.toarray(), np.zeros(n)
@@ -69,20 +71,23 @@ def dense(model, samples):
         found.append(np.concatenate([q, u]))
         for k, ((t0, _), (t1, _)) in enumerate(pairwise(samples)):
             h = t1 - t0
-            gain = 0.7 * np.sqrt(evolution.growth(h, 0.7)[0]) * theta[2 + k]
-            q = np.array([0.5 + evolution.transition(h)[0, 0] * (q[0] - 0.5) + gain, q[1]])
-            S, load = M / h + B, M @ u / h - A @ q
+            rate, gained = -evolution.generator[0, 0], evolution.growth(h, 0.7)[0]
+            root = 0.7 * np.linalg.cholesky(mean_and_end(rate, h, gained))
+            mean, end = root @ theta[2 + 2 * k : 4 + 2 * k]
+            q = np.array([0.5 + evolution.transition(h)[0, 0] * (q[0] - 0.5), q[1]])
+            S, load = M / h + B, M @ u / h - A @ (q + np.array([mean, 0.0]))
+            q = q + np.array([end, 0.0])
             u = model.impose(np.zeros(n), lp.fem.Moment(t1))
             u[free] = np.linalg.solve(S[np.ix_(free, free)], (load - S @ u)[free])
             found.append(np.concatenate([q, u]))
         return np.array(found)
 
-    here = path(np.zeros(2 + count))
-    J = np.stack([path(row) - here for row in np.eye(2 + count)], axis=-1)
+    here, whole = path(np.zeros(2 + 2 * count)), np.eye(2 + 2 * count)
+    J = np.stack([path(row) - here for row in whole], axis=-1)
     z = np.array([z for _, z in samples])
     seen = np.isfinite(z)
-    rows = np.vstack([(np.einsum("sj,tjp->tsp", G, J[:, 2:])[seen]) / NOISE, np.eye(2 + count)])
-    right = np.append((z - here[:, 2:] @ G.T)[seen] / NOISE, np.zeros(2 + count))
+    rows = np.vstack([(np.einsum("sj,tjp->tsp", G, J[:, 2:])[seen]) / NOISE, whole])
+    right = np.append((z - here[:, 2:] @ G.T)[seen] / NOISE, np.zeros(len(whole)))
     theta = np.linalg.lstsq(rows, right, rcond=None)[0]
     covariance = np.linalg.inv(rows.T @ rows)
     deviations = np.sqrt(np.einsum("tip,pq,tiq->ti", J, covariance, J))
@@ -101,6 +106,26 @@ def compared(law, evolution, samples):
     )
     columns = [0, 1, *(2 + np.argsort(MESH.p[0]))]
     return found, (mean[:, columns], std[:, columns])
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_the_smoother_weighs_each_reading_by_its_noise(names):
+    """With a noise for each reading the last smoothed estimate is that of the filter."""
+    model = sources(EVOLUTIONS["walk"])
+    noise = np.where(np.arange(31) % 2, 0.001, 0.5)
+    pairs = [
+        (t, np.column_stack([z, [std] * 3])) for (t, z), std in zip(irregular(), noise, strict=True)
+    ]
+    samples = [
+        (t, dict(zip("abc", z.tolist(), strict=True))) if names else (t, z) for t, z in pairs
+    ]
+    law = lp.SensitivityLaw(refit=None, gate=np.inf, guards=None)
+    result = lp.Identifier(model, SENSORS, law, u0=0.0).run(samples)
+    data = result.smoothed()
+    for name in "sc":
+        last = result.last[name]
+        assert float(data[name][-1]) == pytest.approx(last.mean, rel=1e-9)
+        assert float(data[f"{name}_std"][-1]) == pytest.approx(last.std, rel=1e-9)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Pattern, analyse
 from livepde.stepping import (
+    End,
     ForwardStage,
     Interval,
     Kept,
@@ -142,7 +143,9 @@ def test_substeps_are_the_same_steps_taken_by_hand(scheme):
 
 def interval(t0=1.0, t1=3.0, z0=(2.0, np.nan, 1.0), z1=(4.0, 6.0, np.nan)):
     inputs = (Inputs({"Q": 10.0}), Inputs({"Q": 20.0}))
-    return lp.stepping.Interval(t0, t1, *inputs, np.array(z0), np.array(z1))
+    start = lp.stepping.End(t=t0, inputs=inputs[0], z=np.array(z0))
+    stop = lp.stepping.End(t=t1, inputs=inputs[1], z=np.array(z1))
+    return lp.stepping.Interval.between(start, stop)
 
 
 def test_between_two_samples_data_are_linear():
@@ -451,7 +454,10 @@ def test_the_matrix_of_a_stage_is_assembled_once_for_each_parameter(prior):
 def test_held_inputs_are_held_exactly():
     held = lp.Advance(lp.Alexander2(), hold=True)
     between = held.over(
-        Interval(0.0, 1.0, Inputs({"Q": 5.0}), Inputs({"Q": 0.1}), *[np.ones(1)] * 2)
+        Interval.between(
+            End(t=0.0, inputs=Inputs({"Q": 5.0}), z=np.ones(1)),
+            End(t=1.0, inputs=Inputs({"Q": 0.1}), z=np.ones(1)),
+        )
     )
     assert between.at(1.0 / 3.0).inputs["Q"] == between.at(1.0).inputs["Q"] == 0.1
     assert between.at(1.0 / 3.0).inputs is between.at(1.0).inputs

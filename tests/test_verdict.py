@@ -13,7 +13,7 @@ import pytest
 import livepde as lp
 from livepde.errors import LawError
 from livepde.runs import doubts, verdict
-from livepde.verdict import LEVELS, Finding, Shifts, Verdict, WithheldLedger, discretised
+from livepde.verdict import Finding, Shifts, Verdict, WithheldLedger, discretised
 from livepde.verdict.findings import flat
 
 TIMES = np.linspace(0.0, 8.0, 161)
@@ -405,8 +405,8 @@ def test_few_samples_are_too_few():
     sensors = lp.Points(PLACES, noise=NOISE)
     identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
     estimate = identifier.step(0.1, np.zeros(3), {"T_left": 0.0})
-    assert estimate.verdict.level == "caution"
-    assert "too few to judge by" in estimate.verdict.sentences[0]
+    assert estimate.verdict.level == "not judged"
+    assert "there are 1 samples, 20 are needed" in estimate.verdict.sentences[0]
 
 
 @pytest.mark.long
@@ -423,6 +423,7 @@ def test_what_is_left_out_is_said():
     assert any("missing sources" in text for text in found.untested)
     bare = run(shown() + errors(), law=lp.SensitivityLaw(verdict=False))[1].verdict
     assert bare.untested == ("innovations: verdict = False",)
+    assert bare.level == "not judged"
     with pytest.raises(LawError, match="verdict must be"):
         lp.SensitivityLaw(verdict="dear")
 
@@ -447,12 +448,36 @@ def test_the_worst_finding_decides_and_none_is_said_twice():
     notes = [Finding("noise", "note", f"n{k}") for k in range(6)]
     grave = Finding("misfit", "do not trust", "grave")
     found = Verdict.of([*notes, grave, grave])
-    assert found.level == LEVELS[2]
+    assert found.level == "do not trust"
     assert len(found.sentences) == 5
     assert found.sentences[0] == "grave"
     assert len(set(found.sentences)) == len(found.sentences)
     assert Verdict.of(notes).level == "trusted"
     assert found.with_findings([grave]).findings == found.findings
+
+
+def test_what_was_not_judged_is_never_trusted():
+    """Neither with notes nor with a caution, which says more than is known; it may be worse."""
+    note, caution = Finding("noise", "note", "n"), Finding("flat", "caution", "f")
+    grave = Finding("withheld", "do not trust", "w")
+    for found in ([], [note], [note, caution]):
+        one = Verdict.of(found, ["innovations: none"], judged=False)
+        assert one.level == "not judged"
+        assert one.sentences[0] == (
+            "Not judged: whether the model holds was not tested (innovations: none)."
+        )
+        again = Verdict.from_dict(json.loads(json.dumps(one.to_dict())))
+        assert again.to_dict() == one.to_dict()
+        assert one.with_findings([grave]).level == "do not trust"
+        assert Verdict.of(found).level == ("caution" if caution in found else "trusted")
+
+
+def test_a_verdict_of_an_earlier_version_that_tested_nothing_is_not_judged():
+    for untested in ("innovations: GradientLaw says nothing of their size", "everything: no law"):
+        old = {"level": "trusted", "findings": [], "untested": [untested], "unseen": []}
+        assert Verdict.from_dict(old).level == "not judged"
+    old = {"level": "trusted", "findings": [], "untested": ["lag of single sensors"], "unseen": []}
+    assert Verdict.from_dict(old).level == "trusted"
 
 
 def test_a_finding_of_later_data_takes_the_place_of_an_earlier_one():

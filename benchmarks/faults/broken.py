@@ -200,7 +200,7 @@ def _taken(case: Case, path: Path) -> tuple[list[Record], dict[int, set[str]]]:
     begun: list[Ready] = []
     while not begun:
         begun += feed.poll(0.0)
-    prepared = case.begin(Sample(begun[0].t, begun[0].values), intake.start)
+    prepared = case.begin(Sample(t=begun[0].t, z=begun[0].values), intake.start)
     with prepared.journal() as journal:
         Live(prepared.identifier, feed, journal, fields_every=100, begun=begun).run()
         return list(journal), feed.reasons

@@ -77,7 +77,9 @@ class Stack:
         """Return states at a sample from those at the one before."""
         matrices, (before, now) = self.matrices, self.augmented.moments[at - 1 : at + 1]
         none = np.zeros(0)
-        interval = Interval(before.t, now.t, before.inputs, now.inputs, none, none)
+        interval = Interval(
+            t0=before.t, t1=now.t, inputs0=before.inputs, inputs1=now.inputs, z0=none, z1=none
+        )
         factor = matrices.factorise(a)
 
         def stage(c: Array, t: float, h: float) -> Array:

@@ -57,7 +57,9 @@ class Augmented:
         """Return x at the sample with this number from that at the one before."""
         q, none = self.latent(x[self.n :]), np.zeros(0)
         before, now = self.moments[at - 1], self.moments[at]
-        interval = Interval(before.t, now.t, before.inputs, now.inputs, none, none)
+        interval = Interval(
+            t0=before.t, t1=now.t, inputs0=before.inputs, inputs1=now.inputs, z0=none, z1=none
+        )
 
         def stage(c: Array, t: float, h: float) -> Array:
             return self.forward.solve(c, q, h, interval.at(t))

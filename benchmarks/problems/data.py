@@ -102,7 +102,7 @@ class Data:
                 z = dict(zip(names, z, strict=True)) | dict(
                     zip(hidden, process.hidden[k], strict=True)
                 )
-            yield Sample(float(t), z, process.inputs[k] if process.inputs else None)
+            yield Sample(t=float(t), z=z, inputs=process.inputs[k] if process.inputs else None)
 
     @cached_property
     def observed(self) -> Observed:
@@ -121,11 +121,13 @@ class Data:
         q, none = model.latent.prior, np.zeros(0)
         rows = [Inputs(dict(row)) for row in process.inputs or [{}] * len(self)]
         times = process.times.tolist()
-        at = Interval(times[0], times[0], rows[0], rows[0], none, none)
+        at = Interval(t0=times[0], t1=times[0], inputs0=rows[0], inputs1=rows[0], z0=none, z1=none)
         u = model.initial(process.u0, at.end)
         start = process_time()
         for k in range(1, len(times)):
-            interval = Interval(times[k - 1], times[k], rows[k - 1], rows[k], none, none)
+            interval = Interval(
+                t0=times[k - 1], t1=times[k], inputs0=rows[k - 1], inputs1=rows[k], z0=none, z1=none
+            )
 
             def stage(c: Array, t: float, h: float, of: Interval = interval) -> Array:
                 return stage_of.solve(c, q, h, of.at(t))

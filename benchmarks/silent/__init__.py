@@ -21,7 +21,8 @@ PARTS = {
     "partial": "the gradient law that tunes itself, with partial data",
     "repeats": "rows that arrive twice, and clocks that go back",
     "sensors": "sensors that fail for a while, and wild first rows",
-    "start": "boundary values of the start, checkpoints of another model",
+    "start": "boundary values of the start, and what the numbers of an estimate are",
+    "checkpoint": "checkpoints of another problem, results that are pickled",
     "paper": "the paper's law: stages, damping, failed steps",
 }
 

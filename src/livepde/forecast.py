@@ -18,7 +18,7 @@ from livepde.stepping import Interval
 __all__ = ["Forecast", "ahead"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Forecast:
     """Predicted sensor readings at given times, with their standard deviations.
 
@@ -81,7 +81,7 @@ def ahead(
         seen = [_seen(each, belief, interval.end) for each in sensors]
         z[k], std[k] = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     times = np.array([interval.t1 for interval in intervals])
-    return Forecast(times, names, z, std, status)
+    return Forecast(t=times, names=names, z=z, z_std=std, status=status)
 
 
 def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Array]:

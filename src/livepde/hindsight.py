@@ -13,7 +13,7 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.records import SMOOTHED, Record, bare
 from livepde.result import Estimate, Result
-from livepde.stepping import Interval
+from livepde.stepping import End, Interval
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -50,8 +50,9 @@ class Hindsight:
         taken = estimate.status.taken
         opens = taken and interval.t0 == interval.t1
         if self._opening is None:
-            t, z, inputs = interval.t0, interval.z0, interval.inputs0
-            self._opening = interval if opens else Interval(t, t, inputs, inputs, z, z)
+            nothing = np.full_like(interval.z0, np.nan)
+            start = End(t=interval.t0, inputs=interval.inputs0, z=nothing)
+            self._opening = interval if opens else Interval.between(start, start)
         if opens:
             self._q = [q]
         elif taken:
@@ -70,7 +71,13 @@ class Hindsight:
         last = len(self._estimates) - 1
         kept = {n for k, (n, *_) in enumerate(self._estimates) if k in (0, last)}
         kept |= {n for n, *_ in self._estimates[::fields_every]}
-        return FixedInterval(self._opening, self._intervals, self._q, self._jumps, kept)
+        return FixedInterval(
+            opening=self._opening,
+            intervals=self._intervals,
+            q=self._q,
+            jumps=self._jumps,
+            fields=kept,
+        )
 
     def dataset(self, result: Result, problem: Problem, beliefs: Iterable[Belief]) -> xr.Dataset:
         """Return smoothed beliefs, given in reverse time order, as a dataset of the run."""
@@ -94,9 +101,17 @@ class Hindsight:
     @staticmethod
     def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:
         withheld = 0 if result.withheld is None else result.withheld.size
-        unseen = np.full(result.observed.size, np.nan), np.full(withheld, np.nan)
-        space = result.model.parameter_space
-        return Estimate(t, belief, *unseen, status, 0, Diagnostics, (), space)
+        return Estimate(
+            t=t,
+            belief=belief,
+            innovation=np.full(result.observed.size, np.nan),
+            withheld_error=np.full(withheld, np.nan),
+            status=status,
+            steps=0,
+            diagnose=Diagnostics,
+            held=(),
+            space=result.model.parameter_space,
+        )
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:

@@ -7,7 +7,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.fingerprint import Fingerprint, fingerprint
 from livepde.forecast import Forecast, ahead
 from livepde.hindsight import Hindsight
 from livepde.laws import (
@@ -39,12 +40,13 @@ from livepde.laws import (
     stepped,
 )
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.step_ledger import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
-from livepde.stepping import Advance, Interval, Scheme
+from livepde.stepping import Advance, End, Interval, Scheme
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
@@ -52,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 7  # of the checkpoint
+FORMAT = 8  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -70,9 +72,13 @@ class Identifier:
     q0, u0
         Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
         q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
+        Without a sample at t0, boundary channels begin with the values that u0 has on their
+        boundaries. A u0 that is left out, or varies along such a boundary, states none.
     t0
         Initial time. A first sample at exactly t0 describes the start and takes no step; a law
-        may update the unknowns of the initial state by it.
+        may update the unknowns of the initial state by it. Without one, channels of the model
+        whose value at t0 is not known hold their first one over the first interval: the estimate
+        (`Estimate.held`) and the verdict name them.
     withheld
         Sensors that are never assimilated, only scored.
     scheme, dt_max
@@ -143,17 +149,37 @@ class Identifier:
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
+        self._stated = model.boundary_readings(u0)  # at t0
         self._state: Any = None
         self._t = float(t0)
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._samples = 0
+        self._fingerprint = self._lazy_fingerprint()
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
         self._gaps = InputLedger.start(len(self.inputs))
+        self._steps = StepLedger.start()
         # Boundary values may come with the first sample; the initial state has to wait for them
         # then.
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
+        parts = self.law, self.problem, self.withheld
+        return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
+
+    def started(self, q0: Array, u0: Array) -> Identifier:
+        """Return an identifier of the same parts with another start; for `Fleet.identifier`.
+
+        Parameters
+        ----------
+        q0, u0
+            Latent parameter and state, shapes (m,) and (n,).
+        """
+        other = copy.copy(self)
+        other._q0, other._u0 = q0, u0
+        other._fingerprint = other._lazy_fingerprint()
+        return other
 
     def placed(
         self, state: Any, t: float, z: Array, inputs: Array, held: Array, samples: int
@@ -173,7 +199,8 @@ class Identifier:
         """
         other = copy.copy(self)
         other._state, other._t, other._z, other._samples = state, t, z, samples
-        other._gaps = InputLedger(np.zeros(1 + len(held), dtype=np.int64), held)
+        other._gaps = replace(InputLedger.start(len(held)), held=held)
+        other._steps = StepLedger.start()
         begun = zip(self.inputs, inputs.tolist(), strict=True) if state is not None else ()
         other._inputs = Inputs(dict(begun))
         return other
@@ -275,32 +302,44 @@ class Identifier:
             An input has no value yet; a later gap holds the last value and is noted. The position
             of a moving sensor may be missing, and is not held.
         """
+        return self._taken(t, z, inputs)[0]
+
+    def _taken(
+        self, t: float, z: Readings, inputs: Mapping[str, float] | None
+    ) -> tuple[Estimate, Interval]:
+        """Take one sample; return the estimate, and the interval that the law was given."""
         t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         if noise is not None:
             self.check_weighs(noise)
         values, held = self._channels.filled(named, self._inputs)
-        if self._state is None:
-            self._begun_by(values, t)
+        unstated = self._begun_by(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
-        # A first sample at the initial time has an empty interval: both ends are the sample.
-        start = self._inputs if t > self._t else values
         names, gaps = self._channels.inputs, {}
         if names:
             missing = np.array(list(map(held.__contains__, names)), dtype=float)
             if held or np.count_nonzero(self._gaps.held):
                 gaps = self._gaps.gaps(names, missing)
-        z0 = self._z if t > self._t else used
-        interval = Interval(self._t, t, start, values, z0, used, noise, gaps)
+        now = End(t=t, inputs=values, z=used, noise=noise, gaps=gaps)
+        # A first sample at the initial time has an empty interval: both ends are the sample.
+        interval = Interval.between(self._last if t > self._t else now, now)
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
+        self._steps = self._steps.add(report.status.code)
         if report.status.taken:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
-        return self._estimate(t, measured, withheld, values, report, held, scored=True)
+        held = (*held, *unstated)
+        estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
+        return estimate, interval
+
+    @property
+    def _last(self) -> End:
+        """The last accepted sample, where the next interval begins."""
+        return End(t=self._t, inputs=self._inputs, z=self._z)
 
     def _time_of_next(self, t: float) -> float:
         """Return the time of the next sample, checked; only the first may be at the start."""
@@ -316,8 +355,18 @@ class Identifier:
             )
         return t
 
-    def _begun_by(self, inputs: Inputs, t: float) -> None:
-        """Begin with the inputs of the first sample, unless no finite state comes of them."""
+    def _opening(self, inputs: Inputs, t: float) -> Inputs:
+        """Return the inputs at the initial time, from those at t of the first sample."""
+        if t == self._t or not self._stated:
+            return inputs
+        return Inputs({**inputs, **self._stated})
+
+    def _begun_by(self, values: Inputs, t: float) -> tuple[str, ...]:
+        """Begin with a first sample, unless no finite state comes of its inputs.
+
+        Return the channels of the model that have no value at the initial time.
+        """
+        inputs = self._opening(values, t)
         try:
             with nonfinite_allowed():
                 state = self._start(inputs)
@@ -332,17 +381,22 @@ class Identifier:
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
         self._state, self._inputs = state, inputs
+        missing = [name for name in self.model.channels if name not in self._stated]
+        unstated = tuple(missing) if t > self._t else ()
+        mask = np.array([name in unstated for name in self.inputs], dtype=float)
+        self._gaps = replace(self._gaps, unstated=mask)
+        return unstated
 
     @property
     def place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
-        ledgers = self._withheld, self._gaps
+        ledgers = self._withheld, self._gaps, self._steps
         return self._state, self._t, self._z, self._inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
-        self._withheld, self._gaps = ledgers
+        self._withheld, self._gaps, self._steps = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -416,16 +470,17 @@ class Identifier:
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return the verdict of the law with the findings on withheld sensors and gaps."""
-        withheld, gaps = self._withheld, self._gaps
+        """Return the verdict of the law with the findings on steps, withheld sensors and gaps."""
+        withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        if not names and not np.count_nonzero(gaps.counts[1:]):
+        silent = not np.count_nonzero(gaps.counts[1:]) and not gaps.unstated.any()
+        if not names and not steps.failed and silent:
             return judge
 
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
-            return judge().with_findings([*withheld.findings(names), *held])
+            return judge().with_findings([*steps.findings(), *withheld.findings(names), *held])
 
         return found
 
@@ -521,17 +576,16 @@ class Identifier:
             )
         self._check_reachable(float(t[-1]))
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
-        state, before = self._state, self._inputs
+        state, last = self._state, self._last
         if state is None:
-            state, before = self._start(planned[0]), planned[0]
+            opening = self._opening(planned[0], float(t[0]))
+            state, last = self._start(opening), replace(last, inputs=opening)
         blank = np.full(self.observed.size, np.nan)
-        ends = [(end, then, blank) for end, then in zip(t.tolist(), planned, strict=True)]
-        intervals = [
-            Interval(t0, t1, inputs0, inputs1, z0, z1)
-            for (t0, inputs0, z0), (t1, inputs1, z1) in pairwise(
-                [(self._t, before, self._z), *ends]
-            )
+        ends = [
+            End(t=when, inputs=then, z=blank)
+            for when, then in zip(t.tolist(), planned, strict=True)
         ]
+        intervals = [Interval.between(start, stop) for start, stop in pairwise([last, *ends])]
         sensors = self._channels.sensors
         return ahead(self.law, self._work, self.problem, sensors, state, intervals)
 
@@ -567,7 +621,7 @@ class Identifier:
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             result.add(estimate)
-            taken.append(Sample(sample.t, copy.copy(sample.z), copy.copy(sample.inputs)))
+            taken.append(Sample(t=sample.t, z=copy.copy(sample.z), inputs=copy.copy(sample.inputs)))
             if on_estimate is not None:
                 on_estimate(estimate)
         if result.last is not None:
@@ -613,11 +667,9 @@ class Identifier:
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)
-            t, z, inputs = who._t, who._z, who._inputs
-            estimate = who.step(sample.t, sample.z, sample.inputs)
-            if before is None:  # the law begins with the inputs of the first sample
-                before, inputs = self._start(who._inputs), who._inputs
-            interval = Interval(t, who._t, inputs, who._inputs, z, who._z)
+            estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
+            if before is None:  # the law begins with the first sample
+                before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who.latent_belief().q)
         result = Result(self.model, self.observed, self.withheld, fields_every)
         data = run.fixed_interval(fields_every)
@@ -633,7 +685,12 @@ class Identifier:
                 "longer dt_max."
             )
 
-    def _fingerprint(self) -> dict[str, Any]:
+    @property
+    def fingerprint(self) -> Fingerprint:
+        """Numbers by which a checkpoint of this problem is known; computed when first asked for."""
+        return self._fingerprint()
+
+    def _header(self) -> dict[str, Any]:
         return {
             "format": FORMAT,
             "law": type(self.law).__name__,
@@ -649,7 +706,7 @@ class Identifier:
 
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
-        header = {**self._fingerprint(), "begun": self._state is not None}
+        header = {**self._header(), "begun": self._state is not None}
         leaves = {
             "t": self._t,
             "z": self._z,
@@ -659,6 +716,9 @@ class Identifier:
             "withheld_last": self._withheld.last,
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
+            "steps": self._steps.counts,
+            "unstated": self._gaps.unstated,
+            **self.fingerprint.leaves,
         }
         if self._state is not None:
             leaves |= checkpoint.flatten(self._state)
@@ -670,7 +730,8 @@ class Identifier:
         Raises
         ------
         RunError
-            The file is damaged, or of another model, law or set of sensors.
+            The file is damaged, or of another problem: another model, prior, sensor place or
+            boundary value, say, or another option of the law.
         """
         self.restore(checkpoint.read(path), str(path))
 
@@ -678,7 +739,7 @@ class Identifier:
         """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
         # Nothing of this identifier changes before all parts of the checkpoint have been read.
-        mine = self._fingerprint()
+        mine = self._header()
         for key, value in mine.items():
             if header.get(key) != value:
                 if key == "format":
@@ -690,12 +751,22 @@ class Identifier:
                     f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
                     f"{value!r}. Build it as it was when it was saved."
                 )
+        if differs := self.fingerprint.differing(leaves):
+            raise RunError(
+                f"{where} was saved with another {differs}. Build the identifier as it was then, "
+                "or start a new run."
+            )
         state = None
         try:
             t, samples = float(leaves["t"]), int(leaves["samples"])
             z = checkpoint.rebuild(self._z, leaves, "z")
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
-            gaps = InputLedger(leaves["held_counts"].astype(np.int64), leaves["held"])
+            gaps = InputLedger(
+                counts=leaves["held_counts"].astype(np.int64),
+                held=leaves["held"],
+                unstated=leaves["unstated"],
+            )
+            steps = StepLedger(leaves["steps"].astype(np.int64))
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
             if header["begun"]:
@@ -707,7 +778,7 @@ class Identifier:
                 "as they were when it was saved."
             ) from error
         self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
-        self._state, self._withheld, self._gaps = state, withheld, gaps
+        self._state, self._withheld, self._gaps, self._steps = state, withheld, gaps, steps
         if state is None and not self.inputs:
             self._begin(inputs)
 

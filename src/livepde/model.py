@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -10,7 +11,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.errors import ModelError, NameClashError
+from livepde.errors import ConfigurationError, ModelError, NameClashError
 from livepde.fem import (
     START,
     Channel,
@@ -184,6 +185,32 @@ class Model:
             )
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
+
+    def __copy__(self) -> Model:
+        return self  # it never changes
+
+    def __deepcopy__(self, memo: object) -> Model:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how pickle builds it again: from what it was made of.
+
+        Raises
+        ------
+        ConfigurationError
+            A function that pickle cannot find by its name.
+        """
+        parts = self.state, self.parameter, {**self._parts, **self._units}
+        try:
+            pickle.dumps(parts)
+        except (pickle.PicklingError, AttributeError, TypeError) as error:
+            raise ConfigurationError(
+                "this model cannot be pickled, since pickle stores a function by its name, and a "
+                f"lambda or an inner function has none ({error}): define forms and values with def "
+                "at the top of a module, or pickle what builds the model. Estimates and results "
+                "can be pickled."
+            ) from error
+        return _rebuilt, parts
 
     def _form(
         self,
@@ -480,6 +507,31 @@ class Model:
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)
 
+    def boundary_readings(self, u0: Any) -> dict[str, float]:
+        """Return the boundary channels whose values an initial state states, with these values.
+
+        Left out are channels on whose boundaries u0 varies by more than a thousandth of its range,
+        and those of components that u0 does not name. None states nothing.
+        """
+        if u0 is None:
+            return {}
+        u = self.state_space.interpolate(u0)
+        values: dict[str, Array] = {}
+        allowed: dict[str, float] = {}
+        for name, block in self.state_space.fields.items():
+            given = u0.get(name) if isinstance(u0, Mapping) else u0
+            if given is None:
+                continue
+            own = u[self.state_space.part(name)]
+            inside = block.at_vertices @ own
+            # Rounding counts where the state is the same everywhere.
+            spread = 1e-3 * float(np.ptp(inside)) + 1e-9 * float(np.abs(inside).max())
+            for channel, there in block.traces(given, own):
+                values[channel] = np.append(values.get(channel, []), there)
+                allowed[channel] = min(spread, allowed.get(channel, spread))
+        fits = {channel: np.ptp(there) <= allowed[channel] for channel, there in values.items()}
+        return {channel: float(there.mean()) for channel, there in values.items() if fits[channel]}
+
     def initial(self, u0: Any, moment: Moment = START) -> Array:
         """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
         return self.impose(self.state_space.interpolate(u0), moment)
@@ -518,6 +570,10 @@ class Model:
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
         return q
+
+
+def _rebuilt(state: Any, parameter: Any, parts: dict[str, Any]) -> Model:
+    return Model(state, parameter, **parts)
 
 
 def _common_mesh(state: FunctionSpace) -> Any:

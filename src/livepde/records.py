@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -38,6 +38,9 @@ __all__ = [
     "Snapshot",
     "bare",
     "name_clashes",
+    "refusal",
+    "refused_readings",
+    "used_errors",
 ]
 
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
@@ -112,7 +115,7 @@ class Snapshot:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Record:
     """The stored part of an estimate.
 
@@ -211,14 +214,14 @@ class RecordArrays:
         for k, (numbers, innovation, error) in enumerate(rows):
             said = {name: float(column[k]) for name, column in notes.items()}
             yield Record(
-                self._t[k],
-                numbers,
-                innovation,
-                error,
-                self._status[k],
-                self._steps[k],
-                {name: value for name, value in said.items() if not math.isnan(value)},
-                kept.get(k),
+                t=self._t[k],
+                numbers=numbers,
+                innovation=innovation,
+                withheld_error=error,
+                status=self._status[k],
+                steps=self._steps[k],
+                notes={name: value for name, value in said.items() if not math.isnan(value)},
+                snapshot=kept.get(k),
             )
 
     def _table(self, values: array[float]) -> Array:
@@ -376,6 +379,9 @@ class Layout:
         Sensor, withheld or not, that is at one point -> its coordinates.
     attrs
         Attributes of the dataset: title, origin (the date of t = 0), equation.
+    comments
+        Variable of a field -> what its numbers are, where that is not a mean or a standard
+        deviation.
     """
 
     time_unit: str
@@ -392,6 +398,7 @@ class Layout:
     length_unit: str = ""
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
+    comments: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as a JSON object."""
@@ -487,7 +494,18 @@ class Layout:
         at = {name: [0.0] * len(grid) for name in ("z", "w")}
         blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [], places=at)
         rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
-        rows.append(Record(0.0, np.zeros(0), np.zeros(1), np.zeros(1), 0, 1, {}, snapshot))
+        rows.append(
+            Record(
+                t=0.0,
+                numbers=np.zeros(0),
+                innovation=np.zeros(1),
+                withheld_error=np.zeros(1),
+                status=0,
+                steps=1,
+                notes={},
+                snapshot=snapshot,
+            )
+        )
         data, coords, _ = blank._contents(rows, None)
         found = {DATE}
         for name, (dimensions, *_) in {**data, **coords}.items():
@@ -501,8 +519,9 @@ class Layout:
             return data
         for name in kept[0].profiles:
             values = np.array([snapshot.profiles[name] for snapshot in kept])
-            unit = {"units": self.units.get(name, self.units.get(bare(name), ""))}
-            data[name] = (("snapshot", "vertex"), values, unit)
+            attrs = {"units": self.units.get(name, self.units.get(bare(name), ""))}
+            attrs |= {"comment": self.comments[name]} if name in self.comments else {}
+            data[name] = (("snapshot", "vertex"), values, attrs)
         for name, (_, count) in kept[-1].told.items():
             told = np.array([snapshot.told[name][0] for snapshot in kept])
             about = {"long_name": "modes that the data have told of", "of": count}
@@ -538,6 +557,38 @@ def bare(name: str) -> str:
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
+
+
+def refusal(name: str) -> str:
+    """Return the name of the note that is 1 where a reading of a sensor was refused.
+
+    >>> refusal("T_1")
+    'refused T_1'
+    """
+    return f"refused {name}"
+
+
+def refused_readings(data: xr.Dataset) -> dict[str, Mask]:
+    """Return sensor -> which samples have a reading that the gate refused; none without."""
+    found = {}
+    for name in map(str, data["sensor"].values) if "sensor" in data else ():
+        note = refusal(name)
+        key = f"{NOTE}{note}" if f"{NOTE}{note}" in data else note
+        if key in data and data[key].dims == ("time",):
+            found[name] = np.asarray(data[key].values == 1.0)
+    return found
+
+
+def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
+    """Return errors of channels, (samples, channels), NaN where the gate refused the reading."""
+    errors: Array = data[variable].transpose("time", dimension).values
+    refused = refused_readings(data) if variable == "innovation" else {}
+    if not refused:
+        return errors
+    errors, names = errors.copy(), list(map(str, data[dimension].values))
+    for name, which in refused.items():
+        errors[which, names.index(name)] = math.nan
+    return errors
 
 
 def name_clashes(

@@ -6,19 +6,28 @@ import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 
 from livepde.errors import ConfigurationError
-from livepde.fem import FieldBlock, FunctionSpace, cells
+from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
 from livepde.laws import Belief, Fit, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import ScalarReadout, unknown_of
-from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Records, Snapshot
+from livepde.records import (
+    STATUS_CODES,
+    Layout,
+    Record,
+    RecordArrays,
+    Records,
+    Snapshot,
+    refused_readings,
+    used_errors,
+)
 from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
@@ -29,13 +38,20 @@ __all__ = [
     "Marginal",
     "Result",
     "interval_ends",
+    "kept",
     "layout_of",
     "unknown_of",
     "vertex_order",
 ]
 
+MEDIAN = "the median"
+FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 
-@dataclass(frozen=True, eq=False)
+
+Kept = TypeVar("Kept")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate:
     """The estimate of parameter and state after one sample.
 
@@ -58,7 +74,8 @@ class Estimate:
     diagnose
         Function that returns the diagnostics of the law; see `diagnostics`.
     held
-        Input channels whose last value was held because the sample had none.
+        Input channels whose last value was held because the sample had none; at the first sample
+        also those without a value at the initial time, whose first one was held.
     space
         The unknowns.
     judge
@@ -132,11 +149,17 @@ class Estimate:
             return held[name]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the belief itself, for a copy."""
+        """Return the values themselves, for pickle and copies."""
         # Functions of a law cannot be pickled, and hold its arrays: what they return is stored.
-        own = {"belief": self.belief, "verdict": self.verdict}
-        own["diagnose"] = partial(_same, self.diagnostics)
-        return own | {k: v for k, v in vars(self).items() if k not in ("_read", "judge")}
+        own = {
+            "belief": self.belief,
+            "verdict": self.verdict,
+            "diagnostics": self.diagnostics,
+            "diagnose": partial(kept, self.diagnostics),
+            "judge": partial(kept, self.verdict),
+            "space": self.space.described,
+        }
+        return {k: v for k, v in vars(self).items() if k != "_read"} | own
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
@@ -175,7 +198,11 @@ class Estimate:
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none)."""
+        """Label of each scalar unknown -> (value, standard deviation; NaN if there is none).
+
+        For a `Normal` mean and standard deviation. Under a transform the median, and the standard
+        deviation to first order; `estimate[label]` has mean and standard deviation of these, too.
+        """
         std = self.q_std
         return {
             label: (float(self.q[k]), float(std[k]) if std is not None else np.nan)
@@ -201,7 +228,7 @@ class Estimate:
         }
 
     def __getitem__(self, name: str) -> Marginal:
-        """Return the marginal of one unknown: its mean, standard deviation and intervals.
+        """Return the marginal of one unknown: median, mean, standard deviation and intervals.
 
         Parameters
         ----------
@@ -229,20 +256,37 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Marginal:
-    """The marginal distribution of one unknown in an estimate.
+    """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
 
     Attributes
     ----------
-    mean, std
-        A number each; of a field arrays of coefficients. The standard deviation is NaN for a law
-        without covariance.
+    median
+        A number; of a field an array of coefficients.
+    deviation
+        Standard deviation to first order: that of the latent value times the slope of the transform
+        at the median. NaN for a law without covariance.
     unknown
         The unknown with its prior.
     """
 
-    mean: Any
-    std: Any
+    median: Any
+    deviation: Any
     unknown: Any
+
+    @property
+    def mean(self) -> Any:
+        """Mean: the median of a `Normal`, larger than it for a `LogNormal`."""
+        return self._moments[0]
+
+    @property
+    def std(self) -> Any:
+        """Standard deviation: `deviation` of a `Normal`, larger for a `LogNormal`."""
+        return self._moments[1]
+
+    @cached_property
+    def _moments(self) -> tuple[Any, Any]:
+        mean, std = self.unknown.prior.moments(self.median, self.deviation)
+        return (float(mean), float(std)) if isinstance(self.median, float) else (mean, std)
 
     def interval(self, level: float = 0.95) -> tuple[Any, Any]:
         """Return the ends of the central interval that holds it with probability `level`.
@@ -250,12 +294,17 @@ class Marginal:
         Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
         without covariance.
         """
-        low, high = self.unknown.interval(self.mean, self.std, level)
-        return (float(low), float(high)) if isinstance(self.mean, float) else (low, high)
+        low, high = self.unknown.interval(self.median, self.deviation, level)
+        return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
 
     def __str__(self) -> str:
-        numbers = isinstance(self.mean, float)
-        return f"{self.mean:.4g} ± {self.std:.2g}" if numbers else repr(self)
+        """Return mean and standard deviation; under a transform median and 95 % interval."""
+        if not isinstance(self.median, float):
+            return repr(self)
+        if isinstance(self.unknown.prior, Normal):
+            return f"{self.mean:.4g} ± {self.std:.2g}"
+        low, high = self.interval()
+        return f"{self.median:.4g} (95 %: {low:.4g} to {high:.4g})"
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
@@ -305,6 +354,8 @@ class Result:
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld)
+        # Of a result that was pickled: its records are complete, and the model is not there.
+        self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
         self._readout = ScalarReadout(model.parameter_space)
 
@@ -345,14 +396,14 @@ class Result:
     def record(self, estimate: Estimate, keeps: bool) -> Record:
         """Return the record of an estimate; `keeps`: with its fields."""
         return Record(
-            estimate.t,
-            np.array(self._readout(estimate.belief)),
-            estimate.innovation,
-            estimate.withheld_error,
-            STATUS_CODES.index(estimate.status.code),
-            estimate.steps,
-            estimate.diagnostics.named(),
-            self.snapshot(estimate) if keeps else None,
+            t=estimate.t,
+            numbers=np.array(self._readout(estimate.belief)),
+            innovation=estimate.innovation,
+            withheld_error=estimate.withheld_error,
+            status=STATUS_CODES.index(estimate.status.code),
+            steps=estimate.steps,
+            notes=estimate.diagnostics.named(),
+            snapshot=self.snapshot(estimate) if keeps else None,
         )
 
     def snapshot(self, estimate: Estimate) -> Snapshot:
@@ -402,7 +453,16 @@ class Result:
         `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
         result of `Verdict.to_dict`, as JSON.
         """
-        records, last = RecordArrays.of(self.records), None
+        data = self.layout.dataset(*self._finished())
+        if self.last is not None:
+            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+        return data
+
+    def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
+        """Return all records, and the last fields if `fields_every` has left them out."""
+        records, last = RecordArrays.of(self.records), self._last_fields
+        if self._complete:
+            return records, last
         if self.last is not None and self._settled is not None:
             snapshot = (
                 None if records.last_snapshot < len(records) - 1 else self.snapshot(self.last)
@@ -411,10 +471,23 @@ class Result:
         if self.last is not None and records.last_snapshot < len(records) - 1:
             # The last fields are part of the dataset, also where `fields_every` has left them out.
             last = self.snapshot(self.last)
-        data = self.layout.dataset(records, last)
-        if self.last is not None:
-            data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
-        return data
+        return records, last
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what was found, without the model, whose functions may not be pickled."""
+        records, fields = self._finished()
+        own = {"records": records, "_last_fields": fields, "_complete": True, "smoother": None}
+        left = ("model", "observed", "withheld", "_readout", "_settled")
+        return {k: v for k, v in vars(self).items() if k not in left} | own
+
+    def __getattr__(self, name: str) -> Any:
+        # Python calls this only for names that are not there: those that `__getstate__` leaves out.
+        if name in ("model", "observed", "withheld", "_readout", "_settled"):
+            raise ConfigurationError(
+                "this result was pickled, without its model: it has its estimates, datasets and "
+                "tables. To add samples or to smooth, run an identifier again."
+            )
+        raise AttributeError(f"a Result has no attribute '{name}'.")
 
     def smoothed(self) -> xr.Dataset:
         """Return a dataset of unknowns and state over time, given all samples of the run.
@@ -461,7 +534,9 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
     for label in model.parameter_space.labels:
         unknown = unknown_of(model.parameter_space, label)
         unit: dict[str, Any] = {"units": unknown.unit}
-        numbers |= {label: {**unit, **_prior(unknown)}, f"{label}_std": unit}
+        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
+        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
+        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
         numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
         numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
     points = model.mesh.p[:, vertex_order(model)]
@@ -481,6 +556,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         state=[key for name, block in components for key in block.variables(name)],
         length_unit=model.length_unit,
         places={name: at.tolist() for name, at in places.items()},
+        comments=_field_comments(model),
     )
 
 
@@ -534,6 +610,15 @@ def _prior(unknown: Any) -> dict[str, float]:
     return found
 
 
+def _field_comments(model: Model) -> dict[str, str]:
+    """Return unknown field or its standard deviation -> what it is, where it has a transform."""
+    found: dict[str, str] = {}
+    for name, block in model.parameter_space.fields.items():
+        if not isinstance(block.field.prior, Normal):
+            found |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
+    return found
+
+
 def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     """Return the table of a run's dataset: last estimates, and errors of each channel."""
     rows: dict[str, dict[str, float]] = {}
@@ -545,14 +630,18 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
         if variable not in data:
             continue
-        for name in data[dimension].values:
-            errors = data[variable].sel({dimension: name}).dropna("time")
+        columns = used_errors(data, variable, dimension).T
+        for name, column in zip(data[dimension].values, columns, strict=True):
+            errors = column[np.isfinite(column)]
             rows[f"{variable}:{name}"] = {
                 "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
                 "count": float(len(errors)),
             }
+    for name, which in refused_readings(data).items():
+        rows[f"innovation:{name}"]["refused"] = float(which.sum())
     return rows
 
 
-def _same(diagnostics: Diagnostics[float]) -> Diagnostics[float]:
-    return diagnostics
+def kept(value: Kept) -> Kept:
+    """Return a value: with it, a function that returns it can be pickled."""
+    return value

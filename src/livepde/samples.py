@@ -61,7 +61,7 @@ def sample_of(item: Any) -> Sample:
     if isinstance(item, tuple | list) and len(item) in (2, 3):
         *_, last = item
         if len(item) == 2 or last is None or isinstance(last, Mapping):
-            return Sample(*item)
+            return Sample(t=item[0], z=item[1], inputs=last if len(item) == 3 else None)
     raise SampleError(
         f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}; a pandas "
         "table whose index are the times and whose columns are channels gives them by .iterrows()."

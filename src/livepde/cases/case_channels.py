@@ -194,6 +194,15 @@ def _part(
         if item.quantity is not None
     }
     uncertain = {name: std for name, std in _shifted(case).items() if name in channels}
+    # A family of point sensors of which one names a component has one for each.
+    numbers = [item.component for item in channels.values()]
+    if any(number is not None for number in numbers):
+        if None in numbers:
+            unnamed = next(name for name, item in channels.items() if item.component is None)
+            raise case.missing(
+                f"channels.{unnamed}.component", "the component of the vector that it measures."
+            )
+        common = {**common, "component": numbers}
     return Points(points, direct, uncertain or None, **common)
 
 

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, tzinfo
 from functools import partial
@@ -20,6 +20,7 @@ from livepde.cases.case_content import CaseContent
 from livepde.cases.equations import check_options, load_code, own_code
 from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
+from livepde.linalg import Mask
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -32,6 +33,7 @@ from livepde.streams import (
 )
 from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
+from livepde.streams.first_rows import wild_first_rows
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
@@ -39,18 +41,22 @@ from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = [
+    "START",
     "Data",
     "assimilation_start",
     "check_hours",
     "clock_of",
     "data_file",
     "limits_of",
+    "passwords_of",
     "policy_of",
     "publishers_of",
     "read_data",
     "reader_of",
     "source_of",
     "source_text",
+    "suspect_start",
+    "wild_start",
     "without_gaps",
 ]
 
@@ -60,7 +66,11 @@ UNSET = (
     f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
     "the measurements."
 )
+PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
+TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password of a server
 LOG = logging.getLogger("livepde.run")
+FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
+START = "start"  # kind of remark on values of the first rows
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
@@ -197,9 +207,65 @@ def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
+def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
+    """Return a record without wild first values, from which no initial state must be made.
+
+    They count as missing. Rows at the start in which an input lacks its value for that are left
+    out.
+    """
+    wild = wild_first_rows(table.t, table.values, _comparable(case, table.names))
+    if not wild.any():
+        return table
+    values, drives = np.where(wild, math.nan, table.values), _driving(case, table.names)
+    lacking = (wild & drives).any(axis=1)
+    begin = int(np.flatnonzero(lacking)[-1]) + 1 if lacking.any() else 0
+    counts = zip(table.names, wild.sum(axis=0).tolist(), strict=True)
+    remarks = {**table.remarks, **{(START, name): n for name, n in counts if n}}
+    return replace(table, t=table.t[begin:], values=values[begin:], remarks=remarks)
+
+
+def wild_start(
+    case: CaseContent, rows: Sequence[tuple[float, Mapping[str, float]]]
+) -> list[tuple[int, str]]:
+    """Return the wild values of the first rows of a live source: row and channel of each."""
+    names = list(case.spec.channels)
+    values = np.array([[row.get(name, math.nan) for name in names] for _, row in rows])
+    wild = wild_first_rows(np.array([t for t, _ in rows]), values, _comparable(case, names))
+    return [(k, names[i]) for k, i in np.argwhere(wild).tolist()]
+
+
+def suspect_start(case: CaseContent, row: Mapping[str, float]) -> bool:
+    """Return whether a value of the first row lies far from all others of the same quantity."""
+    names = list(case.spec.channels)
+    for group in _comparable(case, names):
+        values = np.sort([x for k in group if math.isfinite(x := row.get(names[k], math.nan))])
+        if len(values) < 3:
+            continue
+        below, above = values[1] - values[0], values[-1] - values[-2]
+        if below > FAR * np.ptp(values[1:]) or above > FAR * np.ptp(values[:-1]):
+            return True
+    return False
+
+
+def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
+    """Return the channels that measure the same component of the state."""
+    groups: dict[str | None, list[int]] = {}
+    for k, name in enumerate(names):
+        channel = case.spec.channels.get(name)
+        if channel is not None and channel.role in ("boundary", "sensor", "withheld"):
+            groups.setdefault(channel.of, []).append(k)
+    return [*groups.values()]
+
+
+def _driving(case: CaseContent, names: Sequence[str]) -> Mask:
+    """Return which columns drive the model."""
+    channels = case.spec.channels
+    return np.array([name in channels and channels[name].drives for name in names])
+
+
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
-    channels = case.spec.channels
+    table, channels = without_wild_start(case, table), case.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
     screened = [name for name, item in channels.items() if item.screened]
     return fill_table(table, interpolated, screened)
@@ -292,11 +358,13 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
     return (stamp - since_1970(origin)) * clock.second
 
 
-def source_of(case: CaseContent, data: Data, position: str) -> RowSource:
+def source_of(
+    case: CaseContent, data: Data, position: str, passwords: Mapping[str, str] | None = None
+) -> RowSource:
     """Return the source of the rows of a case, from a position on."""
     match data:
         case None:
-            return _own_source(case, position)
+            return _own_source(case, position, passwords or {})
         case str():
             return _file_source(case, Path(data), position)
         case Iterable():
@@ -304,12 +372,12 @@ def source_of(case: CaseContent, data: Data, position: str) -> RowSource:
     return data
 
 
-def _own_source(case: CaseContent, position: str) -> RowSource:
+def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) -> RowSource:
     """Return the source that the case names: a broker, a server or a file."""
     spec = case.spec.data
     if spec.mqtt is not None:
         topics = {**dict.fromkeys(spec.mqtt.rows), **spec.mqtt.columns}
-        return MqttSource(_broker(case, spec.mqtt, "data.mqtt"), topics, spec.times[0])
+        return MqttSource(_broker(case, spec.mqtt, "data.mqtt", passwords), topics, spec.times[0])
     if spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
@@ -319,7 +387,7 @@ def _own_source(case: CaseContent, position: str) -> RowSource:
             spec.times[0],
             interval=case.positive(spec.opcua.interval, "s", "data.opcua.interval"),
             username=spec.opcua.username,
-            password=_password(case, spec.opcua.password_env, "data.opcua"),
+            password=passwords.get("data.opcua"),
         )
     return _file_source(case, data_file(case), position)
 
@@ -337,12 +405,12 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
     )
 
 
-def publishers_of(case: CaseContent) -> list[Sink]:
+def publishers_of(case: CaseContent, passwords: Mapping[str, str]) -> list[Sink]:
     """Return the sinks that a case names."""
     spec = case.spec.output.mqtt
     if spec is None:
         return []
-    return [MqttSink(_broker(case, spec, "output.mqtt"), spec.topic)]
+    return [MqttSink(_broker(case, spec, "output.mqtt", passwords), spec.topic)]
 
 
 def source_text(case: CaseContent) -> str:
@@ -358,22 +426,45 @@ def source_text(case: CaseContent) -> str:
     return str(spec.file or spec.reader)
 
 
-def _broker(case: CaseContent, spec: BrokerSpec, key: str) -> Broker:
+def _broker(case: CaseContent, spec: BrokerSpec, key: str, passwords: Mapping[str, str]) -> Broker:
     return Broker(
         host=spec.host,
         port=spec.port,
         client_id=spec.client_id or f"livepde-{case.name}",
         username=spec.username,
-        password=_password(case, spec.password_env, key),
+        password=passwords.get(key),
         tls=spec.tls,
         ca_file=spec.ca_file,
         session=round(case.positive(spec.session, "s", f"{key}.session")),
     )
 
 
-def _password(case: CaseContent, variable: str | None, key: str) -> str | None:
-    if variable is None:
-        return None
+def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
+    """Return the passwords of a case by the key of their connection, before any is opened.
+
+    Parameters
+    ----------
+    own
+        Whether the case's own source is used.
+    allowed
+        Environment variables that may be sent, besides those whose names begin with LIVEPDE_.
+    """
+    spec, allowed = case.spec, set(allowed)
+    sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}
+    connections = {**sources, "output.mqtt": spec.output.mqtt}
+    named = {key: one.password_env for key, one in connections.items() if one is not None}
+    return {key: _password(case, name, key, allowed) for key, name in named.items() if name}
+
+
+def _password(case: CaseContent, variable: str, key: str, allowed: Collection[str]) -> str:
+    # A case of somebody else must not send any secret of this machine to a server that it names.
+    own = variable.startswith(PASSWORDS) and variable != TOKEN
+    if not (own or variable in allowed):
+        raise case.error(
+            f"{key}.password_env",
+            f"the environment variable {variable} would be sent to a server that the case names; "
+            f"if you trust it, add --allow-env {variable}, or let the name begin with {PASSWORDS}.",
+        )
     if variable not in os.environ:
         raise case.error(
             f"{key}.password_env", f"the environment variable {variable} is not set; set it."
@@ -412,5 +503,6 @@ def policy_of(case: CaseContent) -> Policy:
         tolerance=duration(spec.tolerance, "intake.tolerance"),
         leap=leap,
         repeated=spec.repeated,
+        shift=duration(spec.shift, "intake.shift"),
         channels=habits,
     )

@@ -8,26 +8,32 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from livepde.cases.case import Case, Prepared
 from livepde.cases.data import (
+    START,
     Data,
     check_hours,
     limits_of,
+    passwords_of,
     policy_of,
     publishers_of,
     read_data,
     source_of,
+    suspect_start,
+    wild_start,
 )
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
-from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed, shifted
+from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.streams.clock import since_1970
+from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
 
@@ -57,6 +63,9 @@ class LiveCase:
     pace
         Speed of the replay of a finished file, relative to real time; infinity: as fast as
         possible.
+    allow_env
+        Environment variables that the case may use as passwords, besides those whose names begin
+        with LIVEPDE_.
 
     Attributes
     ----------
@@ -79,7 +88,13 @@ class LiveCase:
     """
 
     def __init__(
-        self, case: Case, data: Data = None, *, path: Path | None = None, pace: float = math.inf
+        self,
+        case: Case,
+        data: Data = None,
+        *,
+        path: Path | None = None,
+        pace: float = math.inf,
+        allow_env: Iterable[str] = (),
     ) -> None:
         if not pace > 0.0:
             raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
@@ -89,6 +104,7 @@ class LiveCase:
         self.why = ""
         # An invalid case is refused here, before anything is connected.
         self._policy, self._limits = policy_of(case), limits_of(case)
+        self._passwords = passwords_of(case, data is None, allow_env)
         self._path = path
         self._journal: Journal | None = None
         self._intake: Intake | None = None
@@ -136,14 +152,14 @@ class LiveCase:
             The source ended before the first sample.
         """
         stopping = stopping or threading.Event()
-        sinks = [*sinks, *publishers_of(self.case)]
+        sinks = [*sinks, *publishers_of(self.case, self._passwords)]
         for sink in sinks:
             self._stack.callback(sink.close)
         waiting: Sequence[Ready] = ()
         irregular: dict[tuple[str, str], Remark] = {}
         if self._journal is not None and self._journal.first is not None:
             first = self._journal.first
-            self.prepared = self.case.begin(Sample(first.t, first.values), self._start)
+            self.prepared = self.case.begin(Sample(t=first.t, z=first.values), self._start)
         else:
             found = self._begun(stopping, irregular)
             if found is None:
@@ -188,16 +204,18 @@ class LiveCase:
         LOG.info("waits for the first sample")
         why = told = "no sample came"
         heard = time.monotonic()
-        while not (stopping.is_set() or self._feed.done):
-            found = list(self._feed.poll(LOOK))
+        found: list[Ready] = []
+        while not stopping.is_set() and (found or not self._feed.done):
+            new = list(self._feed.poll(LOOK))
             heard = self._listened(heard)
-            remarks, known = self._feed.remarks(found), set(irregular)
-            for remark in remarks:
+            remarks, known = self._feed.remarks(new), set(irregular)
+            found += new
+            for remark in [*remarks, *self._without_wild(found)]:
                 gather(irregular, remark)
-            while found:
+            while found and not self._too_few(found):
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 try:
-                    return self.case.begin(Sample(found[0].t, values), self._start), found
+                    return self.case.begin(Sample(t=found[0].t, z=values), self._start), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
                 self.why = f"the run cannot begin yet: {why}"
@@ -214,6 +232,22 @@ class LiveCase:
         first = next(iter(irregular.values()), None)
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
         raise DataError(f"{self.case.path}: {why}{wrong}.")
+
+    def _too_few(self, found: Sequence[Ready]) -> bool:
+        """Return whether more rows have to show if the first one is wild, as it looks."""
+        few = not self._feed.done and len(found) <= FEWEST
+        return few and suspect_start(self.case, found[0].values)
+
+    def _without_wild(self, found: list[Ready]) -> list[Remark]:
+        """Blank wild values of the first rows, and return remarks on them."""
+        if len(found) <= FEWEST:
+            return []
+        remarks = []
+        for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):
+            message = f"{name} = {found[k].values[name]:g} is far off all that follows"
+            remarks.append(Remark(START, name, message))
+            found[k] = replace(found[k], values=found[k].values | {name: math.nan})
+        return remarks
 
     def _listened(self, heard: float) -> float:
         """Note whether the source is silent, and return when something came from it last."""
@@ -235,7 +269,7 @@ class LiveCase:
             last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
         self._intake, position = self._new_intake()
-        return Gathered(source_of(case, data, position), self._intake)
+        return Gathered(source_of(case, data, position, self._passwords), self._intake)
 
     def _reads_all(self, data: Data, named: str | None) -> bool:
         """Return whether all rows are read at once, not followed one by one."""
@@ -258,12 +292,11 @@ class LiveCase:
         position = ""
         if journal is not None:
             begun = journal.layout.attrs.get("origin")
-            shift, position = shifted(journal.position)
+            position = journal.position
             options |= {
                 "origin": _seconds(begun),
                 "dates": begun is not None,
                 "last": journal.last,
-                "shift": shift,
                 "recent": [(one.t, one.values) for one in journal.recent(RECENT)],
             }
         intake = Intake(case.columns, case.clock, self._policy, **options)

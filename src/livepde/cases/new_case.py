@@ -19,6 +19,7 @@ from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
+from livepde.streams.sentinels import sentinels
 
 __all__ = [
     "PLACES",
@@ -138,7 +139,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
-        *_inline("data", _data(table, folder)),
+        *_inline("data", _data(table, folder), _missing_told(table)),
         *_contents(table),
         *_unknowns(equation, given),
         *_inputs(found),
@@ -221,7 +222,25 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
     if others:
         own = [{key: v for key, v in other.items() if v != first.get(key)} for other in others]
         found["file"] = [first["file"], *(o if len(o) > 1 else o["file"] for o in own)]
+    if missing := _missing(table):
+        found["missing"] = missing
     return found
+
+
+def _missing(table: Measured) -> list[float]:
+    """Return the values that stand for no reading in some column, and are usual in no other."""
+    columns = table.columns.values()
+    found = {one.value for values in columns for one in sentinels(values)}
+
+    def usual(value: float, values: Array) -> bool:
+        return value in values and value not in {one.value for one in sentinels(values)}
+
+    return sorted(v for v in found if not any(usual(v, values) for values in columns))
+
+
+def _missing_told(table: Measured) -> str:
+    """Return a comment on the values that count as missing; empty without."""
+    return "missing: far outside the other values; check them" if _missing(table) else ""
 
 
 def _written(table: Measured, folder: Path) -> dict[str, Any]:

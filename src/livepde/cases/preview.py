@@ -285,10 +285,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
 
 def _moves(model: Model, law: SensitivityLaw) -> bool:
     """Return whether an unknown changes in time, by the law or by its own evolution."""
-    return bool(law.drift) or any(
-        unknown.evolution.growth(1.0, unknown.prior.latent_std).any()
-        for unknown in model.parameter_space.unknowns.values()
-    )
+    return bool(law.drift or model.latent.random)
 
 
 def _information(
@@ -345,6 +342,11 @@ def _candidates(prepared: Prepared) -> tuple[Any, Array, Any]:
     """Return the readout matrix at candidates, positions (d, candidates), and part of the state."""
     case = prepared.case
     block, part = case.model.state_space.component(case.observation.of)
+    if block.vector:
+        raise ConfigurationError(
+            "advice on sensors requires a state that is one number at each point; this one is a "
+            "vector."
+        )
     # -(-n // m) is n / m, rounded up.
     every = -(-block.field.mesh.p.shape[1] // MOST_CANDIDATES)
     return block.at_vertices[::every], block.field.mesh.p[:, ::every], part

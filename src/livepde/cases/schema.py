@@ -313,6 +313,7 @@ class IntakeSpec(Spec):
     tolerance: Quantity = Policy.tolerance
     leap: Quantity | None = None
     repeated: Literal["first", "last"] = Policy.repeated
+    shift: Quantity = Policy.shift
     overflow: Literal["queue", "merge", "drop"] = Backlog.overflow
     queue: PositiveInt = Backlog.length
     silence: Quantity | None = None
@@ -403,6 +404,7 @@ class ChannelSpec(Spec):
     positions: Name | None = None
     quantity: str | None = None
     of: Name | None = None
+    component: NonNegativeInt | None = None
     noise: Quantity | None = None
     noise_column: Name | None = None
     unit: str | None = None
@@ -414,6 +416,11 @@ class ChannelSpec(Spec):
     valid: Pair | None = None
     missing: Literal["interpolate", "hold", "skip"] | None = None
     spikes: Literal["refuse", "keep"] | None = None
+
+    @property
+    def is_point(self) -> bool:
+        """Whether the channel has a position, or is a family of channels with one each."""
+        return (self.at, self.each, self.positions) != (None, None, None)
 
     @property
     def drives(self) -> bool:
@@ -457,8 +464,7 @@ class ChannelSpec(Spec):
             raise ValueError('each needs column = a name with {} for the number, as "u_{}"')
         if self.positions is not None and (self.columns or "{}" not in (self.column or "{}")):
             raise ValueError('positions takes column = a name with {} for that of a row, as "T_{}"')
-        places = (self.at, self.each, self.positions)
-        if self.at_std is not None and places == (None, None, None):
+        if self.at_std is not None and not self.is_point:
             raise ValueError("at_std belongs to at = position")
         return self
 
@@ -470,6 +476,8 @@ class ChannelSpec(Spec):
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and not sensor:
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
+        if self.component is not None and not (sensor and self.is_point):
+            raise ValueError("component requires a sensor at a position")
         if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
             raise ValueError(
                 'missing = "interpolate" and spikes belong to boundary and input channels; '

@@ -6,12 +6,14 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
+from livepde.streams.sentinels import sentinels
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
@@ -50,7 +52,12 @@ def check(
     samples: DataTable = prepared.raw  # type: ignore[assignment]
     _show_data(console, loaded, prepared, samples)
     failed = _show_checks(console, prepared)
-    notes = [*loaded.notes, *_refused(prepared), *_show_preview(console, prepared)]
+    notes = [
+        *loaded.notes,
+        *_refused(prepared),
+        *_sentinels(loaded, samples),
+        *_show_preview(console, prepared),
+    ]
     if advise:
         _show_advice(console, prepared)
     for note in notes:
@@ -63,12 +70,34 @@ def check(
 def _refused(prepared: Prepared) -> list[str]:
     """Return sentences on values of input channels that a run will refuse."""
     remarks = getattr(prepared.stream, "remarks", {})
-    return [
+    wild = [
+        f"{number} first values of {name} are far off all that follow, and off the other channels: "
+        "a run counts them as missing."
+        for (kind, name), number in remarks.items()
+        if kind == "start"
+    ]
+    return wild + [
         f"{number} values of {name} are far off those before and after: a run refuses them as "
         'spikes; channels.NAME.spikes = "keep" takes them.'
         for (kind, name), number in remarks.items()
         if kind == "spike"
     ]
+
+
+def _sentinels(case: Case, samples: DataTable) -> list[str]:
+    """Return sentences on values that may stand for no reading, as they are in the file."""
+    said: list[str] = []
+    for name, values in zip(samples.names, samples.values.T, strict=True):
+        column = case.columns[name]
+        if len(column.names) > 1:  # a mean is none of the values in the file
+            continue
+        said += [
+            f"{name}: {found.value:g} occurs {found.times} times, far outside the other values "
+            f"({found.low:.4g} to {found.high:.4g}). If it stands for no reading, add it to "
+            f"`data.missing`; else state the range with `channels.{name}.valid`."
+            for found in sentinels(np.round((values - column.offset) / column.factor, 9))
+        ]
+    return said
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:

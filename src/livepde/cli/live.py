@@ -53,6 +53,8 @@ class LiveOptions:
         Secret that visitors need.
     estimates
         Print each estimate as a line of JSON.
+    allow_env
+        Environment variables that the case may use as passwords.
     """
 
     data: str | Iterable[str] | None = None
@@ -62,6 +64,7 @@ class LiveOptions:
     page: str | None = None
     token: str = ""
     estimates: bool = False
+    allow_env: tuple[str, ...] = ()
 
     @property
     def pace(self) -> float:
@@ -96,7 +99,9 @@ def run_live(
     from livepde.cases.live_case import LiveCase
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
 
-    wiring = stack.enter_context(LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace))
+    wiring = stack.enter_context(
+        LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
+    )
     health, stopping = _LiveHealth(wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CaseArgument",
     "CodeOption",
+    "EnvOption",
     "ForceOption",
     "JsonOption",
     "OutOption",
@@ -50,6 +51,15 @@ CodeOption = Annotated[
     bool,
     typer.Option(
         "--allow-code", help="Load the equation or reader of your own that the case names."
+    ),
+]
+EnvOption = Annotated[
+    list[str] | None,
+    option(
+        "Environment variable that the case may use as a password (`password_env`), if its name "
+        "does not begin with LIVEPDE_. Repeat it for more.",
+        "--allow-env",
+        metavar="NAME",
     ),
 ]
 SetOption = Annotated[

@@ -171,10 +171,11 @@ def _compared(before: xr.Dataset, after: xr.Dataset) -> list[Table]:
         for name, item in found.items()
         if name in errors
     ]
+    free = "With the cause free (± std. dev., of medians to first order)"
     title = "RMSE one step ahead, second half of the samples"
     columns = ("unknown", "run", "cause free", "moved, std. dev.")
     return [
-        Table("With the cause free (± one standard deviation)", columns, [*judged, *rows]),
+        Table(free, columns, [*judged, *rows]),
         Table(title, ("channel", "run", "cause free"), channels),
     ]
 

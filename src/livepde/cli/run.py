@@ -19,6 +19,7 @@ from livepde.cli.live import LiveOptions, run_live
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
+    EnvOption,
     JsonOption,
     OutOption,
     SetOption,
@@ -110,6 +111,7 @@ def run(
     log: Annotated[LogKind, typer.Option(help="How a live run writes its log.")] = LogKind.text,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
+    allow_env: EnvOption = None,
     settings: SetOption = None,
 ) -> None:
     """Identify: take every sample of a case, and write a run directory.
@@ -128,7 +130,8 @@ def run(
     goes_on = own or source is sys.stdin
     # What is sent to a run that is gone on with begins anywhere: times count from the first start.
     live = own or realtime or (resume and source is sys.stdin)
-    how = LiveOptions(source, goes_on, speed, listen, watch, token, estimates)
+    allowed = tuple(allow_env or ())
+    how = LiveOptions(source, goes_on, speed, listen, watch, token, estimates, allowed)
     folder = _run_directory(loaded, out, resume)
     _refuse(how, live, as_json)
     write = partial(writer_of, loaded, folder, settings or (), resume, ["livepde", *sys.argv[1:]])
@@ -214,7 +217,12 @@ def writer_of(
 
     if resume and (folder / RECORD).exists():
         return RunWriter.reopen(
-            folder, version=__version__, command=command, case=loaded.text, settings=settings
+            folder,
+            version=__version__,
+            command=command,
+            case=loaded.text,
+            settings=settings,
+            original=loaded.original,
         )
     return RunWriter.create(
         folder,
@@ -283,7 +291,15 @@ def concluded(
     draw
         Whether to draw figures.
     """
-    from livepde.runs import arrivals, checks_of, input_findings, tables, verdict, verdict_table
+    from livepde.runs import (
+        arrivals,
+        checks_of,
+        clock_findings,
+        input_findings,
+        tables,
+        verdict,
+        verdict_table,
+    )
     from livepde.runs.outcome import attempted
     from livepde.verdict import Verdict
 
@@ -297,7 +313,8 @@ def concluded(
     driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
-        return verdict(dataset).with_findings(input_findings(driven.journal, driving))
+        found = [*clock_findings(driven.journal), *input_findings(driven.journal, driving)]
+        return verdict(dataset).with_findings(found)
 
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())

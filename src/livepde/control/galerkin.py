@@ -158,7 +158,8 @@ class GalerkinReduction:
         return np.column_stack([K, driven + K @ (self.test @ fixed)])
 
     def check(self) -> None:
-        """Raise `ModelError` if the model is not linear in its unknown numbers."""
+        """Raise `ModelError` if unknown numbers do not enter linearly, or vanish from the model."""
+        self._check_effects()
         # The parts, made at the ends of single numbers, must give the system where all are halfway.
         both = self.q + 0.5 * sum((q - self.q for q in self.values()[1:]), np.zeros_like(self.q))
         expected = np.tensordot(np.array([1.0, *both[self.rows]]), self.parts(), axes=1)
@@ -169,6 +170,21 @@ class GalerkinReduction:
                 "model in which they are parameters. Write it linear in them: a LogNormal prior of "
                 "each is no hindrance."
             )
+
+    def _check_effects(self) -> None:
+        """Raise `ModelError` if an unknown number drops out by linearisation."""
+        if self.model.affine:
+            return
+        free = self.model.X.free
+        rng = np.random.default_rng(0)
+        elsewhere = self.u + free * (1.0 + np.abs(self.u).max()) * rng.standard_normal(len(free))
+        here, there = self.linearisation, replace(self.linearisation, u=elsewhere)
+        for label, q in zip(self.model.parameter_space.labels, self.values()[1:], strict=True):
+            if there.differ(self.q, q) and not here.differ(self.q, q):
+                raise ModelError(
+                    f"reduce: '{label}' has no effect on the model linearised at this state, as a "
+                    "coefficient of u has none at u = 0: name another operating point with u=."
+                )
 
     def output(self, observed: Observed) -> Output:
         """Return the output equation of an observation in reduced coordinates."""

@@ -88,6 +88,15 @@ class Linearisation:
         values = np.array([self.inputs[name] for name in self.model.channels])
         return Linear(K, E, K @ self.u - known - E @ values)
 
+    def differ(self, one: Array, other: Array) -> bool:
+        """Return True if the systems for two parameters differ."""
+        free = self.model.X.free
+        first, second = self.at(one), self.at(other)
+        rows = np.repeat(free, np.diff(first.K.indptr))
+        pairs = ((rows * first.K.data, rows * second.K.data), (first.E.T * free, second.E.T * free))
+        known = (first.f * free, second.f * free)
+        return any(_differ(*pair) for pair in (*pairs, known))
+
     def boundary(self) -> tuple[Array, Array]:
         """Return the lifting of boundary channels, (n, channels), and of known values, (n,).
 

@@ -26,7 +26,7 @@ Future: TypeAlias = Mapping[str, ArrayLike]
 """Name -> a number that holds, or one for each coming period."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Action:
     """Control action of a sample: inputs to apply, with the estimate behind them.
 
@@ -182,12 +182,12 @@ class Loop:
         self._before, self._memory = decision.inputs, decision.memory
         y = model.outputs(known.x, model.values(channels))
         return Action(
-            t,
-            dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
-            known,
-            dict(zip(model.outputs.names, y.tolist(), strict=True)),
-            decision.status,
-            getattr(self.estimator, "estimate", None),
+            t=t,
+            inputs=dict(zip(model.controls, decision.inputs.tolist(), strict=True)),
+            known=known,
+            outputs=dict(zip(model.outputs.names, y.tolist(), strict=True)),
+            status=decision.status,
+            estimate=getattr(self.estimator, "estimate", None),
         )
 
     def _separated(self, z: Any, inputs: Mapping[str, float]) -> tuple[Any, dict[str, float]]:

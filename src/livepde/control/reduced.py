@@ -339,15 +339,17 @@ def reduce(
         Rates (reciprocal times) at which responses are also exact: take 1/period if an output lies
         where a control acts, so that it responds at once.
     u, q, inputs
-        Linearisation point, as u0 and q0 of `Identifier`: default zero, the prior, and zero. The
-        value of an unknown field is taken from q; see `ReducedModel.about`.
+        Operating point, as u0 and q0 of `Identifier`: default zero, the prior, and zero. A model
+        that is not affine in u is linearised there, and u has no default. The value of an unknown
+        field is taken from q; see `ReducedModel.about`.
 
     Raises
     ------
     ModelError
-        The model depends on time, or is not linear in unknown numbers or channels.
+        The model depends on time, or is not linear in unknown numbers or channels; or an unknown
+        number has no effect on the model linearised at u.
     ConfigurationError
-        A control is not a channel of the model.
+        A control is not a channel of the model, or the model is to be linearised and u is missing.
     """
     chosen = [name for name in model.channels if name in controls]
     if isinstance(controls, str) or not 0 < len(controls) == len(chosen):
@@ -361,6 +363,11 @@ def reduce(
     for rate in rates:
         if not 0.0 < rate < np.inf:
             raise ConfigurationError(f"reduce: rates must be positive numbers; got {rate}.")
+    if u is None and not model.affine:
+        raise ConfigurationError(
+            "reduce: the model is not affine in its state, so that it is linearised at an "
+            "operating point: name that with u=, a number, a function of x or coefficients."
+        )
     frame = GalerkinReduction.linearised(model, outputs, sensors, u, q, inputs)
     linearisation = frame.linearisation
     linearisation.check(frame.q)

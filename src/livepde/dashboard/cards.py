@@ -316,14 +316,15 @@ def _sensor_table(data: xr.Dataset) -> Any:
             name,
             "used" if role == "assimilated" else role,
             f"{last[name]:+.3g}" if math.isfinite(last[name]) else "missing",
+            refused or "–",
             f"{float(errors.mean()):+.2g}" if len(errors) else "–",
             f"{float(np.sqrt((errors**2).mean())):.3g}" if len(errors) else "–",
         )
-        for name, (role, errors, _) in channel_errors(data).items()
+        for name, (role, errors, _, refused) in channel_errors(data).items()
     ]
     unit = labelled("", str(data["innovation"].attrs.get("units", ""))).strip()
     title = f"Measured minus expected {unit}".rstrip()
-    return _table(title, ("channel", "role", "last", "mean", "root mean square"), rows)
+    return _table(title, ("channel", "role", "last", "refused", "mean", "root mean square"), rows)
 
 
 def _when(data: xr.Dataset | None, t: float | None) -> str:

@@ -93,7 +93,7 @@ def overview_table(views: Mapping[str, View]) -> Any:
     seen = {name: views[name].look() for name in list(views)[:MOST_RUNS]}
     labels = _labels(one.dataset for one in seen.values() if one.dataset is not None)
     shown = list(labels)[:MOST_UNKNOWNS]
-    titles = ["run", "status", "verdict", "newest", *(f"{labels[k]} ± std. dev." for k in shown)]
+    titles = ["run", "status", "verdict", "newest", *(labels[k] for k in shown)]
     levels = {name: cards.gravest(one) for name, one in seen.items()}
     order = sorted(seen, key=lambda name: (ORDER.index(levels[name][0]), name))
     rows = [html.Tr(_cells(name, seen[name], levels[name], shown)) for name in order]
@@ -104,11 +104,18 @@ def overview_table(views: Mapping[str, View]) -> Any:
 
 
 def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
-    """Return unknown -> its name with the unit; those of the last dataset come first."""
+    """Return unknown -> title of its column; those of the last dataset come first."""
     found: dict[str, str] = {}
     for data in datasets:
-        found = {k: labelled(k, unit_of(data, k)) for k in scalars(data)} | found
+        found = {k: _title(data, k) for k in scalars(data)} | found
     return found
+
+
+def _title(data: xr.Dataset, label: str) -> str:
+    """Return the name of an unknown with its unit, and what stands in its column."""
+    name = labelled(label, unit_of(data, label))
+    first_order = "comment" in data[f"{label}_std"].attrs
+    return f"{name}, median ± first-order std. dev." if first_order else f"{name} ± std. dev."
 
 
 def _cells(name: str, one: RunView, level: tuple[cards.Level, str], shown: list[str]) -> list[Any]:

@@ -41,6 +41,7 @@ from livepde.plots.dataset import (
     scalars,
     scored_from,
 )
+from livepde.records import used_errors
 from livepde.runs.summary import shown
 
 __all__ = ["SECTIONS", "Panel", "panels"]
@@ -274,7 +275,7 @@ def residuals(
     """
     data = _bounded(data)
     figure, axis = over_time(data, unit_label(data, variable), at)
-    t, errors = axis.values(data["time"].values), data[variable].values
+    t, errors = axis.values(data["time"].values), used_errors(data, variable, dimension)
     names = [str(name) for name in data[dimension].values]
     mode = "lines" if len(t) > 60 else "lines+markers"
     if len(names) <= MOST_LINES:

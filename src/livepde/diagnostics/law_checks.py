@@ -259,6 +259,10 @@ class _FragileScheme(Scheme):
     scheme: Scheme
     calls: list[str]  # empty: not armed; shared with the law, since both are frozen
 
+    @property
+    def weight(self) -> float:
+        return self.scheme.weight
+
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         if self.calls:
             self.calls.append("called")

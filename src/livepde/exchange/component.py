@@ -113,4 +113,4 @@ class Component:
         self._first = first
         names = [port.name for port in self.process.inputs]
         z = dict(zip(names, first[1:].tolist(), strict=True))
-        return self.process.begin(Sample(float(first[0]), z))
+        return self.process.begin(Sample(t=float(first[0]), z=z))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -486,6 +486,26 @@ class FieldBlock(Block):
             else:
                 u[dofs] = value
         return u
+
+    def traces(self, value: Any, coefficients: Array) -> Iterator[tuple[str, Array]]:
+        """Yield each channel of a Dirichlet condition, and the values of a function there.
+
+        Parameters
+        ----------
+        value, coefficients
+            The function as it was given, and its coefficients.
+        """
+        # A projection differs from a given function of x at the boundary.
+        exact = callable(value) and not self.vector
+        for k, (dofs, condition) in enumerate(self.conditions):
+            if not isinstance(condition, Channel):
+                continue
+            # Where two boundaries meet, the value may be that of the other condition.
+            others = [item for j, (item, _) in enumerate(self.conditions) if j != k]
+            own = np.setdiff1d(dofs, np.concatenate([[], *others]))
+            own = own if len(own) else dofs
+            x = self.doflocs[:, own]
+            yield condition.name, value(x) + 0.0 * x[0] if exact else coefficients[own]
 
     def prolongation(self, finer: FieldBlock) -> sp.csr_array:
         """Return the matrix from coefficients to those of the same function on a finer mesh.

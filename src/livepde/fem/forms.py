@@ -51,6 +51,10 @@ SMALL = 1e-3
 # Relative step of a central difference of fourth order: its truncation and rounding errors are
 # about 1e-13.
 SHIFT = 1e-3
+# Sizes of random arguments with which an integrand is probed: up to 1e9, so that saturation and
+# thresholds far from one are detected; and times, since a term may act for a while only.
+MAGNITUDES = (1e-3, 1.0, 1e3, 1e6, 1e9)
+PROBED = (0.0, 0.3, 1.0, 1e3, 1e6)
 # Number of products of local functions up to which a trilinear form is stored as a sparse matrix.
 # Beyond, element tensors need less memory.
 LARGEST_TENSOR = 5_000_000
@@ -281,7 +285,7 @@ class Form(FormMatrices):
     def _affine(self, slot: str, homogeneous: bool) -> bool:
         """Return True if the form is affine (linear, if homogeneous) in an argument."""
         # Probing has a fixed seed: whether a form counts as affine must not differ between two
-        # runs. Magnitudes up to 1e9 detect saturation and thresholds far from one.
+        # runs.
         rng = np.random.default_rng(1)
         probe = Moment(0.3, self._inputs)
         for term in (piece for whole in self.terms for piece in whole.samples()):
@@ -294,7 +298,7 @@ class Form(FormMatrices):
                 density, _ = term.evaluate({**values, slot: x}, probe)
                 return np.asarray(density)
 
-            for scale in (1e-3, 1.0, 1e3, 1e6, 1e9):
+            for scale in MAGNITUDES:
                 a, b = scale * rng.standard_normal((2, *values[slot].shape))
                 with np.errstate(all="ignore"):
                     zero = at(0 * a)
@@ -307,6 +311,45 @@ class Form(FormMatrices):
                 if not finite.any() or np.abs(change[finite]).max() > 1e-11 * size:
                     return False
         return True
+
+    def differentiates(self, slot: str, test: str = "v") -> bool:
+        """Return True if, integrated by parts, a form contains derivatives of an argument.
+
+        Its integrand then reads a derivative of the argument, or the argument itself in a term with
+        a derivative of the test function, such as the flux q u in `q * u * grad(v)`. Probed at
+        several magnitudes and times, with value and derivatives independent of each other.
+        """
+        rng = np.random.default_rng(2)
+        return any(
+            self._reads(term, slot, test, scale, rng)
+            for whole in self.terms
+            for term in whole.samples()
+            for scale in MAGNITUDES
+        )
+
+    def _reads(
+        self, term: _Term, slot: str, test: str, scale: float, rng: np.random.Generator
+    ) -> bool:
+        """Return True if derivatives of an argument matter at one magnitude."""
+
+        def drawn(local: LocalSpace) -> Array:
+            return rng.standard_normal((local.components, *local.shape))
+
+        values = {key: drawn(local) for key, local in term.spaces.items()}
+        here, there = scale * values[slot], scale * drawn(term.spaces[slot])
+        steep = np.where(term.spaces[slot].derivatives[:, None, None], there, here)
+        flux = np.where(term.spaces[test].derivatives[:, None, None], values[test], 0.0)
+
+        def differ(one: Array, other: Array, v: Array, t: float) -> bool:
+            moment = Moment(t, self._inputs)
+            pair = ({**values, slot: u, test: v} for u in (one, other))
+            change = np.subtract(*(term.evaluate(given, moment)[0] for given in pair))
+            return bool(change[np.isfinite(change)].any())  # elsewhere is nothing to compare
+
+        with np.errstate(all="ignore"):  # roots and logarithms of random numbers
+            return any(
+                differ(here, steep, values[test], t) or differ(here, there, flux, t) for t in PROBED
+            )
 
     @property
     def _trilinear(self) -> bool:

@@ -93,6 +93,11 @@ class Latent:
         return any(p.evolution.moves for p in self.parts.values())
 
     @cached_property
+    def random(self) -> tuple[str, ...]:
+        """Names of the unknowns that move at random."""
+        return tuple(name for name, p in self.parts.items() if p.evolution.growth(1.0, 1.0).any())
+
+    @cached_property
     def V(self) -> sp.csr_array:
         """Summation matrix of the visible components, shape (m, dim)."""
         blocks = [
@@ -266,6 +271,10 @@ class Composed(FormMatrices):
     def linear_in_parameter(self) -> bool:
         """True if the form is linear in the latent coefficients."""
         return self.latent.linear and self.form.linear_in_parameter
+
+    def differentiates(self, slot: str, test: str = "v") -> bool:
+        """Return True if, integrated by parts, the form contains derivatives of an argument."""
+        return self.form.differentiates(slot, test)
 
     def _physical(self, coefficients: dict[str, Array]) -> dict[str, Array]:
         if "q" not in coefficients:

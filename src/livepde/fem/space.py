@@ -13,12 +13,12 @@ import scipy.sparse as sp
 
 from livepde.errors import SpaceError
 from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
-from livepde.fem.fields import Declaration, Piecewise, Unknown, declared
+from livepde.fem.fields import Declaration, Piecewise, Scalar, Unknown, declared
 from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
-from livepde.linalg import Array, IntArray, compact
+from livepde.linalg import Array, IntArray, Mask, compact
 
-__all__ = ["FunctionSpace", "LocalSpace", "Named"]
+__all__ = ["FunctionSpace", "LocalSpace", "Named", "NamedUnknowns"]
 
 
 class Named(SimpleNamespace):
@@ -55,6 +55,11 @@ class LocalSpace:
                 owners += [(local, columns, name, k) for k in range(size)]
             left = columns.stop
         return owners
+
+    @cached_property
+    def derivatives(self) -> Mask:
+        """Mask of the components of fields that are derivatives, shape (components,)."""
+        return np.array([name != "value" for _, _, name, _ in self._owners])
 
     def component(self, k: int) -> tuple[slice, Array]:
         """Return the slice of local functions of a component, and its values (local, E, P)."""
@@ -192,6 +197,42 @@ def _parts(density: Array, axes: tuple[int, ...]) -> Iterator[tuple[tuple[int, .
             yield index, density[index]
 
 
+@dataclass(frozen=True, kw_only=True)
+class NamedUnknowns:
+    """Names of unknowns, their places among the coefficients, and their priors.
+
+    An estimate that is pickled holds this instead of a `FunctionSpace`, whose functions (of
+    regions, of boundary values) cannot be pickled.
+
+    Attributes
+    ----------
+    labels, parts
+        As of a `FunctionSpace`.
+    fields
+        Names of the unknowns that are fields, as keys.
+    unknowns
+        Name -> an unknown number with the same prior, evolution and unit.
+    """
+
+    labels: Mapping[str, int]
+    parts: Mapping[str, slice]
+    fields: Mapping[str, None]
+    unknowns: Mapping[str, Scalar]
+
+    @property
+    def described(self) -> NamedUnknowns:
+        """Itself."""
+        return self
+
+    def part(self, name: str) -> slice:
+        """Return the slice of an unknown in the coefficients."""
+        return self.parts[name]
+
+    def unknown_of(self, label: str) -> Scalar:
+        """Return the unknown of a scalar label."""
+        return self.unknowns[label if label in self.unknowns else base_name(label)]
+
+
 @dataclass(frozen=True, eq=False)
 class FunctionSpace:
     """A product of unknowns, each a field, a scalar, or values per region.
@@ -289,6 +330,21 @@ class FunctionSpace:
             for k, label in enumerate(block.labels(name)):
                 found[label] = start + k
         return found
+
+    @cached_property
+    def described(self) -> NamedUnknowns:
+        """What a reader of estimates needs of the space, without functions and meshes."""
+        return NamedUnknowns(
+            labels=self.labels,
+            parts=self.parts,
+            fields=dict.fromkeys(self.fields),
+            unknowns={
+                name: Scalar(
+                    each.prior, evolution=each.evolution, unit=each.unit, within=each.within
+                )
+                for name, each in self.unknowns.items()
+            },
+        )
 
     @cached_property
     def fields(self) -> dict[str, FieldBlock]:

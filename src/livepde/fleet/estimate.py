@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +17,7 @@ from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import NOTE, STATUS_CODES, Layout
-from livepde.result import Estimate
+from livepde.result import Estimate, kept
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,7 +27,7 @@ __all__ = ["FleetEstimate", "FleetResult"]
 MEMBER = "member"  # dimension of the dataset
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FleetEstimate:
     """Estimates of all members at one time.
 
@@ -48,7 +48,8 @@ class FleetEstimate:
     diagnose
         Function that returns the diagnostics of the law, numbers of shape (members,).
     held
-        Input channels whose last value was held -> which members had none, shape (members,).
+        Input channels whose last value was held, or at the first sample the first one -> which
+        members had none, shape (members,).
     space
         The unknowns.
     belief
@@ -66,6 +67,17 @@ class FleetEstimate:
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the values themselves, for pickle and copies; as of an `Estimate`."""
+        each = tuple(map(self.belief, range(len(self.members))))
+        own = {
+            "read": partial(kept, self.beliefs),
+            "diagnose": partial(kept, self.diagnostics),
+            "belief": each.__getitem__,
+            "space": self.space.described,
+        }
+        return vars(self) | own
 
     @cached_property
     def beliefs(self) -> Beliefs:
@@ -119,7 +131,7 @@ class FleetEstimate:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Row:
     """Record of an estimate: numbers, and no state."""
 
@@ -154,13 +166,13 @@ class FleetResult:
         codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
         self._rows.append(
             _Row(
-                estimate.t,
-                estimate.parameters,
-                estimate.innovation,
-                estimate.withheld_error,
-                np.array(codes, dtype=np.int32),
-                estimate.steps,
-                estimate.diagnostics.named(),
+                t=estimate.t,
+                parameters=estimate.parameters,
+                innovation=estimate.innovation,
+                withheld_error=estimate.withheld_error,
+                status=np.array(codes, dtype=np.int32),
+                steps=estimate.steps,
+                diagnostics=estimate.diagnostics.named(),
             )
         )
         self.last = estimate

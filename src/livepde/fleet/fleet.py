@@ -21,6 +21,7 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
+from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import MOST_SUBSTEPS, Identifier
@@ -34,7 +35,7 @@ from livepde.stepping import Advance, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 6  # of the checkpoint
+FORMAT = 7  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -120,6 +121,12 @@ class Fleet:
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
         self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
+        # Boundary values at t0 that u0 states, shape (members, channels), NaN where it does not.
+        self._stated = np.full((len(self.members), len(self.inputs)), np.nan)
+        for k, u in enumerate(u0s):
+            if k == 0 or u is not u0s[k - 1]:
+                stated = model.boundary_readings(u)
+            self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
         self.note = law.stepped_alone(self._work)
         self._engine = self._stepper(made_of, u0s)
         count = len(self)
@@ -129,6 +136,7 @@ class Fleet:
         self._inputs = np.full((count, len(self.inputs)), np.nan)
         self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
         self._samples = 0
+        self._starts: dict[int, Identifier] = {}
         if not self.inputs:
             self._begin(self._inputs)
 
@@ -250,17 +258,37 @@ class Fleet:
                 "time, or take a longer dt_max."
             )
         if self._state is None:
-            self._begin(values)
+            if t > last:
+                held = {**held, **self._unstated(held)}
+            self._begin(self._opening(values) if t > last else values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
         if t == last:
-            span = Span(self._t, t, self.inputs, values, values, used, used, noise=noise)
+            span = Span(
+                t0=self._t,
+                t1=t,
+                channels=self.inputs,
+                inputs0=values,
+                inputs1=values,
+                z0=used,
+                z1=used,
+                noise=noise,
+            )
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
-            ends = self._inputs, values, self._z, used
             gaps = np.stack([self._held, missing], axis=1)
             some = gaps if gaps.any() else None
-            span = Span(self._t, t, self.inputs, *ends, noise=noise, gaps=some)
+            span = Span(
+                t0=self._t,
+                t1=t,
+                channels=self.inputs,
+                inputs0=self._inputs,
+                inputs1=values,
+                z0=self._z,
+                z1=used,
+                noise=noise,
+                gaps=some,
+            )
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         # A member whose step failed keeps its time and values: its next step covers both intervals.
@@ -271,6 +299,21 @@ class Fleet:
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
         return self._estimate(span, measured, withheld, report, held)
+
+    def _opening(self, inputs: Array) -> Array:
+        """Return the inputs at the initial time, from those of a later first sample."""
+        unknown = np.isnan(self._stated)
+        # The same object at both ends says that inputs are held.
+        return inputs if unknown.all() else np.where(unknown, inputs, self._stated)
+
+    def _unstated(self, held: Mapping[str, Array]) -> dict[str, Array]:
+        """Return channels of the model -> members without a value now or at the initial time."""
+        found = {}
+        for k, name in enumerate(self.inputs):
+            unknown = np.isnan(self._stated[:, k])
+            if name in self.model.channels and unknown.any():
+                found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
+        return found
 
     def _check_order(self, t: float, last: float) -> None:
         if t < last or (t == last and self._samples):
@@ -345,7 +388,10 @@ class Fleet:
         k = member if isinstance(member, int) else self.members.index(member)
         state = None if self._state is None else self._engine.member(self._state, k)
         t, z, inputs = float(self._t[k]), self._z[k].copy(), self._inputs[k]
-        return self._one.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
+        # Kept, since its fingerprint is computed once for all checkpoints of this member.
+        start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k])
+        self._starts[k] = start
+        return start.placed(state, t, z, inputs, self._held[k].copy(), self._samples)
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
@@ -366,10 +412,13 @@ class Fleet:
             How many they have taken.
         """
         other = copy.copy(self)
-        vars(other).pop("fingerprint", None)
+        other._starts = {}
+        for name in ("header", "fingerprint"):
+            vars(other).pop(name, None)
         other.members = tuple(self.members[k] for k in which)
         other._engine = self._engine.subset(which)
         other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
+        other._stated = self._stated[which]
         other._t, other._z = self._t[which], self._z[which]
         other._inputs, other._held = self._inputs[which], self._held[which]
         other._state, other._samples = state, samples
@@ -488,7 +537,12 @@ class Fleet:
         return values, held
 
     @cached_property
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> Fingerprint:
+        """Numbers by which a checkpoint of this fleet is known; computed when first asked for."""
+        return self._one.fingerprint.of_members(self._q0, self._u0)
+
+    @cached_property
+    def header(self) -> dict[str, Any]:
         """Properties that a fleet must share with the one whose checkpoint it takes over."""
         return {
             "format": FORMAT,
@@ -501,15 +555,23 @@ class Fleet:
             "together": self.together,
         }
 
+    def check(self, header: Mapping[str, Any], leaves: Mapping[str, Array], where: str) -> None:
+        """Raise `RunError` unless a checkpoint, named `where` in messages, is of such a fleet."""
+        other = [key for key, value in self.header.items() if header.get(key) != value]
+        if differs := other[0] if other else self.fingerprint.differing(leaves):
+            raise RunError(
+                f"{where} was saved with another {differs}; build the fleet as it was then."
+            )
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the state to a file, from which `load` continues with bit-identical numbers."""
         checkpoint.write(path, self.dump())
 
     def dump(self) -> bytes:
         """Return the state as `save` writes it."""
-        header = {**self.fingerprint, "begun": self._state is not None}
+        header = {**self.header, "begun": self._state is not None}
         leaves = {"t": self._t, "z": self._z, "inputs": self._inputs, "samples": self._samples}
-        leaves["held"] = self._held
+        leaves |= {"held": self._held, **self.fingerprint.leaves}
         if self._state is not None:
             leaves |= {
                 f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
@@ -529,12 +591,7 @@ class Fleet:
     def restore(self, content: bytes, where: str = "the checkpoint") -> None:
         """Continue from the bytes of `dump`, named `where` in messages. Raises as `load`."""
         header, leaves = checkpoint.unpacked(content, where)
-        for key, value in self.fingerprint.items():
-            if header.get(key) != value:
-                raise RunError(
-                    f"{where} was saved with another {key}; build the fleet as it was when it was "
-                    "saved."
-                )
+        self.check(header, leaves, where)
         state = None
         try:
             if header["begun"]:

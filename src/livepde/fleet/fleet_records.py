@@ -18,7 +18,7 @@ from livepde.result import interval_ends, unknown_of, vertex_order
 __all__ = ["FleetRecords"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _MemberRow:
     """Record of an estimate, each array over members."""
 
@@ -41,14 +41,14 @@ class _MemberRow:
             snapshot = Snapshot(profiles, {}, correlation)
         diagnostics = {name: values[k] for name, values in self.diagnostics.items()}
         return Record(
-            self.t,
-            self.numbers[k],
-            self.innovation[k],
-            self.withheld_error[k],
-            self.status[k],
-            self.steps[k],
-            {name: value for name, value in diagnostics.items() if np.isfinite(value)},
-            snapshot,
+            t=self.t,
+            numbers=self.numbers[k],
+            innovation=self.innovation[k],
+            withheld_error=self.withheld_error[k],
+            status=self.status[k],
+            steps=self.steps[k],
+            notes={name: value for name, value in diagnostics.items() if np.isfinite(value)},
+            snapshot=snapshot,
         )
 
 
@@ -85,15 +85,17 @@ class FleetRecords:
         if self._count % self.fields_every == 0:
             profiles, correlation = self._profiles(beliefs.u, factors), self._correlation(factors)
         row = _MemberRow(
-            estimate.t,
-            self._numbers(beliefs, factors),
-            estimate.innovation,
-            estimate.withheld_error,
-            [STATUS_CODES.index(status.code) for status in estimate.statuses],
-            estimate.steps.tolist(),
-            {name: values.tolist() for name, values in estimate.diagnostics.named().items()},
-            profiles,
-            correlation,
+            t=estimate.t,
+            numbers=self._numbers(beliefs, factors),
+            innovation=estimate.innovation,
+            withheld_error=estimate.withheld_error,
+            status=[STATUS_CODES.index(status.code) for status in estimate.statuses],
+            steps=estimate.steps.tolist(),
+            diagnostics={
+                name: values.tolist() for name, values in estimate.diagnostics.named().items()
+            },
+            profiles=profiles,
+            correlation=correlation,
         )
         self._count += 1
         self._rows.append(row)

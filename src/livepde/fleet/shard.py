@@ -242,8 +242,9 @@ class Shard:
             A step was broken off by an exception.
         """
         self._refuse_torn()
-        header = {**self._fleet.fingerprint, "shard": FORMAT}
+        header = {**self._fleet.header, "shard": FORMAT}
         leaves = {"offset": self.offset, "taken": self._taken, **self._fleet.ends}
+        leaves |= self._fleet.fingerprint.leaves
         leaves |= {f"state/{path}": leaf for path, leaf in self._states.leaves().items()}
         return checkpoint.packed(header, leaves)
 
@@ -258,9 +259,9 @@ class Shard:
             The content is damaged, or of another shard; nothing was changed.
         """
         header, leaves = checkpoint.unpacked(content, "the dump")
-        for key, value in {**self._fleet.fingerprint, "shard": FORMAT}.items():
-            if header.get(key) != value:
-                raise RunError(f"the dump is of a shard with another {key}: build it as that was.")
+        if header.get("shard") != FORMAT:
+            raise RunError("the dump is of another shard, or of another version of livepde.")
+        self._fleet.check(header, leaves, "the dump")
         try:
             offset, taken = int(leaves["offset"]), leaves["taken"].astype(np.int64)
             ends = {name: leaves[name] for name in self._fleet.ends}

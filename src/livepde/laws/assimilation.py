@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from livepde.laws.filter import Filter, Update
 from livepde.laws.filter_state import FilterState
+from livepde.laws.gate import Gate
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
@@ -86,23 +87,26 @@ class Assimilation(NamedTuple):
     predicted
         Predicted value of each sensor, shape (members, sensors).
     steps
-        Substeps taken.
+        Substeps taken, one number for all members or shape (members,).
     status
         Why no member could be stepped, or ok.
     finite
         Members whose numbers are finite, shape (members,).
     refused
-        Values that the gate refused, shape (members,).
+        Values that the gate refused, shape (members, sensors).
     worst
         Largest innovation of all members in units of the noise; 0 without.
+    anchored
+        Members whose state was corrected alone, shape (members,); None: no member's.
     """
 
     predicted: Array
-    steps: int
+    steps: int | IntArray
     status: Status
     finite: Mask
-    refused: Array
+    refused: Mask
     worst: float
+    anchored: Mask | None = None
 
 
 @dataclass(frozen=True)
@@ -111,16 +115,14 @@ class UpdateOptions:
 
     Attributes
     ----------
-    gate, patience
-        Innovations beyond `gate` expected standard deviations are refused, `patience` times in a
-        row.
+    gate
+        Which readings are used.
     adaptive
         True if the noise is a first guess whose multiple is found from the samples; their
         likelihood is kept then, too.
     """
 
-    gate: float = math.inf
-    patience: int = 10
+    gate: Gate = field(default_factory=Gate)
     adaptive: bool = False
 
 
@@ -132,12 +134,13 @@ def assimilate(
     if failure is None:
         return absorb(filter_, end, span, options, steps)
     predicted, _ = filter_.sensors.observe(x, span.end)
-    none = np.zeros(len(x))
-    return x, Assimilation(predicted, steps, Status.of(failure), none > 0.0, none, 0.0)
+    none = np.zeros(len(x), dtype=bool)
+    refused = np.zeros(predicted.shape, dtype=bool)
+    return x, Assimilation(predicted, steps, Status.of(failure), none, refused, 0.0)
 
 
 def absorb(
-    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int = 0
+    filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int | IntArray = 0
 ) -> tuple[FilterState, Assimilation]:
     """Update a state that belongs to the end of a span by the measurements there.
 
@@ -147,15 +150,15 @@ def absorb(
     predicted, Y = filter_.sensors.observe(x, at)
     d = span.z1 - predicted
     used: Mask = np.isfinite(d)
-    whole, measured = np.count_nonzero(used) == used.size, None
+    whole, measured, present = np.count_nonzero(used) == used.size, None, used
+    refused = np.zeros(used.shape, dtype=bool)
     if not whole:
         measured = np.asarray(used.any(axis=1))
         if not measured.any():
-            none = np.zeros(len(d))
             sums = (x.u + x.du).sum(axis=1) + x.da.sum(axis=1)
             finite: Mask = np.isfinite(sums + x.U.sum(axis=(1, 2)) + x.C.sum(axis=(1, 2)))
-            return x, Assimilation(predicted, steps, OK, finite, none, 0.0)
-    noise = filter_.noise_of(x, span)
+            return x, Assimilation(predicted, steps, OK, finite, refused, 0.0)
+    noise, innovations = filter_.noise_of(x, span), d
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
     sizes = np.abs(d)
@@ -170,15 +173,20 @@ def absorb(
         # neither the gate nor the verdict may count them again.
         shift = off[:, shadows.counted].sum(axis=1) / noise
         told = d + shift
-    dropped, newest = np.zeros(len(d)), None
+    newest = anchored = None
     parts: dict[str, Any] = {}
-    # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
-    near = np.abs(e) <= options.gate
-    if np.count_nonzero(near) < near.size or np.count_nonzero(x.refused):
+    if options.gate.beyond < math.inf:
         expected = d / np.sqrt(variance + shift * shift)
-        used, parts["refused"], dropped, newest = _gated(x, e, expected, used, options)
-        if newest is not None:
-            whole = bool(used.all())
+        screened, pause = x.screened.paused(span.t1 - np.asarray(span.t0))
+        far = _far(x, e, np.where(pause[:, None], e, expected), used, options.gate.beyond)
+        z = np.broadcast_to(span.z1, used.shape)  # members may share one sample
+        if far is None:
+            parts["screened"] = screened.fitted(z, used)
+        else:
+            gated = options.gate(screened, z, innovations, noise, far, used, span.t1, pause)
+            parts["screened"], used, whole = gated.state, gated.kept, bool(gated.kept.all())
+            refused, anchored = present & ~used, gated.anchored
+            newest = np.where(gated.counted, e, np.nan)
             e = np.where(used, e, np.nan)
     if not whole:  # missing values take part as zeros, which carry no information
         d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
@@ -192,12 +200,36 @@ def absorb(
     if shadows is not None and off is not None:
         learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
+    corrected: Mask | None = None
+    if anchored is not None and anchored.any():
+        corrected = np.asarray(anchored.any(axis=1))
+        new = filter_.anchor.corrected(new, innovations, anchored, at)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell
     # at once that nothing of this has happened.
     squares = np.vdot(new.u, new.u) + np.vdot(new.du, new.du) + np.vdot(new.da, new.da)
     good = x.member >= 0 if squares + worst * worst < math.inf else _finite(new, sizes)
-    return new, Assimilation(predicted, steps, OK, good, dropped, worst)
+    return new, Assimilation(predicted, steps, OK, good, refused, worst, corrected)
+
+
+def _far(x: FilterState, e: Array, expected: Array, used: Mask, beyond: float) -> Mask | None:
+    """Return which values do not fit; None if all do, of members that refuse no sensor.
+
+    The gate is as much wider as the innovations are usually larger than expected, so that a noise
+    that is stated too small does not close it.
+
+    Parameters
+    ----------
+    e, expected
+        Normalised innovations, and those by a standard deviation that includes known errors.
+    """
+    # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
+    near, quiet = np.abs(e) <= beyond, not np.count_nonzero(x.screened.refused)
+    if quiet and np.count_nonzero(near) == near.size:
+        return None
+    limit = beyond * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
+    far: Mask = used & ~(np.abs(expected) <= limit[:, None])
+    return None if quiet and not far.any() else far
 
 
 def _finite(x: FilterState, sizes: Array) -> Mask:
@@ -230,37 +262,22 @@ def _judged(
         return filter_.estimate(x)
 
     z, at, u = span.z1, span.end, x.u + x.du
-    sample = ScoredSample(x.C, x.causes, a, q, u, Y, d, used, z, predicted, noise, at)
+    sample = ScoredSample(
+        C=x.C,
+        M=x.causes,
+        a=a,
+        q=q,
+        u=u,
+        Y=Y,
+        d=d,
+        used=used,
+        z=z,
+        predicted=predicted,
+        noise=noise,
+        at=at,
+    )
     causes, ledger = judge.add(x.ledger, sample)
     return changed(x, causes=causes, ledger=ledger)
-
-
-def _gated(
-    x: FilterState, e: Array, expected: Array, used: Mask, options: UpdateOptions
-) -> tuple[Mask, IntArray, Array, Array | None]:
-    """Return which values pass: normalised innovations e, and those by the wider `expected`.
-
-    The gate is as much wider as the innovations are usually larger than expected, so that a noise
-    that is stated too small does not close it.
-
-    Returns
-    -------
-    used, refused
-        Values that are used, and how many in a row of each sensor were refused, (members, sensors).
-    dropped
-        Number of values refused now, shape (members,).
-    newest
-        Normalised innovations for the test for jumps, (members, sensors); None: all of them.
-    """
-    limit = options.gate * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
-    far = used & ~(np.abs(expected) <= limit[:, None])
-    if options.gate == math.inf or not (far.any() or x.refused.any()):
-        return used, x.refused, np.zeros(len(e)), None
-    refused = np.where(far, x.refused + 1, np.where(used, 0, x.refused))
-    kept = used & ~(far & (refused <= options.patience))
-    dropped = (used.sum(axis=1) - kept.sum(axis=1)).astype(float)
-    # One value alone is no change of the process; a second one in a row may be.
-    return kept, refused, dropped, np.where(kept | (refused > 1), e, np.nan)
 
 
 def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:

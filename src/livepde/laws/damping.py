@@ -66,6 +66,10 @@ class Damping(ABC):
     def theta(self, r: Residual) -> float:
         """Return theta >= 0, in 1/time."""
 
+    def most(self, observed: Residual) -> float:
+        """Return a bound of theta for all r, from the norms of u_alpha; infinity without one."""
+        return math.inf
+
     def slopes(self, r: Residual) -> tuple[float, float, float]:
         """Return the derivatives of theta in r.X, r.VX and r.V, for the Newton iteration.
 
@@ -141,6 +145,10 @@ class ConstantDamping(Damping):
     def theta(self, r: Residual) -> float:
         size = math.sqrt(r.V + self.floor**2 * r.observed.V)
         return self.mu / size if size > 0.0 else 0.0
+
+    def most(self, observed: Residual) -> float:
+        least = self.floor * math.sqrt(observed.V)
+        return self.mu / least if least > 0.0 else math.inf
 
     def slopes(self, r: Residual) -> tuple[float, float, float]:
         squared = r.V + self.floor**2 * r.observed.V

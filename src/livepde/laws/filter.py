@@ -17,16 +17,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import lapack
 
+from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed
+from livepde.laws.member_arrays import changed, put, take
 from livepde.laws.member_sensors import MemberSensors
+from livepde.laws.process_noise import NoiseRows, grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, BlockFactor, IntArray, Mask
@@ -39,6 +41,8 @@ from livepde.stepping import (
     advance,
 )
 from livepde.verdict import Judge
+
+Steps: TypeAlias = int | IntArray
 
 __all__ = ["Filter", "Update", "contraction"]
 
@@ -119,6 +123,11 @@ class Filter:
         return self.drift[member] if len(self.drift) > 1 else np.repeat(self.drift, len(member))
 
     @cached_property
+    def anchor(self) -> Anchor:
+        """Correction of the state by readings that do not change the unknowns."""
+        return Anchor(self.problem, self.sensors)
+
+    @cached_property
     def moves(self) -> bool:
         """True if an unknown moves."""
         return self.reduction.moves or bool(self.drift.any())
@@ -142,47 +151,60 @@ class Filter:
         q: Array = x.q + x.da @ self.reduction.Phi.T
         return q
 
-    def predict_unknowns(self, x: FilterState, h: float) -> FilterState:
+    def _with_noise(self, x: FilterState, h: float, noise: NoiseRows | None) -> FilterState:
         """Return the filter state with the unknowns predicted over a time h; u stays as it is.
 
         Their process noise stands in new rows of the square root, in the same order for every h.
         """
         end = self.unknowns_after(x, h)
-        grown = end.C.shape[1] - x.C.shape[1]
-        if not grown:
+        if noise is None:
             return end
-        U, past, causes = (extended(part, grown) for part in (x.U, x.past, x.causes))
-        return changed(end, U=U, past=past, causes=causes)
+        U, past, causes = (extended(part, len(noise)) for part in (x.U, x.past, x.causes))
+        C = np.concatenate([end.C, noise.at_end()], axis=1)
+        return changed(end, U=U, C=C, past=past, causes=causes)
 
-    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
-        """Return q, da, C and the shifts by shadows after a time h; all else is that of before."""
-        if h == 0.0:
-            return x
+    def _noise(self, x: FilterState, start: float, h: float) -> NoiseRows | None:
+        """Return the process noise of a step; None if no coordinate gains any."""
         drifts = self.drifts(x.member)
-        if not (self.reduction.moves or drifts.any()):  # members of a bank, of which others drift
-            return changed(x, age=x.age + h)
-        F = self.reduction.transition(h)
+        if h == 0.0 or not (self.reduction.moves or drifts.any()):
+            return None
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
-        # A coordinate that gains in one member has a row in all of them: members share one array.
-        gains: Mask = np.asarray((gained > 0.0).any(axis=0))
-        (grows,) = gains.nonzero()
-        members, r, k = x.C.shape
-        C = np.zeros((members, r + len(grows), k))
-        C[:, :r] = x.C @ F.T
-        C[:, r + np.arange(len(grows)), grows] = np.sqrt(gained[:, grows])
+        # A coordinate that gains in one member has rows in all of them: members share one array.
+        (grows,) = np.asarray((gained > 0.0).any(axis=0)).nonzero()
+        if not len(grows):
+            return None
+        lengths = tuple((self.reduction.rates[grows] * h).tolist())
+        weight = self.problem.control.scheme.weight
+        return NoiseRows(
+            start=start,
+            length=h,
+            scale=np.sqrt(gained[:, grows]),
+            lengths=lengths,
+            columns=grows,
+            k=x.C.shape[2],
+            weight=weight,
+        )
+
+    def unknowns_after(self, x: FilterState, h: float) -> FilterState:
+        """Return q, da, C and the shifts by shadows after a time h without process noise."""
+        if h == 0.0 or not self.reduction.moves:
+            return changed(x, age=x.age + h)
+        F = self.reduction.transition(h)
         shadows = x.shadows
         if shadows.a.shape[1]:
             shadows = changed(shadows, a=shadows.a @ F.T)
         q, da = self.reduction.predict(x.q, h), x.da @ F.T
-        return changed(x, q=q, da=da, C=C, age=x.age + h, shadows=shadows)
+        return changed(x, q=q, da=da, C=x.C @ F.T, age=x.age + h, shadows=shadows)
 
-    def predict(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def predict(self, x: FilterState, span: Span) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the state at the end of a span, the number of substeps, and the failure or None.
+
+        That number is one for each member if they differ.
 
         The process noise of the unknowns is independent from substep to substep.
         """
-        end, taken, failure = self.carried(x, span)
+        x, end, taken, failure = self._divided(x, span)
         if failure is None and self.problem.input_noise:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
         if failure is not None:
@@ -193,53 +215,91 @@ class Filter:
             end = changed(end, U=np.exp(-(span.t1 - span.start) / self.fading) * end.U)
         return end, taken, None
 
-    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, int, StepFailed | None]:
+    def _divided(
+        self, x: FilterState, span: Span
+    ) -> tuple[FilterState, FilterState, Steps, StepFailed | None]:
+        """Return the state at the start with the rate that the step needs, and as `carried`."""
+        length, more = span.t1 - span.start, True
+        while more:
+            end, taken, failure = self.carried(x, span)
+            if failure is not None or not self.moves:
+                break
+            rate = np.maximum(x.rate, end.rate)
+            more = bool((grades(rate, length) > grades(x.rate, length)).any())
+            if more:  # what the readings see of the process noise changes faster than was known
+                x = changed(x, rate=rate)
+        return x, end, taken, failure
+
+    def carried(self, x: FilterState, span: Span) -> tuple[FilterState, Steps, StepFailed | None]:
         """Return the state at the end of a span whose inputs are known exactly."""
-        first, taken = span.start, 0
-        length = span.t1 - first
-        # The process noise of moving unknowns has to act on u within the span, not at its end
-        # alone, so that these take each substep by itself.
-        count = self.problem.control.count(length) if self.moves else 1
-        for k in range(count):
-            stop = span.t1 if k + 1 == count else first + (k + 1) / count * length
-            x, steps, failure = self._advanced(x, span, first + k / count * length, stop)
-            taken += steps
+        if not self.moves:
+            return self._through(x, span, [span.t1])
+        # Each part of a step has process noise of its own.
+        parts, taken = grades(x.rate, span.t1 - span.start), np.zeros(len(x), dtype=np.int64)
+        for count in sorted(set(parts.tolist())):
+            times = pieces(self.problem.control, span.start, span.t1, count)
+            if (parts == count).all():
+                return self._through(x, span, times)
+            group = np.flatnonzero(parts == count)
+            some, steps, failure = self._through(take(x, group), span.part(group), times)
             if failure is not None:
-                return x, taken, failure
+                return x, steps, failure
+            x, taken[group] = put(x, group, some), steps
         return x, taken, None
+
+    def _through(
+        self, x: FilterState, span: Span, times: list[float]
+    ) -> tuple[FilterState, int, StepFailed | None]:
+        """Return the state after the parts of a span that end at some times."""
+        first, taken = span.start, 0
+        for stop in times:
+            x, steps, failure = self._advanced(x, span, first, stop)
+            first, taken = stop, taken + steps
+            if failure is not None:
+                break
+        return x, taken, failure
 
     def _advanced(
         self, x: FilterState, span: Span, start: float, stop: float
     ) -> tuple[FilterState, int, StepFailed | None]:
         """Return the state at the end of a part of a span."""
-        end, kept = self.predict_unknowns(x, stop - start) if self.moves else x, x.kept
+        noise, rows = self._noise(x, start, stop - start), x.U.shape[1]
+        end, kept = self._with_noise(x, stop - start, noise) if self.moves else x, x.kept
         deviates = bool(np.count_nonzero(x.da) or np.count_nonzero(x.du))
         off: Mask = np.zeros(len(x.member), dtype=bool)
         if deviates:
             off = np.asarray(x.da.any(axis=1) | x.du.any(axis=1))
         shadows = x.shadows.u.shape[1]
 
-        def directions(at: FilterState) -> Array:
+        def directions(at: FilterState, C: Array) -> Array:
             # The estimate relative to the linearisation point, [du; da], is propagated as one more
             # tangent: so it follows the same linear model as the rows of [U C].
-            C = np.concatenate([at.C, at.da[:, None]], axis=1) if deviates else at.C
+            C = np.concatenate([C, at.da[:, None]], axis=1) if deviates else C
             found = self.reduction.directions(at.q, C)
             if not shadows:  # which change no number of the others
                 return found
             apart = self.reduction.directions(at.q, at.shadows.a)
             return np.concatenate([found, apart], axis=1)
 
-        at_end = directions(end)
+        at_end = directions(end, end.C)
         factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
+        begun, length = start, stop - start
+
+        def begin(t: float, h: float) -> None:
+            nonlocal begun, length
+            begun, length = t, h
 
         def stage(columns: Array, t: float, h: float) -> Array:
             nonlocal kept
             q, along = end.q, at_end
-            # An inner stage sees the unknowns at its own time: those of the end would reduce the
-            # order of the time scheme.
-            if self.moves and t != stop:
-                now = self.unknowns_after(x, t - start)
-                q, along = now.q, directions(now)
+            if self.moves and (t != stop or (noise and noise.weight == 1.0)):
+                # An inner stage sees the unknowns at its own time: those of the end would reduce
+                # the order of the time scheme.
+                now = self.unknowns_after(x, t - start) if t != stop else end
+                C = now.C[:, :rows]
+                if noise:
+                    C = np.concatenate([C, noise.at_stage(t, begun, length)], axis=1)
+                q, along = now.q, directions(now, C)
             same = factors if q is end.q else {}
             work = StageOfMembers(x.member, q, along, h, span.at(t), kept, off, same, shadows)
             y, kept = self.stage.advance(columns, work)
@@ -249,16 +309,26 @@ class Filter:
         if shadows:
             last.append(end.shadows.u.transpose(1, 0, 2))
         columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
-        columns, steps, failure = advance(self.problem.control, stage, columns, start, stop)
+        control, count = self.problem.control, end.U.shape[1]
+        columns, steps, failure = advance(control, stage, columns, start, stop, begin)
         if failure is not None:
             return x, steps, failure
-        rows = end.U.shape[1]
-        U, du = columns[1 : 1 + rows].transpose(1, 0, 2), columns[1 + rows] if deviates else end.du
+        U = columns[1 : 1 + count].transpose(1, 0, 2)
+        du = columns[1 + count] if deviates else end.du
         parts: dict[str, Any] = {"u": columns[0], "U": U, "du": du, "kept": kept}
         if shadows:
             parts["shadows"] = changed(end.shadows, u=columns[-shadows:].transpose(1, 0, 2))
         new = changed(end, **parts)
-        return self._compressed(new) if rows > self.rank else new, steps, None
+        if noise and stop == span.t1:
+            new = changed(new, rate=self._rate(new, noise, span))
+        return self._compressed(new) if count > self.rank else new, steps, None
+
+    def _rate(self, x: FilterState, noise: NoiseRows, span: Span) -> Array:
+        """Return how fast the readings at the end forget the process noise, shape (members,)."""
+        U = x.U[:, -len(noise) :]
+        C = np.zeros((*U.shape[:2], x.C.shape[2]))  # a sensor of the unknown itself forgets nothing
+        Y = self.sensors.rows(x, U, C, span.end)
+        return noise.rate(x.rate, Y / self.noise_of(x, span)[:, None])
 
     @staticmethod
     def update(x: FilterState, Y: Array, d: Array, **parts: Any) -> tuple[FilterState, Update]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from livepde.laws.gate import Screened
 from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import changed
 from livepde.laws.shadow_state import ShadowState
@@ -41,8 +42,11 @@ class FilterState:
         Time for which the unknowns have moved, shape (members,).
     innovations
         Statistics of the innovations.
-    refused
-        How many values in a row of each sensor the gate has refused, shape (members, sensors).
+    rate
+        How fast the readings forget the process noise of unknowns that move, by which steps are
+        divided, shape (members,).
+    screened
+        What the gate remembers of each sensor.
     level, samples
         Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
         many samples that stands for, shapes (members,).
@@ -68,8 +72,9 @@ class FilterState:
     past: Array = field(metadata={"grows": 1})
     dpast: Array
     age: Array
+    rate: Array
     innovations: Innovations
-    refused: IntArray
+    screened: Screened
     level: Array
     samples: Array
     evidence: Array

@@ -17,7 +17,7 @@ CONVERGED = 0.5  # standard deviations between reference and estimate at which t
 STRIDE = 1.0  # prior standard deviations that a step moves the reference at most: a trust region
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Window:
     """Some samples of one member: the filter before and after them.
 

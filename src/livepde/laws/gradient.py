@@ -12,9 +12,11 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.equation_tests import EquationLedger, EquationTests, ObservedEquation
 from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
-from livepde.laws.law import Belief, Law, Problem, Report, Status
+from livepde.laws.information import InformationMetric
+from livepde.laws.law import Belief, Deferred, Law, Problem, Report, Status
 from livepde.laws.metrics import StepBegin, Transition
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
@@ -44,6 +46,8 @@ class GradientState:
         Sensors of the last sample, shape (sensors,), and whether q was held.
     observed, metric, excitation
         States of the rules for u_alpha and for the metric of Q, and of the excitation gate.
+    tested
+        Sums of the tests of the equation.
     """
 
     u: Array
@@ -58,6 +62,7 @@ class GradientState:
     observed: Any
     metric: Any
     excitation: ExcitationLevel
+    tested: EquationLedger
 
 
 @dataclass(frozen=True)
@@ -135,6 +140,15 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "GradientLaw has no covariance that input_noise or u0_from could enter: leave them "
                 "out, or use SensitivityLaw."
             )
+        parts = self._parts(problem)
+        metric, prior = parts.metric, np.zeros((problem.model.Q.dim, 0))
+        # A constant gain does not go by the prior, which need not have a size that means anything.
+        if isinstance(metric, InformationMetric):
+            prior = metric.probes
+        forms = parts.stage(np.ones(problem.observed.size, dtype=bool)).terms.forms
+        return replace(parts, tests=EquationTests(forms, prior))
+
+    def _parts(self, problem: Problem) -> GradientParts:
         if self.gain == "auto":
             return tuned_parts(problem, self.nu, self.N_op, self.newton)
         return constant_parts(
@@ -163,6 +177,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             observed=work.observed.init(),
             metric=work.metric.init(q0),
             excitation=ExcitationLevel.none(),
+            tested=EquationLedger.none(),
         )
 
     def start(self, work: GradientParts, q0: Array, u0: Array, moment: Moment) -> GradientState:
@@ -178,13 +193,17 @@ class GradientLaw(Law[GradientParts, GradientState]):
         self, work: GradientParts, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
         interval = work.problem.linear_readings(interval, state.u)
-        new, report = self._advanced(work, state, interval, work.closed(state.excitation))
+        closed = work.closed(state.excitation)
+        new, report = self._advanced(work, state, interval, closed)
         # A q that prior and data cannot explain is not believed: the step is taken again with q
         # held.
         if report.status.ok and (doubt := work.metric.doubt(new.metric, new.q)):
             new, report = self._advanced(work, state, interval, frozen=True)
             if report.status.ok:
                 report = replace(report, status=Status("departed", doubt))
+        elif closed and report.status.ok:
+            tested = replace(new.tested, rests=new.tested.rests + 1)
+            new, report = replace(new, tested=tested), report.updated(Diagnostics(at_rest=1.0))
         return new, report
 
     def _advanced(
@@ -221,8 +240,14 @@ class GradientLaw(Law[GradientParts, GradientState]):
         # clipped.
         u, q = end[:n], model.latent.clipped(end[n:])
         r, change = R(u) - u_alpha, end[n:] - state.q
-        after = Transition(forms, end[n:], u - r, change, stages.equation_error, moment, length)
+        error = cache(stages.equation_error)
+        after = Transition(forms, end[n:], u - r, change, error, moment, length)
         learned = work.metric.learn(state.metric, after)
+
+        def equation() -> ObservedEquation:
+            rate = forms.mass @ (u_alpha - path.at(interval.t0).u) / length
+            return ObservedEquation(error=error(), rate=rate, w=u - r, q=end[n:], moment=moment)
+
         new = GradientState(
             u=u,
             q=q,
@@ -236,15 +261,20 @@ class GradientLaw(Law[GradientParts, GradientState]):
             observed=observed,
             metric=learned,
             excitation=work.excited(state.excitation, u - r, u, q, moment),
+            tested=work.tested(state.tested, interval.present, equation),
         )
         found = path.diagnostics().updated(work.metric.diagnostics(learned, q, length))
-        at_rest = 1.0 if frozen else np.nan
 
         def diagnosed() -> Diagnostics[float]:
-            return replace(found, residual=model.X.norm(r), at_rest=at_rest)
+            return replace(found, residual=model.X.norm(r))
 
         predicted = work.problem.predict(u, q, moment)
         return new, Report(Status(), predicted, steps, cache(diagnosed))
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:
         return Belief(state.q, state.u)
+
+    def deferred(self, work: GradientParts, state: GradientState) -> Deferred:
+        belief, tests, tested = self.belief(work, state), work.tests, state.tested
+        judge = self.unjudged if tests is None else lambda: tests.verdict(tested)
+        return Deferred(lambda: belief, judge)

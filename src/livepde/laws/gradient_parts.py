@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,6 +19,7 @@ from livepde.laws.coupled import (
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
+from livepde.laws.equation_tests import EquationLedger, EquationTests, ObservedEquation
 from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel, Probes
 from livepde.laws.information import InformationMetric
 from livepde.laws.law import Problem
@@ -35,6 +37,7 @@ from livepde.stepping import Newton
 
 __all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
 
+ROUNDING = 1e-9  # of entries of P, which are at most about one
 SAME = 1e-9  # of a step: times that are the same but for rounding
 MOST_STAGES = 8  # kept for different sets of present sensors
 
@@ -56,6 +59,8 @@ class GradientParts:
         never held.
     memory
         Pattern of the information, for `StageTerms`.
+    tests
+        Tests of the equation, for the verdict; None: there is none.
     """
 
     problem: Problem
@@ -70,6 +75,7 @@ class GradientParts:
     probes: Probes | None = None
     memory: Pattern | None = None
     at_estimate: bool = False
+    tests: EquationTests | None = None
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
     def stage(self, present: Array) -> CoupledStage:
@@ -105,6 +111,16 @@ class GradientParts:
             return excitation
         seen = self.probes(np.array([w, u]).T, q, moment)
         return self.gate.add(excitation, seen[:, 0], seen[:, 1])
+
+    def tested(
+        self, tested: EquationLedger, present: Array, equation: Callable[[], ObservedEquation]
+    ) -> EquationLedger:
+        """Return the sums of the tests after a sample; one of some sensors only is left out."""
+        if self.tests is None or not self.tests.possible:
+            return tested
+        if not present.all():
+            return tested.interrupted()
+        return self.tests.add(tested, equation())
 
 
 class StageSequence:
@@ -233,11 +249,19 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "GradientLaw: gain='auto' accumulates what is known of constant unknowns, and here "
             "one moves (evolution=): give a number for gain, or use SensitivityLaw."
         )
+    whole = _sees_all(problem)
+    if not whole and model.form_A.differentiates("u"):
+        raise LawError(
+            "GradientLaw: gain='auto' needs data of the whole state where A contains derivatives "
+            "of u, because fluxes at the border of partial data would decide the unknowns: use "
+            "SensitivityLaw on this Subdomain or these sensors, or give a number for gain."
+        )
     metric = InformationMetric(model, observation.nodal)
     observed: ObservedPart[Any] = GeneralizedInverse(problem)
     if observation.reconstruction.regularises:
         observed = RegularizedInverse(problem)
-    elif smooths(problem.observed):
+    elif whole and smooths(problem.observed):
+        # Of partial data the smoothed part moves with w, and errors grow: they stay as they are.
         observed = SelfChosenSmoothing(problem)
     return GradientParts(
         problem=problem,
@@ -250,6 +274,12 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         metric=metric,
         memory=metric.pattern,
     ).prepared()
+
+
+def _sees_all(problem: Problem) -> bool:
+    """Return True if all sensors together determine every free coefficient of the state."""
+    hidden = abs(problem.observed.split().P) @ problem.model.X.free
+    return not bool((hidden > ROUNDING).any())
 
 
 def _for_scheme(newton: Newton, problem: Problem) -> Newton:

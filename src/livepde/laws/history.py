@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from livepde.fem import Inputs
 from livepde.laws.law import Problem
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import Interval, Span, own_noise
+from livepde.stepping import End, Interval, Span, own_noise
 
 __all__ = [
     "added",
@@ -29,6 +28,7 @@ __all__ = [
     "span_between",
     "trimmed",
     "with_readings",
+    "withdrawn",
 ]
 
 SPARE = np.inf  # time of rows that are not in use
@@ -92,43 +92,49 @@ def _extended(log: Array) -> Array:
     return buffer[:, : rows + 1]
 
 
+def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
+    """Return a log without the readings of some sensors since a time.
+
+    Parameters
+    ----------
+    sensors, since
+        Sensors of each member, and the time of the first reading to leave out, shapes (members,
+        sensors).
+    """
+    gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
+    readings = log[:, :, 1 : 1 + sensors.shape[1]]
+    if np.isnan(readings[gone]).all():
+        return log
+    found = log.copy()
+    found[:, :, 1 : 1 + sensors.shape[1]][gone] = np.nan
+    return found
+
+
 def trimmed(log: Array, first: int) -> Array:
     """Return a log from a row on."""
     return log[:, first:].copy()
 
 
-class _LogRow(NamedTuple):
-    """A row of the log of one member."""
-
-    t: float
-    z: Array
-    noise: Array | None
-    inputs: Inputs
-
-
-def _rows(log: Array, channels: tuple[str, ...]) -> list[_LogRow]:
+def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
     """Return the rows that the one member of a log took."""
     sensors = (log.shape[2] - 1 - len(channels)) // 2
     found = []
     for row in log[0][np.isfinite(log[0, :, 0])]:
         t, z, noise, inputs = np.split(row, [1, 1 + sensors, 1 + 2 * sensors])
         named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
-        found.append(_LogRow(float(t[0]), z, own_noise(noise), named))
+        found.append(End(t=float(t[0]), inputs=named, z=z, noise=own_noise(noise)))
     return found
 
 
 def first_interval(log: Array, channels: tuple[str, ...]) -> Interval:
     """Return the first row of one member as an interval without length."""
     (row,) = _rows(log[:, :1], channels)
-    return Interval(row.t, row.t, row.inputs, row.inputs, row.z, row.z, row.noise)
+    return Interval.between(row, row)
 
 
 def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
     """Return the intervals between the rows of one member, in time order."""
-    return [
-        Interval(first.t, last.t, first.inputs, last.inputs, first.z, last.z, last.noise)
-        for first, last in pairwise(_rows(log, channels))
-    ]
+    return [Interval.between(first, last) for first, last in pairwise(_rows(log, channels))]
 
 
 def with_readings(log: Array, sensors: int) -> Mask:
@@ -167,5 +173,12 @@ def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span
     z0, z1 = first[:, 1 : 1 + sensors], last[:, 1 : 1 + sensors]
     noise = own_noise(last[:, 1 + sensors : 1 + 2 * sensors])
     return Span(
-        first[:, 0], float(last[0, 0]), problem.channels, inputs0, inputs1, z0, z1, noise=noise
+        t0=first[:, 0],
+        t1=float(last[0, 0]),
+        channels=problem.channels,
+        inputs0=inputs0,
+        inputs1=inputs1,
+        z0=z0,
+        z1=z1,
+        noise=noise,
     )

@@ -224,7 +224,8 @@ def _pattern(model: Model, selects: bool) -> Pattern:
     if selects:
         A = model.form_A.pattern("v", "q")
         ones = A.matrix(np.ones(A.nnz))
-        return Pattern.of(sp.csr_array(ones.T @ ones))
+        # The diagonal counts as well where A does not touch a coefficient, as at an end alone.
+        return Pattern.of(sp.csr_array(ones.T @ ones + sp.eye_array(model.Q.dim)))
     if model.Q.dim > MOST_DENSE:
         raise LawError(
             "GradientLaw: gain='auto' keeps a dense matrix of all unknowns where sensors read no "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from livepde.stepping import Span, StepFailed
 
 __all__ = ["initial_rows", "input_rank", "with_initial_rows", "with_input_noise"]
 
-Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, int, StepFailed | None]]
+Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, Any, StepFailed | None]]
 
 # Rows of the square root for each noisy channel: with 10 the standard deviation of a state near the
 # boundary is that of all rows to 1 %: tests/test_input_noise.py.

@@ -212,7 +212,7 @@ def _deviations(x: FilterState, shift: Array) -> float:
     return float(np.linalg.norm(weights))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class _Samples:
     """The samples of one member since the start, ready to be assimilated again."""
 
@@ -226,7 +226,8 @@ class _Samples:
         """Return the samples of the window of one member."""
         log, channels = state.log[:, int(state.window[0]) :], work.filter.problem.channels
         opening = first_interval(log, channels)
-        return cls(work, state, opening, intervals_since(log, channels))
+        intervals = intervals_since(log, channels)
+        return cls(work=work, state=state, opening=opening, intervals=intervals)
 
     @property
     def unaccompanied(self) -> _Samples:
@@ -297,7 +298,14 @@ class _Samples:
         state, opening = self.state, self.opening
         length = self.intervals[-1].t1 - opening.t1 if self.intervals else 0.0
         now, initial = state.now, bool(state.initial[0])
-        window = Window(state.start, now, state.start.q[0], initial, opening.end, length)
+        window = Window(
+            start=state.start,
+            now=now,
+            reference=state.start.q[0],
+            initial=initial,
+            moment=opening.end,
+            length=length,
+        )
         return placed(self.work.filter, window, self.work.filter.reduction.bounded(q))
 
 

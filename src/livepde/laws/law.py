@@ -346,7 +346,7 @@ def numerical(error: Exception) -> Status | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class FixedInterval:
     """The samples of a run and its estimates, for a smoother.
 
@@ -480,7 +480,8 @@ class Law(ABC, Generic[Work, State]):
 
     def unjudged(self) -> Verdict:
         """Return the verdict where no innovation is judged."""
-        return Verdict.of((), (f"innovations: {type(self).__name__} says nothing of their size",))
+        why = f"innovations: {type(self).__name__} says nothing of their size"
+        return Verdict.of((), (why,), judged=False)
 
 
 AnyLaw = Law[Any, Any]

@@ -13,6 +13,7 @@ import numpy as np
 
 from livepde.laws.assimilation import assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
+from livepde.laws.gate import Screened
 from livepde.laws.gauss_newton import (
     CONVERGED,
     Window,
@@ -118,7 +119,9 @@ def _iterated(
             if guards.within_reach(x.da - begin.da)[0]:
                 return levelled(x, temper), tempered
         start, length = interval.at(interval.t0), interval.t1 - interval.t0
-        window = Window(begin, x, begin.q[0], False, start, length)
+        window = Window(
+            start=begin, now=x, reference=begin.q[0], initial=False, moment=start, length=length
+        )
         far = missed_most(filter_, window) > guards.reach
         if not (far and distance(filter_, window) > CONVERGED):
             return levelled(x, temper), tempered
@@ -171,7 +174,9 @@ def _rescued(
         return not report.status.ok or bool(beyond[0] > guards.runaway)
 
     if not astray(report):
-        return changed(new, scale=scale.without_refused(state.scale, new.now.refused)), report
+        return changed(
+            new, scale=scale.without_refused(state.scale, new.now.screened.refused)
+        ), report
     older = changed(work.filter.relinearised(state.older), kept=new.now.kept)
     row = int(state.since_older[0])
     silent = [item.silent for item in [*_since(work, state, row), interval]]
@@ -189,6 +194,11 @@ def _rescued(
 def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
     """Return the intervals that one member has taken since a row of the log."""
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
+
+
+def _doubted(screened: Screened) -> int:
+    """Return how many readings in a row were refused of a sensor that is not set aside."""
+    return int(np.where(screened.aside, 0, screened.refused).max())
 
 
 def _retaken(
@@ -223,13 +233,13 @@ def _watched(
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, report
     e = new.now.innovations.newest
-    watch, alarms = jumps.add(state.watch, e, new.now.refused)
+    watch, alarms = jumps.add(state.watch, e, new.now.screened.refused)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
     if alarm:
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
-        onset = max(jumps.onset(state.watch, e), int(new.now.refused.max()))
+        onset = max(jumps.onset(state.watch, e), _doubted(new.now.screened))
         before = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:

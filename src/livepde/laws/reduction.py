@@ -48,6 +48,12 @@ class ReducedEvolution:
         gained = self.model.growth(h, self.std)
         return np.repeat(gained, (self.part.stop - self.part.start) // len(gained))
 
+    @property
+    def rates(self) -> Array:
+        """Rate at which each of its coordinates relaxes to the prior mean; zero for a walk."""
+        rates = -np.diag(self.model.generator)
+        return np.repeat(rates, (self.part.stop - self.part.start) // len(rates))
+
     def backward(self, h: float, drift: float) -> Array:
         """Return the matrix of the backward prediction of the coordinates by a time h."""
         F, growth = self.transition(h), self.growth(h)
@@ -111,6 +117,11 @@ class Reduction:
     def moves(self) -> bool:
         """True if an unknown moves by itself."""
         return any(evolution.model.moves for evolution in self.evolutions)
+
+    @cached_property
+    def rates(self) -> Array:
+        """Rate at which each coordinate relaxes to the prior mean, shape (k,)."""
+        return np.concatenate([evolution.rates for evolution in self.evolutions])
 
     @cached_property
     def still(self) -> Mask:

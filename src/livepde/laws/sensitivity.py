@@ -20,6 +20,7 @@ from livepde.laws.assimilation import (
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState
+from livepde.laws.gate import Gate, Screened
 from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
 from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
@@ -112,7 +113,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         Innovations of more than this many expected standard deviations, times the usual size of
         normalised innovations where that exceeds 1, are not used; infinity: all are.
     gate_patience
-        After so many refusals in a row a sensor is used again: the process has really changed.
+        After so many refusals in a row a sensor is believed if most others misfit as well, else set
+        aside: see `livepde.laws.gate`.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
     guards
@@ -135,7 +137,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     jumps: Jumps | None = None
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
-    verdict: bool | str = True
+    # A run may be judged that was not judged before: fleets are not.
+    verdict: bool | str = field(default=True, metadata={"begins_anew": True})
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
     graded_start: ClassVar[bool] = True
@@ -218,10 +221,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
-        options = UpdateOptions(self.gate, self.gate_patience, self.noise == "auto")
+        # Unknowns that move, or that may jump, follow a change of the process themselves.
+        anchors = not (filter_.moves or self.jumps is not None)
+        gate = Gate(self.gate, self.gate_patience, anchors)
         return SensitivityWork(
             filter=filter_,
-            options=options,
+            options=UpdateOptions(gate, self.noise == "auto"),
             refit=self.refit,
             guards=self.guards,
             jumps=self.jumps,
@@ -250,8 +255,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             past=np.zeros((1, k, 0)),
             dpast=np.zeros((1, 0)),
             age=0.0 * one,
+            rate=0.0 * one,
             innovations=Innovations.start(sensors),
-            refused=np.zeros((1, sensors), dtype=np.int64),
+            screened=Screened.start(sensors),
             level=one,
             samples=GUESS * one,
             evidence=0.0 * one,
@@ -319,7 +325,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not np.isfinite(now.da).all():
                 return state
             initial = bool(state.initial[0])
-            begun = Window(state.now, now, x.q[0], initial, interval.end, 0.0)
+            begun = Window(
+                start=state.now,
+                now=now,
+                reference=x.q[0],
+                initial=initial,
+                moment=interval.end,
+                length=0.0,
+            )
             if not iterates or distance(filter_, begun) <= CONVERGED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
@@ -401,7 +414,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if np.count_nonzero(far):
                 usual = usual & ~far.any(axis=1)
             scale = state.scale.add(span.z1, span.z1 - told.predicted)
-            parts["scale"] = scale.without_refused(state.scale, x.refused)
+            parts["scale"] = scale.without_refused(state.scale, x.screened.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
             # away: most samples are spared the exact test.
             if told.worst > guards.runaway:
@@ -409,7 +422,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 beyond = scale.beyond(span.z1 - told.predicted, noise)
                 usual = usual & ~(beyond > guards.runaway)
         if (jumps := self.jumps) is not None and (present := span.present).any():
-            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.refused)
+            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.screened.refused)
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)
@@ -420,7 +433,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 return state, told, usual
             x = where(usual, x, before)
             parts = {name: where(usual, part, getattr(state, name)) for name, part in parts.items()}
-        return stored(work, state, x, span, usual, **parts), told, usual
+        new = stored(work, state, x, span, usual, told.anchored, **parts)
+        return new, told, usual
 
     def _apart(
         self,

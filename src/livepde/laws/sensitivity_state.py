@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -14,13 +14,14 @@ from livepde.laws.covariance import robust_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
 from livepde.laws.guards import Guards
-from livepde.laws.history import added, trimmed
+from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, where, zeros
 from livepde.laws.refit_options import Refit
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
+from livepde.records import refusal
 from livepde.stepping import Span
 
 __all__ = [
@@ -268,17 +269,29 @@ def stored(
     now: FilterState,
     span: Span,
     taken: Mask,
+    anchored: Mask | None = None,
     **parts: Any,
 ) -> SensitivityState:
     """Return a state with the filter after a sample, which the members `taken` took.
 
-    `parts` are other fields to exchange.
+    Parameters
+    ----------
+    anchored
+        Members whose state was corrected alone, shape (members,).
+    parts
+        Other fields to exchange.
     """
     if not work.keeps_log:
         return changed(state, now=now, **parts)
-    parts["log"] = log = added(state.log, span, taken)
+    log = added(state.log, span, taken)
+    # A sensor that is set aside brings no measurements, from the first one that misfitted on.
+    if (aside := now.screened.aside & taken[:, None]).any():
+        log = withdrawn(log, aside, now.screened.since)
+    parts["log"] = log
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
+    if work.window and anchored is not None and (anchored & taken).any():
+        parts |= _windows_from(state, now, log.shape[1] - 1, anchored & taken)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
@@ -292,6 +305,25 @@ def stored(
                 "since_newer": np.where(due, last, state.since_newer),
             }
     return changed(state, now=now, **parts)
+
+
+def _windows_from(
+    state: SensitivityState, now: FilterState, row: int, begun: Mask
+) -> dict[str, Any]:
+    """Return the fields of windows that begin with a filter at a row, of some members.
+
+    No trajectory of constant unknowns passes through a disturbance.
+    """
+    zero = np.zeros(len(begun), dtype=np.int64)
+    return {
+        "start": where(begun, now, state.start),
+        "window": np.where(begun, row, state.window),
+        "opening": state.opening & ~begun,
+        "initial": state.initial & ~begun,
+        "assimilated": np.where(begun, zero, state.assimilated),
+        "due": np.where(begun, zero + 1, state.due),
+        "fit": where(begun, FitState.none(len(begun)), state.fit),
+    }
 
 
 def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
@@ -328,8 +360,8 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         found = innovations.diagnostics
         if work.options.adaptive:
             found = replace(found, noise_level=np.sqrt(level))
-        if work.options.gate < np.inf:
-            found = replace(found, refused=told.refused)
+        if work.options.gate.beyond < np.inf:
+            found = _with_refused(found, told.refused, work.filter.problem.observed.names)
         if work.jumps is not None:
             found = replace(found, jump=np.zeros(members))
         if shadows is not None:
@@ -341,8 +373,17 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.array([told.steps] * members)
+    steps = np.array(np.broadcast_to(told.steps, members))
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
+
+
+def _with_refused(
+    found: Diagnostics[Array], refused: Mask, sensors: Sequence[str]
+) -> Diagnostics[Array]:
+    """Return diagnostics with the number of readings refused, and those sensors."""
+    some = np.flatnonzero(refused.any(axis=0)).tolist()
+    each = {refusal(sensors[i]): np.where(refused[:, i], 1.0, np.nan) for i in some}
+    return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
 
 
 def without_factors(x: FilterState) -> FilterState:

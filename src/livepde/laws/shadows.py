@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
@@ -30,6 +30,7 @@ from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, put, take, where
+from livepde.laws.process_noise import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
@@ -179,6 +180,27 @@ class MeanProcess:
         kept
             Warm-start data of the previous stage.
         """
+        if not self.moves:
+            return self._through(x, u, kept, span, [span.t1])
+        # The filter takes the steps of some members in parts (`process_noise`): so does this.
+        parts = grades(x.rate, span.t1 - span.start)
+        new, now, failed = u.copy(), kept, np.zeros(len(u), dtype=bool)
+        for count in sorted(set(parts.tolist())):
+            times = [span.t1]
+            if count > 1:
+                times = pieces(self.control, span.start, span.t1, count)
+            if (parts == count).all():
+                return self._through(x, u, kept, span, times)
+            group = np.flatnonzero(parts == count)
+            some = take(x, group), u[group], take(kept, group), span.part(group)
+            new[group], after, failed[group] = self._through(*some, times)
+            now = put(now, group, after)
+        return new, now, failed
+
+    def _through(
+        self, x: FilterState, u: Array, kept: KeptFactors, span: Span, times: list[float]
+    ) -> tuple[Array, KeptFactors, Mask]:
+        """Return the same as `propagate`, through the parts of a span that end at some times."""
         members, no = len(u), np.zeros(len(u), dtype=bool)
         tangents = self.reduction.directions(x.q, np.zeros((members, 0, x.C.shape[2])))
         factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
@@ -193,9 +215,12 @@ class MeanProcess:
             y, now = self.stage.advance(columns, work)
             return y
 
-        columns, _, failure = advance(self.control, stage, u[None], span.start, span.t1)
-        if failure is not None:
-            return u, kept, ~no
+        first, columns = span.start, u[None]
+        for stop in times:
+            columns, _, failure = advance(self.control, stage, columns, first, stop)
+            if failure is not None:
+                return u, kept, ~no
+            first = stop
         # Warm-start data of a state that is not finite would spoil all later ones.
         good: Mask = np.isfinite(columns[0]).all(axis=1)
         return columns[0], where(good, now, kept), ~good
@@ -537,7 +562,9 @@ class ShadowSet:
         n, k, rows = x.u.shape[1], x.C.shape[2], len(self.shadows)
         u, a = np.zeros((1, rows, n)), np.zeros((1, rows, k))
         nothing = np.zeros((1, len(self.problem.channels)))
-        s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing)
+        # A sample at the start itself counts from there, and not from time zero.
+        begun = np.full(1, 0.0 if moment is None else moment.t)
+        s = changed(ShadowState.none(1, n, k), u=u, a=a, inputs0=nothing, begun=begun)
         for shadow in self.shadows:
             s = shadow.start(s, x, moment, given)
         return s
@@ -574,7 +601,7 @@ class ShadowSet:
                 s = self._add_errors(s, x, end, span, jumps)
             else:
                 some, one, after = take(s, group), take(x, group), take(end, group)
-                new = self._add_errors(some, one, after, _part(span, group), jumps[group])
+                new = self._add_errors(some, one, after, span.part(group), jumps[group])
                 s = put(s, group, new)
         return changed(end, shadows=s)
 
@@ -727,14 +754,3 @@ def _watch_rate(
     if np.count_nonzero(jumps):
         parts["jumped"] = np.where(jumps, count, s.jumped)
     return parts, jumps
-
-
-def _part(span: Span, group: IntArray) -> Span:
-    """Return the span of some members."""
-
-    def some(values: Array) -> Array:
-        return values[group] if len(values) > 1 else values
-
-    parts = {item.name: getattr(span, item.name) for item in fields(span)}
-    arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
-    return Span(**(parts | arrays))

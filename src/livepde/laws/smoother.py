@@ -185,7 +185,14 @@ class _FixedInterval:
         start, opening, intervals = before.now, data.opening, data.intervals
         length = intervals[-1].t1 - opening.t1 if intervals else 0.0
         initial = bool(before.initial[0])
-        self.window = Window(start, after, start.q[0], initial, opening.end, length)
+        self.window = Window(
+            start=start,
+            now=after,
+            reference=start.q[0],
+            initial=initial,
+            moment=opening.end,
+            length=length,
+        )
 
     @property
     def estimated(self) -> Array:

@@ -16,6 +16,7 @@ import numpy as np
 from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter, contraction
 from livepde.laws.filter_state import FilterState
+from livepde.laws.gate import Gate
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
@@ -251,7 +252,7 @@ class StoredSamples:
             samples=now.samples,
             kept=now.kept,
         )
-        x, options = start, replace(self.work.options, gate=np.inf)
+        x, options = start, replace(self.work.options, gate=Gate())
         for span, kept in zip(self.spans, used, strict=True):
             chosen = replace(span, z1=np.where(kept, span.z1, np.nan))
             if span.t1 > span.start:
@@ -260,4 +261,4 @@ class StoredSamples:
                 x, told = absorb(filter_, x, chosen, options)
             if not (told.status.ok and told.finite[0]):
                 return None
-        return changed(x, refused=now.refused)
+        return changed(x, screened=now.screened)

@@ -15,7 +15,16 @@ from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
-from livepde.verdict import WINDOWS, Dictionary, Finding, Judge, Position, Verdict, assess
+from livepde.verdict import (
+    WINDOWS,
+    Dictionary,
+    Finding,
+    Judge,
+    Position,
+    Verdict,
+    assess,
+    too_few,
+)
 
 __all__ = ["judge_of", "judged", "with_fit"]
 
@@ -62,9 +71,9 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
     """Return a function that gives the verdict on a member, and holds no more than that needs."""
     judge = filter_.judge
     if judge is None:
-        return lambda: Verdict.of((), ("innovations: verdict = False",))
+        return lambda: Verdict.of((), ("innovations: verdict = False",), judged=False)
     if not x.ledger.seen[member]:
-        return lambda: Verdict.of([_unseen()])
+        return lambda: Verdict.of((), (too_few("innovations", 0),), judged=False)
     # The answers of the process are states of the size of u, which no finding reads.
     x = changed(x, ledger=changed(x.ledger, process=np.zeros((len(x), 0, 0))))
 
@@ -89,10 +98,6 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
     return lambda: judge().with_findings([Finding("fit", "do not trust", text)])
 
 
-def _unseen() -> Finding:
-    return Finding("samples", "caution", "There are no samples: nothing to judge by.")
-
-
 def _position(filter_: Filter, x: FilterState) -> Position:
     """Return where the estimates of one member stand."""
     problem, reduction = filter_.problem, filter_.reduction
@@ -115,16 +120,21 @@ def _position(filter_: Filter, x: FilterState) -> Position:
     names = [""] * reduction.size
     for label, place in reduction.stay:
         names[place] = label
+    sensors, screened = problem.observed.names, x.screened
+    since, off = screened.since[0].tolist(), screened.off[0].tolist()
     return Position(
         ledger=x.ledger.of_member(0),
         moved=found,
         distance=_distance(reduction, x, a),
-        sensors=problem.observed.names,
+        sensors=sensors,
         noise=np.sqrt(x.level[0]) * filter_.noise,
         unit=problem.observed.observation.unit,
         time_unit=problem.model.time_unit,
         unknowns=names,
         moving=reduction.moves,
+        aside={sensors[i]: (since[i], off[i]) for i in np.flatnonzero(screened.aside[0])},
+        apart=int(screened.apart[0].sum()),
+        strain=int(screened.strain[0].max()),
     )
 
 

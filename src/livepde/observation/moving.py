@@ -79,7 +79,7 @@ class MovingObserved(Observed):
         parameter: FunctionSpace,
     ) -> None:
         super().__init__(observation, state, X, parameter)
-        self.block, _ = state.component(observation.of)
+        self.block = observation.scalar_block(state)
         dimension = self.block.field.mesh.dim()
         for name, channels in zip(self.names, observation.channels, strict=True):
             if len(channels) != dimension:

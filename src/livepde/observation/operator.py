@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Named, Place, Scalars, Unknown
+from livepde.fem import FieldBlock, FunctionSpace, Moment, Named, Place, Scalars, Unknown
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -78,6 +78,16 @@ class Observation:
         """Raise an error if `of` is given but has no effect."""
         if self.of:
             raise ObservationError(f"{type(self).__name__}: of='{self.of}' says nothing; {remedy}")
+
+    def scalar_block(self, state: FunctionSpace) -> FieldBlock:
+        """Return the component that is observed, which has to be one number at each point."""
+        block, _ = state.component(self.of)
+        if block.vector:
+            raise ObservationError(
+                f"{type(self).__name__} requires a state that is one number at each point, and "
+                "this one is a vector: use Points(..., component=0), or Matrix."
+            )
+        return block
 
     def _reads(self, channels: Iterable[str]) -> None:
         """Prepend channels to `inputs`, each once."""

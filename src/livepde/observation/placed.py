@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,6 +84,8 @@ class PlacedObserved(Observed):
     ----------
     observation, state, X, parameter
         As for `Observed`.
+    rows
+        Matrix of the values that some sensors would measure at other places (`Points.rows`).
     at
         Stated coordinates of all sensors, shape (sensors, d).
     uncertain, std
@@ -96,6 +98,7 @@ class PlacedObserved(Observed):
         state: FunctionSpace,
         X: HilbertSpace,
         parameter: FunctionSpace,
+        rows: Callable[[FunctionSpace, Array, Sequence[int]], sp.csr_array],
         at: Array,
         uncertain: Sequence[str],
         std: float,
@@ -104,8 +107,8 @@ class PlacedObserved(Observed):
         block, _ = state.component(observation.of)
         labels = parameter.labels
 
-        def difference(point: Array, start: Array) -> sp.csr_array:
-            values = state.widen(block.probe(np.array([start, point]).T), observation.of)
+        def difference(sensor: int, point: Array, start: Array) -> sp.csr_array:
+            values = rows(state, np.array([start, point]), [sensor, sensor])
             return sp.csr_array(values[[1]] - values[[0]])
 
         self.shifts = []
@@ -124,7 +127,7 @@ class PlacedObserved(Observed):
                 # expected, and are moved into the mesh at its boundary.
                 low, high = (_reached(block, start, axis, step) for step in (-std, std))
                 below, above = float(start[axis] - low[axis]), float(high[axis] - start[axis])
-                ends = (difference(low, start), difference(high, start))
+                ends = (difference(sensor, low, start), difference(sensor, high, start))
                 self.shifts.append(_Shift(sensor, labels[label], below, above, *ends))
 
     @property

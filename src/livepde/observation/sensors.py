@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Normal, Predicate, Scalars, Unknown
 from livepde.fem.measure import Measure
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.observation.operator import Direct, Observation, Observed
 from livepde.observation.placed import POSITION, PlacedObserved, shift_names
 from livepde.spaces import HilbertSpace
@@ -22,7 +22,7 @@ __all__ = ["Averages", "LineIntegrals", "Matrix", "Points"]
 
 @dataclass(frozen=True, eq=False)
 class Points(Observation):
-    """Point sensors, z_k = u(x_k).
+    """Point sensors, z_k = u(x_k), or one component of it where u is a vector.
 
     Parameters
     ----------
@@ -39,6 +39,15 @@ class Points(Observation):
         or a mapping from sensor name to number for some, with one common value. The shifts are then
         additional unknowns: `position[NAME]`, in more than one dimension `position[NAME.x]` and so
         on.
+    component
+        Number of the component that is measured, from 0, if the state is a vector at each point:
+        one for all sensors, or one for each. Two components at one place are two sensors.
+
+    Raises
+    ------
+    ObservationError
+        No position, or options that do not fit the sensors; when it is bound, a position outside
+        of the mesh, or a vector state of which no component is named.
 
     Examples
     --------
@@ -49,10 +58,12 @@ class Points(Observation):
     points: Mapping[str, Any] | Sequence[Any]
     direct: Mapping[str, Direct] = field(default_factory=dict)
     position_std: float | Mapping[str, float] | None = None
+    component: int | Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         if len(self.points) == 0:
             raise ObservationError("Points: give at least one position.")
+        self._check_component()
         given = self.position_std
         if given is None:
             return
@@ -64,6 +75,18 @@ class Points(Observation):
             raise ObservationError(
                 "Points: position_std must be one positive number, which all sensors named have in "
                 f"common; got {given!r}."
+            )
+
+    def _check_component(self) -> None:
+        """Refuse components that are not numbers from 0, or not one for each sensor."""
+        if self.component is None:
+            return
+        numbers = np.asarray(self.component)
+        fits = numbers.shape in ((), (len(self.points),)) and numbers.dtype.kind in "iu"
+        if not (fits and (numbers >= 0).all()):
+            raise ObservationError(
+                "Points: component must be the number of a component, from 0, or one for each of "
+                f"{len(self.points)} sensors; got {self.component!r}."
             )
 
     @property
@@ -98,7 +121,7 @@ class Points(Observation):
         if self.position_std is None:
             return Observed(self, state, X, parameter)
         at, uncertain = self.positions, self.uncertain
-        return PlacedObserved(self, state, X, parameter, at, uncertain, self.shift_std)
+        return PlacedObserved(self, state, X, parameter, self.rows, at, uncertain, self.shift_std)
 
     def names(self, count: int) -> tuple[str, ...]:
         if isinstance(self.points, Mapping):
@@ -118,10 +141,51 @@ class Points(Observation):
         return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        block, _ = state.component(self.of)
         mapping = isinstance(self.points, Mapping)
         what = f"sensors {list(self.points)}: number" if mapping else "sensor"
-        return state.widen(sp.csr_array(block.probe(self.positions.T, what)), self.of)
+        return self.rows(state, self.positions, range(len(self.points)), what)
+
+    def rows(
+        self, state: FunctionSpace, at: Array, which: Sequence[int], what: str = "sensor"
+    ) -> sp.csr_array:
+        """Return the matrix of the values that some sensors would measure at other places, (k, n).
+
+        Parameters
+        ----------
+        at
+            Coordinates, shape (k, d).
+        which
+            Number of the sensor at each place.
+        what
+            Name of a place in messages.
+        """
+        block, _ = state.component(self.of)
+        values = block.probe(at.T, what)
+        if block.vector:
+            # Rows: the first component at all places, then the second, and so on.
+            axes = self._components(values.shape[0] // len(at))[list(which)]
+            values = values[axes * len(at) + np.arange(len(at))]
+        elif self.component is not None:
+            raise ObservationError(
+                f"Points: component = {self.component!r} requires a state that is a vector at each "
+                "point: leave it out."
+            )
+        return state.widen(sp.csr_array(values), self.of)
+
+    def _components(self, count: int) -> IntArray:
+        """Return the number of the component that each sensor measures, of so many."""
+        if self.component is None:
+            raise ObservationError(
+                f"Points: the state is a vector of {count} components at each point: name the "
+                "measured one, as component = 0, or one for each sensor."
+            )
+        numbers: IntArray = np.broadcast_to(np.asarray(self.component), (len(self.points),))
+        if (numbers >= count).any():
+            raise ObservationError(
+                f"Points: there is no component {numbers.max()}: the state has {count} at each "
+                "point, counted from 0."
+            )
+        return numbers
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +229,7 @@ class Averages(Observation):
         return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        block, _ = state.component(self.of)
+        block = self.scalar_block(state)
         rows = [self._row(block, name, region) for name, region in self.regions.items()]
         return state.widen(sp.csr_array(np.array(rows)), self.of)
 
@@ -226,7 +290,7 @@ class LineIntegrals(Observation):
         return True
 
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
-        block, _ = state.component(self.of)
+        block = self.scalar_block(state)
         rows = sp.vstack([self._row(block, name, *ends) for name, ends in self.lines.items()])
         return state.widen(sp.csr_array(rows), self.of)
 

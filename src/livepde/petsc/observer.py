@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.laws.coupled.coupled_stage import SMALLEST, nearest_root
+from livepde.laws.coupled.coupled_stage import nearest_root
 from livepde.laws.coupled.equation import STIFFEST
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.excitation_gate import PROBES, ExcitationGate, ExcitationLevel
@@ -227,7 +227,8 @@ class CoupledSolver:
             u, q = self._newton(stage, u, q)
             return stage.rule() - theta
 
-        root = nearest_root(gap, max(stage.theta, SMALLEST))
+        most = min(self.law.damping.most(stage.seen), STIFFEST / stage.h)
+        root = nearest_root(gap, stage.theta, 1.0 / (STIFFEST * stage.h), most)
         if root is None:
             raise StepFailed("not_converged", "no weight theta of the damping solves the step")
         gap(root)

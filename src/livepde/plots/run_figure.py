@@ -25,6 +25,7 @@ from livepde.plots.dataset import (
     time_values,
 )
 from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, time_axis
+from livepde.records import refused_readings, used_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -221,7 +222,7 @@ def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, ax: Axes) -> Axes:
     """Draw measured minus predicted values of each channel, with the root mean square error."""
     t = time_values(data, data["time"].values)
-    errors = data[variable].transpose("time", dimension).values
+    errors = used_errors(data, variable, dimension)
     names = [str(name) for name in data[dimension].values]
     first = scored_from(data)
     ax.axhline(0.0, color="black", linewidth=0.8)
@@ -234,6 +235,8 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
             label = f"{name}: RMSE {_rms(errors[first:, k]):.3g}"
             line = ax.plot(t, errors[:, k], color=PALETTE[k % len(PALETTE)], label=label)[0]
             line.set(marker=marker, linewidth=width, alpha=0.8)
+        if variable == "innovation":
+            _mark_refused(data, ax)
     else:
         some = np.isfinite(errors).any(axis=1)
         t, seen = t[some], errors[some]
@@ -248,6 +251,15 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, what: str, 
     ax.set_ylabel(labelled("measured − expected", str(data[variable].attrs.get("units", ""))))
     ax.set_title(what)
     return finish(ax)
+
+
+def _mark_refused(data: xr.Dataset, ax: Axes) -> None:
+    """Mark the times of readings that were refused, for each sensor in its colour."""
+    t, names = time_values(data, data["time"].values), list(map(str, data["sensor"].values))
+    for name, which in refused_readings(data).items():
+        colour = PALETTE[names.index(name) % len(PALETTE)]
+        label = f"{name}: {which.sum()} readings refused"
+        ax.plot(t[which], np.zeros(which.sum()), "x", label=label, color=colour)
 
 
 def _rms(errors: Array) -> float:

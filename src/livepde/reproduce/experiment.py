@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -12,10 +13,10 @@ from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.result import Estimate, Result
-from livepde.runs.outcome import Outcome
+from livepde.runs.outcome import Check, Outcome
 from livepde.streams import Twin
 
-__all__ = ["Experiment", "Track", "track"]
+__all__ = ["Experiment", "Failing", "Track", "failures", "track"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,15 @@ class Experiment:
         return self.conduct(truth, progress)
 
 
+class Failing(Protocol):
+    """A run that counts its failed steps."""
+
+    @property
+    def failed(self) -> int:
+        """Number of samples with a failed step."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Track:
     """Run with the errors against its truth.
@@ -87,9 +97,20 @@ class Track:
     u_error: float
     divided: int
 
+    @property
+    def failed(self) -> int:
+        """Number of samples with a failed step."""
+        return int(np.isnan(self.errors).sum())
+
     def error(self, t: float) -> float:
         """Return the error of q at the sample nearest to t."""
         return float(self.errors[np.abs(self.times - t).argmin()])
+
+
+def failures(runs: Iterable[Failing], where: str = "", most: int = 0) -> Check:
+    """Return the check that at most so many steps failed, in all runs together."""
+    failed = float(sum(run.failed for run in runs))
+    return Check(f"failed steps{where}", failed, float(most), "<=")
 
 
 def track(identifier: Identifier, twin: Twin, what: str, progress: bool = False) -> Track:

@@ -23,14 +23,15 @@ from livepde import paper, plots
 from livepde.fem import Field, Normal, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
+from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Subdomain
-from livepde.reproduce.experiment import Experiment, Track, track
+from livepde.reproduce.experiment import Experiment, Track, failures, track
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 
-__all__ = ["SEED"]
+__all__ = ["SEED", "shift"]
 
 D = 1.0
 N = 31
@@ -125,8 +126,10 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         )
         checks, notes = _learned(tracks, kept, _distance(nothing, twin))
         checks.append(Check("error of q at t = 60, gradient, auto", auto.error(60.0), AUTO, "<="))
+        checks.append(failures([*tracks.values(), *kept.values(), auto]))
     else:
         checks, notes = _hidden(twin, tracks, _distance(nothing, twin_of(clamped=False)))
+        checks.append(failures(tracks.values()))
     return Outcome(
         tables=tables,
         checks=checks,
@@ -147,7 +150,8 @@ def _table(
     known: dict[tuple[float, float], float],
     auto: Track | None = None,
 ) -> Table:
-    columns = ["gain", "c1", "q = 0", "t = 6", "t = 60", "expected", "error of u", "divided steps"]
+    columns = ["gain", "c1", "q = 0", "t = 6", "t = 60", "expected", "error of u"]
+    columns += ["divided steps", "failed steps"]
     rows = [_row(twin, *case, found, known.get(case)) for case, found in tracks.items()]
     if auto is not None:
         rows.append(_row(twin, "auto", None, auto, None))
@@ -156,7 +160,13 @@ def _table(
 
 def _row(twin: Twin, gain: Any, c1: Any, found: Track, expected: float | None) -> list[Any]:
     errors = [twin.baseline(0.0), found.error(6.0), found.error(60.0)]
-    return [gain, c1, *errors, expected, found.u_error, found.divided]
+    return [gain, c1, *errors, expected, found.u_error, found.divided, found.failed]
+
+
+def shift(x: Array, q: Array) -> float:
+    """Return the first moment of q about the middle, over the integral of q*."""
+    moment, whole = np.trapezoid((x - 0.5) * q, x), np.trapezoid(q_true([x]), x)
+    return float(moment / whole)
 
 
 def _label(gain: float, c1: float) -> str:
@@ -203,13 +213,10 @@ def _learned(
         ),
         Check("largest error of q from t = 6 on, gain 1e4", float(np.max(late)), SMALL, "<="),
         Check(
-            f"centre of gravity of q at t = 60, {_label(*LIKE_PAPER)} (exact 0.5)",
-            float((x * q).sum() / q.sum()),
+            f"shift of q to the right at t = 60, {_label(*LIKE_PAPER)} (0 for q = 0 and for q*)",
+            shift(x, q),
             SHIFTED,
-            ">=",
-        ),
-        Check(
-            "failed steps", float(sum(np.isnan(t.errors).sum() for t in tracks.values())), 0.0, "<="
+            "in",
         ),
     ]
     notes = [
@@ -305,5 +312,5 @@ BEST = (1e4, 1.0)
 SETTLED = ((1e4, 0.1), (1e4, 1.0))
 SETTLED_FROM = 6.0
 SMALL = 0.071
-SHIFTED = 0.51  # the paper's figure: shifted to the right
+SHIFTED = (0.012, 0.02)  # the paper's figure; 0.0149, 0.0162, 0.0149 on 31, 46, 61 nodes
 HIDDEN = 2.0  # with another truth the error of q at t = 6 is above this for every gain

@@ -22,7 +22,7 @@ from livepde.identifier import Identifier
 from livepde.laws import ResidualDamping, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Full
-from livepde.reproduce.experiment import Experiment, Track, track
+from livepde.reproduce.experiment import Experiment, Track, failures, track
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
@@ -106,7 +106,10 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     }
     table = Table(
         f"relative L2 error of q, truth = {truth}",
-        ["law", "q = 0", "t = 1", "t = 10", "t = 60", "bound", "error of u", "divided steps"],
+        [
+            *("law", "q = 0", "t = 1", "t = 10", "t = 60", "bound", "error of u"),
+            *("divided steps", "failed steps"),
+        ],
         [
             [
                 name,
@@ -117,6 +120,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
                 EXPECTED[name] if truth == "discrete" else None,
                 found.u_error,
                 found.divided,
+                found.failed,
             ]
             for name, found in tracks.items()
         ],
@@ -129,7 +133,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         ]
     return Outcome(
         tables=[table],
-        checks=checks,
+        checks=[*checks, failures(tracks.values())],
         notes=notes,
         dataset=tracks["gradient"].result.to_xarray(),
         figures={

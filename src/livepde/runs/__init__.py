@@ -17,6 +17,7 @@ from livepde.runs.journal import Journal
 from livepde.runs.live_loop import Backlog, Live, Retention, Sink
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.runs.run_verdict import (
+    clock_findings,
     doubts,
     input_findings,
     severities,
@@ -43,6 +44,7 @@ __all__ = [
     "Table",
     "arrivals",
     "checks_of",
+    "clock_findings",
     "conduct",
     "doubts",
     "drive",

@@ -20,6 +20,7 @@ import json
 import math
 import os
 import re
+import tomllib
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -51,12 +52,15 @@ __all__ = [
     "run_names",
 ]
 
-FORMAT = 1
+FORMAT = 2
 RUNS = "runs"  # where the command line puts them
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
 CHECKPOINT, REPORT = "checkpoint.bin", "report.md"
 JOURNAL = "journal.sqlite"
 LONGEST = 10_000_000  # bytes of a record
+# Digests of what is read back: of the record itself, of the copy of the case, and of the estimates.
+# The last are several while the file is replaced, so that a kill leaves a file with its digest.
+OWN, COPY, CONTENT = "sha256", "case_copy_sha256", "estimates_sha256"
 MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
 WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
@@ -177,8 +181,7 @@ class RunWriter:
                 "status": "running",
             }
             if case is not None:
-                write_text(path / CASE, case)
-                record["case_sha256"] = hashlib.sha256((original or case).encode()).hexdigest()
+                record |= _written_case(path, case, original or case)
             if settings:
                 record["settings"] = list(settings)
             # The record comes last: a folder without one has only begun to be made.
@@ -192,9 +195,18 @@ class RunWriter:
 
     @classmethod
     def reopen(
-        cls, path: Path, *, version: str, command: Sequence[str], case: str, settings: Sequence[str]
+        cls,
+        path: Path,
+        *,
+        version: str,
+        command: Sequence[str],
+        case: str,
+        settings: Sequence[str],
+        original: str | None = None,
     ) -> RunWriter:
         """Return the writer of a run that ended early, to go on with it.
+
+        The case may have another `intake.shift` than before, which is kept from now on.
 
         Raises
         ------
@@ -206,8 +218,14 @@ class RunWriter:
         run.refuse_other(command, case, settings)
         for left in filter(Path.is_file, path.glob(f"*{PARTIAL}")):  # by one that was killed
             left.unlink(missing_ok=True)
-        resumed = [*run.record.get("resumed", []), {"at": _now(), "livepde": version}]
-        record = run.record | {"status": "running", "resumed": resumed}
+        begun = {"at": _now(), "livepde": version}
+        changed: dict[str, Any] = {}
+        kept = (path / CASE).read_text(encoding="utf-8", errors="replace")
+        if kept != case or run.settings != list(settings):
+            begun["intake.shift"] = str(_parts(case)[1])
+            changed = {**_written_case(path, case, original or case), "settings": list(settings)}
+        resumed = [*run.record.get("resumed", []), begun]
+        record = run.record | changed | {"status": "running", "resumed": resumed}
         writer = cls(path, {"command": _without_token(command)} | record)
         writer._save_record()
         return writer
@@ -228,7 +246,7 @@ class RunWriter:
         title = str(self.record["title"])
         with _room_to_write(self.path):
             if dataset is not None:
-                write_dataset(dataset, self.path / ESTIMATES)
+                self._write_estimates(dataset)
                 self.record["samples"] = int(dataset.sizes.get("time", 0))
             if identifier is not None:
                 identifier.save(self.path / CHECKPOINT)
@@ -238,6 +256,15 @@ class RunWriter:
             if figures:
                 self._report(markdown(title, shown, checks, notes, drawn), checks, notes)
 
+    def _write_estimates(self, dataset: xr.Dataset) -> None:
+        """Write the dataset, and its digest before it takes its place and after."""
+        with replacing(self.path / ESTIMATES) as partial:
+            _to_netcdf(dataset, partial)
+            new = hashlib.sha256(partial.read_bytes()).hexdigest()
+            self.record[CONTENT] = [*self.record.get(CONTENT, []), new]
+            self._save_record()
+        self.record[CONTENT] = [new]
+
     def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
         """Write the report, and the record."""
         write_text(self.path / REPORT, text)
@@ -245,7 +272,8 @@ class RunWriter:
         self._save_record()
 
     def _save_record(self) -> None:
-        text = json.dumps(plain(self.record), indent=2, ensure_ascii=False)
+        record = plain(self.record)
+        text = json.dumps(record | {OWN: _digest(record)}, indent=2, ensure_ascii=False)
         with _room_to_write(self.path):
             write_text(self.path / RECORD, text + "\n")
 
@@ -299,9 +327,12 @@ class Run:
         import xarray as xr
 
         try:
+            content = path.read_bytes()
+            if hashlib.sha256(content).hexdigest() not in self.record.get(CONTENT, []):
+                raise ValueError("its bytes are not those that were written")
             # What is written here decodes in silence: a warning tells of bytes that changed.
             with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
-                return xr.load_dataset(path, engine="scipy", mmap=False)
+                return xr.load_dataset(io.BytesIO(content), engine="scipy")
         except (
             OSError,
             ValueError,
@@ -310,7 +341,13 @@ class Run:
             MemoryError,
             xr.SerializationWarning,
         ) as error:
-            raise RunError(f"{path} is damaged: {error}.") from error
+            remedy = "run the case again, into another folder"
+            if journal.is_file():
+                remedy = (
+                    f"the journal has the estimates, too: 'livepde export {self.path} FILE.nc "
+                    "--salvage' writes them"
+                )
+            raise RunError(f"{path} is damaged: {error}; {remedy}.") from error
 
     def salvage(self) -> list[str]:
         """Read the intact records of a damaged journal as dataset; return sentences on the rest."""
@@ -342,6 +379,10 @@ class Run:
                 text = original.read_text(encoding="utf-8", errors="replace")
                 if hashlib.sha256(text.encode()).hexdigest() == self.record.get("case_sha256"):
                     return original
+        if hashlib.sha256(copy.read_bytes()).hexdigest() != self.record.get(COPY):
+            raise RunError(
+                f"{copy} is not the case that was run; name the case file to 'livepde run' again."
+            )
         return copy
 
     @property
@@ -359,8 +400,10 @@ class Run:
         begun = (self.path / JOURNAL).is_file() or not (self.path / ESTIMATES).exists()
         if not (self.path / CASE).is_file() or not begun:
             raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
-        same = (self.path / CASE).read_text(encoding="utf-8", errors="replace") == case
-        if not same or self.settings != list(settings):
+        kept = (self.path / CASE).read_text(encoding="utf-8", errors="replace")
+        begun_with, now = map(_but_shift, (self.settings, settings))
+        same = kept == case or _parts(kept)[0] == _parts(case)[0]
+        if not same or begun_with != now:
             raise RunError(
                 f"{self.path} was run with another case or other settings: resume it with those, "
                 "or choose another folder."
@@ -411,6 +454,11 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise RunError(f"{folder / RECORD} is not a record of this version of livepde.")
+    if record.pop(OWN, "") != _digest(record):
+        raise RunError(
+            f"{folder / RECORD} is damaged: it is not as it was written; take it from a copy, or "
+            "run the case again, into another folder."
+        )
     return Run(folder, record)
 
 
@@ -438,12 +486,45 @@ def write_text(path: Path, text: str) -> None:
 
 def write_dataset(data: xr.Dataset, path: Path) -> None:
     """Write a dataset as netCDF 3; the file appears whole or not at all."""
+    with replacing(path) as partial:
+        _to_netcdf(data, partial)
+
+
+def _to_netcdf(data: xr.Dataset, path: Path) -> None:
+    """Write a dataset as netCDF 3."""
     # netCDF 3 knows no dimension without members.
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
     kept.attrs = {key: plain(value) for key, value in data.attrs.items()}
-    with replacing(path) as partial:
-        kept.to_netcdf(partial, engine="scipy")
+    kept.to_netcdf(path, engine="scipy")
+
+
+def _digest(record: Mapping[str, Any]) -> str:
+    """Return the digest of a record, in whatever order and layout it is written."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def _written_case(path: Path, case: str, original: str) -> dict[str, str]:
+    """Write the copy of the case; return its digest and that of the original for the record."""
+    write_text(path / CASE, case)
+    texts = {"case_sha256": original, COPY: case}
+    return {key: hashlib.sha256(text.encode()).hexdigest() for key, text in texts.items()}
+
+
+def _parts(case: str) -> tuple[dict[str, Any], Any]:
+    """Return the content of a case without the correction of its clock, and the correction."""
+    try:
+        document = tomllib.loads(case)
+    except tomllib.TOMLDecodeError:
+        return {"text": case}, 0.0
+    intake = document.pop("intake", {})
+    shift = intake.pop("shift", 0.0)
+    return document | ({"intake": intake} if intake else {}), shift
+
+
+def _but_shift(settings: Sequence[str]) -> list[str]:
+    """Return settings without that of the correction of a clock."""
+    return [one for one in settings if one.partition("=")[0].strip() != "intake.shift"]
 
 
 def markdown(

@@ -15,17 +15,7 @@ from livepde.samples import by_name
 from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
 from livepde.streams.sources import Row, RowSource
 
-__all__ = ["Feed", "Gathered", "Paced", "SampleFeed", "shifted"]
-
-SHIFTED = "shifted by "  # how a position begins where the clock was set back
-
-
-def shifted(position: str) -> tuple[float, str]:
-    """Return the shift of the times of rows in a position, and the position of the source."""
-    if not position.startswith(SHIFTED):
-        return 0.0, position
-    shift, _, place = position.removeprefix(SHIFTED).partition(" ")
-    return float(shift), place
+__all__ = ["Feed", "Gathered", "Paced", "SampleFeed"]
 
 
 class Feed(Protocol):
@@ -45,6 +35,11 @@ class Feed(Protocol):
     def heard(self) -> bool:
         """Return whether any row has come since the last call, usable or not."""
         return True
+
+    @property
+    def doubt(self) -> str:
+        """Reason to doubt the times of rows, in one sentence; empty if there is none."""
+        return ""
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return the counts of remarks since the last call.
@@ -85,7 +80,6 @@ class Gathered(Feed):
         self.intake = intake
         self._heard = False
         self._remarks: list[Remark] = []
-        self._begun = intake.shift
         self._rows = 0  # a token is the number of the row, and what the source gave with it
         self._flushed = False
 
@@ -97,22 +91,23 @@ class Gathered(Feed):
     def poll(self, wait: float) -> Sequence[Ready]:
         """Return the samples that are ready."""
         rows = self.source.poll(wait)
+        received = time.monotonic()
         self._heard |= bool(rows)
         found: list[Ready] = []
         for row in rows:
             self._rows += 1
-            found += self._used(self._outcome(row, (self._rows, row.token)))
+            found += self._used(self._outcome(row, (self._rows, row.token), received))
         if self.source.done and not self._flushed:
             self._flushed = True
             found += self._used(self.intake.flush())
         return found
 
-    def _outcome(self, row: Row, token: Any) -> IntakeOutcome:
+    def _outcome(self, row: Row, token: Any, received: float) -> IntakeOutcome:
         if row.broken:
             return IntakeOutcome(
                 remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token]
             )
-        return self.intake.take(row.values, token)
+        return self.intake.take(row.values, token, received)
 
     def _used(self, outcome: IntakeOutcome) -> list[Ready]:
         self._remarks += outcome.remarks
@@ -127,6 +122,11 @@ class Gathered(Feed):
         """Return whether a row has come since the last call."""
         heard, self._heard = self._heard, False
         return heard
+
+    @property
+    def doubt(self) -> str:
+        """Reason to doubt the clocks of the source."""
+        return self.intake.why
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return remarks on values refused, missing or out of order, each kind and channel once."""
@@ -144,20 +144,8 @@ class Gathered(Feed):
         return list(found.values())
 
     def position(self, waiting: Sequence[Ready]) -> str:
-        """Return the position of the source before these samples, which are still to be taken.
-
-        It includes the shift of the clock there, if the clock was ever set back.
-        """
-        tokens = self._waiting(waiting)
-        place = self.source.position(_given(tokens))
-        anchors = self.intake.anchors
-        if not (anchors or self.intake.shift):
-            return place
-        first = min((number for number, _ in tokens), default=math.inf)
-        # The shift that held at the first row still to be taken.
-        before = [shift for (number, _), shift in anchors if number <= first]
-        shift = before[-1] if before else self._begun
-        return f"{SHIFTED}{shift!r} {place}"
+        """Return the position of the source before these samples, which are still to be taken."""
+        return self.source.position(_given(self._waiting(waiting)))
 
     def acknowledge(self, ready: Ready) -> None:
         """Acknowledge the rows of a sample to the source."""
@@ -207,7 +195,7 @@ class SampleFeed(Feed):
         """Return the next sample."""
         for sample in self._samples:
             if sample.t > self._after:
-                return [Ready(sample.t, self._values(sample), ())]
+                return [Ready(t=sample.t, values=self._values(sample), tokens=())]
         self._done = True
         return []
 
@@ -269,6 +257,11 @@ class Paced(Feed):
     def heard(self) -> bool:
         """Return whether rows have come, or samples are held until they are due."""
         return self.feed.heard() or bool(self._held)
+
+    @property
+    def doubt(self) -> str:
+        """Reason to doubt the times of the feed."""
+        return self.feed.doubt
 
     def remarks(self, waiting: Sequence[Ready]) -> Sequence[Remark]:
         """Return the counts of remarks."""

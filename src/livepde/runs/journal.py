@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 __all__ = ["Event", "Journal", "Taken"]
 
 LOG = logging.getLogger("livepde.run")
-FORMAT = 2
+FORMAT = 3
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
@@ -96,7 +96,7 @@ ESTIMATES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Taken:
     """An accepted sample: its number, its time and the values of all channels (NaN: missing).
 
@@ -297,7 +297,7 @@ class Journal:
             names += self.noise
         row = array("d", [values.get(name, math.nan) for name in names])
         self._enter(t, row.tobytes(), position)
-        return Taken(self._current, t, self._named(row.tolist()))
+        return Taken(id=self._current, t=t, values=self._named(row.tolist()))
 
     def _enter(self, t: float, channels: bytes, position: str) -> None:
         self._newest += 1
@@ -552,23 +552,6 @@ class Journal:
                 low = rows[0][0] + 1
         return low
 
-    def returns_to(self, t: float) -> bool:
-        """Return whether all samples later than a time can be withdrawn."""
-        before = self._number_at(math.nextafter(t, math.inf)) - 1
-        numbers = [n for (n,) in self._read("SELECT id FROM checkpoints WHERE id <= ?", before)]
-        # Without a checkpoint all samples are taken again from the first, unless they were thinned.
-        return before > 0 and bool(numbers or not self._thinning()[0])
-
-    def go_back(self, t: float) -> None:
-        """Withdraw all samples later than a time with their estimates, fields and checkpoints."""
-        first = self._number_at(math.nextafter(t, math.inf))
-        later = self._read("SELECT id FROM samples WHERE id >= ? ORDER BY id DESC", first)
-        # From the newest on, so that their numbers can be used again and leave no gaps.
-        for (number,) in later:
-            self._forget(int(number))
-        self._write(self._db.commit)
-        self._last = self._current = self._highest("estimates")
-
     @property
     def position(self) -> str:
         """Position of the source after the last accepted sample and the unusable rows after it."""
@@ -639,7 +622,9 @@ class Journal:
             with sound(self.path):
                 if len(channels) not in (8 * len(self.channels), 16 * len(self.channels)):
                     raise ValueError(f"sample {number} has not the size of the others")
-                taken = Taken(number, float(t), self._named(np.frombuffer(channels).tolist()))
+                taken = Taken(
+                    id=number, t=float(t), values=self._named(np.frombuffer(channels).tolist())
+                )
             yield taken
 
     def _named(self, row: Sequence[float]) -> dict[str, float]:
@@ -689,7 +674,16 @@ class Journal:
         found, innovation, error, _ = np.split(values, np.cumsum(sizes))
         said = {str(name): float(number) for name, number in json.loads(notes).items()}
         code = STATUS_CODES.index(STATUS_CODES[status])
-        return Record(float(t), found, innovation, error, code, int(steps), said, snapshot)
+        return Record(
+            t=float(t),
+            numbers=found,
+            innovation=innovation,
+            withheld_error=error,
+            status=code,
+            steps=int(steps),
+            notes=said,
+            snapshot=snapshot,
+        )
 
     def dataset(self) -> xr.Dataset:
         """Return the estimates as a dataset; see `Result.to_xarray`."""

@@ -9,7 +9,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -22,7 +22,7 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
-from livepde.verdict import LEVELS
+from livepde.verdict import LEVELS, NOT_JUDGED
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
@@ -35,7 +35,9 @@ LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
 TRIES = 2  # times that a sample in whose step the process has ended is tried again
 REFUSED = 20  # rows and values refused in a row, after which a run is not well
-UNUSED = frozenset({"malformed", "late", "leap", "outside", "skipped"})  # rows of no use
+UNUSED = frozenset(  # rows and values of no use
+    {"malformed", "late", "conflict", "leap", "outside", "skipped"}
+)
 HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
 
@@ -76,9 +78,6 @@ class Backlog:
         oldest = [waiting.popleft() for _ in range(excess)]
         if self.overflow == "merge":
             waiting.appendleft(_merged([*oldest, waiting.popleft()]))
-        elif waiting:
-            # A dropped sample may demand that earlier ones are withdrawn; the next inherits that.
-            waiting[0] = replace(waiting[0], since=_since([*oldest, waiting[0]]))
         return oldest
 
     def has_room(self, waiting: deque[Ready]) -> bool:
@@ -110,12 +109,7 @@ def _merged(samples: Sequence[Ready]) -> Ready:
                 values.setdefault(channel, []).append(value)
     mean = {channel: float(np.mean(several)) for channel, several in values.items()}
     tokens = tuple(t for sample in samples for t in sample.tokens)
-    return Ready(samples[-1].t, mean, tokens, _since(samples))
-
-
-def _since(samples: Iterable[Ready]) -> float | None:
-    """Return the earliest time after which samples must be withdrawn, None for none."""
-    return min((s.since for s in samples if s.since is not None), default=None)
+    return Ready(t=samples[-1].t, values=mean, tokens=tokens)
 
 
 class Live:
@@ -218,6 +212,7 @@ class Live:
             lambda: self._unwritten,
             self._unlinked,
             self._silence,
+            lambda: self.feed.doubt,
             self._refusing,
             self._failing,
             self._doubted,
@@ -229,7 +224,7 @@ class Live:
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
         told = [event for event in journal.events if event.kind == "verdict"]
-        self._level = told[-1].message.partition(":")[0] if told else LEVELS[0]
+        self._level = told[-1].message.partition(":")[0] if told else NOT_JUDGED
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -316,7 +311,7 @@ class Live:
         for key, number in lost.items():
             self.journal.count(*key, number)
         self._count(())
-        while self._waiting and self._waiting[0].since is None:
+        while self._waiting:
             if self._waiting[0].t > self.journal.last:
                 return  # the next sample is kept together with this
             # The sample was committed although its write was reported as failed.
@@ -579,9 +574,6 @@ class Live:
         """Take the first waiting sample; it stays in the queue if the journal cannot keep it."""
         ready = self._waiting.popleft()
         try:
-            if ready.since is not None:
-                self._commit()
-                self._go_back(ready.since)
             # Counts, position and sample are one transaction, so that a crash keeps all or none.
             position = self.feed.position(self._waiting)
             self._count(self.feed.remarks(self._waiting))
@@ -593,11 +585,6 @@ class Live:
         if self._is_due(taken):
             self._commit()
         self._step(taken)
-
-    def _go_back(self, t: float) -> None:
-        """Withdraw the samples later than a time, and restore the state before them."""
-        self.journal.go_back(t)
-        self._again(self.journal.estimated)
 
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
@@ -683,7 +670,7 @@ class Live:
         if verdict.level != self._level:
             self._level = verdict.level
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
-            self._tell("verdict", f"{verdict.level}: {said}")
+            self._tell("verdict", f"{verdict.level}: {said.removeprefix('Not judged: ')}")
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""

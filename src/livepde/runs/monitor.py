@@ -10,7 +10,7 @@ from livepde.errors import RunError, optional
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 from livepde.runs.web import Address, Server
-from livepde.verdict import LEVELS
+from livepde.verdict import NUMBERS
 
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIEnvironment
@@ -84,9 +84,9 @@ class _Health:
         ):
             if key in found:
                 yield GaugeMetricFamily(f"livepde_{name}", text, float(found[key]))
-        if found.get("verdict") in LEVELS:
-            text = "0 trusted, 1 caution, 2 do not trust"
-            level = float(LEVELS.index(found["verdict"]))
+        if found.get("verdict") in NUMBERS:
+            text = ", ".join(f"{number} {level}" for level, number in NUMBERS.items())
+            level = float(NUMBERS[found["verdict"]])
             yield GaugeMetricFamily("livepde_verdict", text, level)
         unwell = GaugeMetricFamily("livepde_unwell", "1 with the reason, if any", labels=["why"])
         if why := str(found.get("why", "")):

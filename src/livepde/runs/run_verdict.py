@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from livepde.dates import when
+from livepde.laws.equation_tests import rested
+from livepde.laws.step_ledger import step_findings
 from livepde.linalg import Array
 from livepde.plots.dataset import field_names, note, prior_left, scalars
+from livepde.records import STATUS_CODES
 from livepde.runs.outcome import Table
 from livepde.runs.summary import digits, jumps, shown
 from livepde.verdict import (
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
     from livepde.runs.journal import Journal
 
 __all__ = [
+    "clock_findings",
     "doubts",
     "findings_of",
     "input_findings",
@@ -46,11 +51,11 @@ MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twic
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
-LEAVES = 1.0  # squared distance from the prior over the one that model and prior allow
 REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 INPUT_KINDS = {
+    "start": "first values far off all that follow, and off the other channels, count as missing",
     "spike": "values far off those before and after were refused as spikes",
     "interpolated": "gaps were interpolated between the values before and after",
     "missing": "missing values were not between known ones: the last value was held",
@@ -62,14 +67,13 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
 
     A finding is: an unknown that ends at a bound, or keeps more than 0.9 of its prior standard
     deviation, so that the data were not informative; a gate that refused more than 2 % of the
-    readings; guards that gave up samples, restarted, or held unknowns that nothing excited; with gain='auto',
-    final unknowns farther from their prior than, with a correct model, in one of a million cases;
-    with a fixed gain, an estimate that scatters in the last half of a run by more than 0.3 of its
-    change since the first sample; latent values held at the limits of their prior; a field of whose mean variance more
-    than a quarter is that of modes that the law leaves out; time step, mesh and linear
-    interpolation of inputs that together shifted an unknown by more than two standard deviations;
-    a jump; and, if no law has judged the innovations, a mean square of the last 500 of more than
-    four times its expected value.
+    readings; guards that gave up samples, restarted, or held unknowns that nothing excited; with a
+    fixed gain, an estimate that scatters in the last half of a run by more than 0.3 of its change
+    since the first sample; latent values held at the limits of their prior; a field of whose mean
+    variance more than a quarter is that of modes that the law leaves out; time step, mesh and
+    linear interpolation of inputs that together shifted an unknown by more than two standard
+    deviations; a jump; and, if no law has judged the innovations, a mean square of the last 500 of
+    more than four times its expected value.
 
     Parameters
     ----------
@@ -84,10 +88,8 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
         *_said("held", "do not trust", _held(data)),
         *_said("left out", "note", _left_out(data)),
         *_discretised(data),
-        *_said("rest", "note", _rests(data) if gradient else []),
-        *_said("lost", "caution", _lost(data) if gradient else []),
+        *_rests(data),
         *_said("guards", "caution", [] if gradient else _guards(data)),
-        *_said("departure", "do not trust", _departure(data)),
         *_said("gain", "caution", _gain(data)),
         *_said("jump", "caution", _jumps(data)),
     ]
@@ -98,9 +100,15 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
 
     Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
-    found = []
-    for name in channels:
-        counts = {kind: n for (kind, channel), n in journal.counts.items() if channel == name}
+    found, driving = [], [*channels]
+    # Wild first values are told of sensors, too: the initial state may have been made of them.
+    others = [name for kind, name in journal.counts if kind == "start"]
+    for name in dict.fromkeys([*driving, *others]):
+        counts = {
+            kind: n
+            for (kind, channel), n in journal.counts.items()
+            if channel == name and (kind == "start" or name in driving)
+        }
         parts = [f"{counts[kind]} {text}" for kind, text in INPUT_KINDS.items() if counts.get(kind)]
         if not parts:
             continue
@@ -108,6 +116,20 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         text = f"Channel {name}: {'; '.join(parts)}."
         found.append(Finding("input", "note", text, name, held))
     return found
+
+
+def clock_findings(journal: Journal) -> list[Finding]:
+    """Return that times went back, if they did: estimates rest on the times as they came."""
+    count = journal.counts.get(("clock", ""), 0)
+    if not count:
+        return []
+    often = "once" if count == 1 else f"{count} times"
+    text = (
+        f"Times of rows went back {often}, and rows were not used until their times were new "
+        "again. Later times are only right if the clock was right afterwards."
+    )
+    remedy = "If the clock was wrong, state its correction with `intake.shift`."
+    return [Finding("clock", "caution", text, "", count, remedy=remedy)]
 
 
 def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:
@@ -243,46 +265,21 @@ def _guards(data: xr.Dataset) -> list[str]:
     return found
 
 
-def _rests(data: xr.Dataset) -> list[str]:
+def _rests(data: xr.Dataset) -> list[Finding]:
     """Return when the gradient law held the unknowns because nothing excited them."""
-    times, at, nothing = data["time"].values, _times(data, "at_rest"), "Nothing but noise excited"
+    times, at = data["time"].values, _times(data, "at_rest")
     if not len(at):
         return []
+    found = rested(len(at), f", last at {when(data, at[-1])}")
     if at[-1] < times[-1]:
-        last = when(data, at[-1])
-        return [
-            f"{nothing} the unknowns in {len(at)} samples, last at {last}: they were held then."
-        ]
+        return [found]
     # The first sample of each period in which the unknowns were held.
     held = np.isin(times, at)
     begin = times[held & ~np.append(False, held[:-1])]
-    found = f"{nothing} the unknowns from {when(data, begin[-1])} on: they were held"
-    return [f"{found}, as {len(begin) - 1} times before." if len(begin) > 1 else f"{found}."]
-
-
-def _lost(data: xr.Dataset) -> list[str]:
-    """Return where a gradient law could not learn from a sample, because no step converged."""
-    at = _times(data, "held")
-    if not len(at):
-        return []
-    return [
-        f"In {len(at)} samples, last at {when(data, at[-1])}, no step converged with the "
-        "unknowns: they were held, and the state went on. Look at sensors and noise level then."
-    ]
-
-
-def _departure(data: xr.Dataset) -> list[str]:
-    """Return whether estimates have left the prior, for laws that do not judge innovations."""
-    ratio = _last_known(data, "departure")
-    if not ratio > LEAVES:
-        return []
-    return [
-        f"The unknowns have left their prior: they are {math.sqrt(ratio):.1f} times as far "
-        "from it as a right model gets in one of a million cases. Do not trust them: the data "
-        "disagree with the model by more than their noise, and the unknowns take it up; or the "
-        "prior is too narrow. Take kind = 'sensitivity', refine the mesh and the steps, state a "
-        "larger noise, or a larger std of the unknowns."
-    ]
+    since = when(data, begin[-1])
+    text = f"Nothing but noise excited the unknowns from {since} on: they were held"
+    before = f", as {len(begin) - 1} times before" if len(begin) > 1 else ""
+    return [replace(found, text=f"{text}{before}.")]
 
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
@@ -347,14 +344,23 @@ def _wanders(values: np.ndarray[Any, Any]) -> bool:
 def verdict(data: xr.Dataset) -> Verdict:
     """Return the verdict of a run: of its law (`Estimate.verdict`), and findings of its dataset.
 
-    The law's verdict is read from the attribute `verdict` of the dataset.
+    The law's verdict is read from the attribute `verdict` of the dataset. Without it the run is not
+    judged.
     """
     stored = data.attrs.get("verdict")
-    own = Verdict.from_dict(json.loads(stored)) if stored else Verdict.unjudged()
+    # A stored verdict counts the steps of all samples, of which a dataset may hold a part.
+    own = Verdict.from_dict(json.loads(stored)) if stored else _steps(data)
     if not data.sizes["time"]:
         return own
-    judged = not any(text.startswith(("innovations", "everything")) for text in own.untested)
-    return own.with_findings(findings_of(data, judged=judged))
+    return own.with_findings(findings_of(data, judged=own.judged))
+
+
+def _steps(data: xr.Dataset) -> Verdict:
+    """Return what a run that has kept no verdict says of its steps."""
+    codes = data["status"].values.astype(int)
+    counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
+    found = step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+    return Verdict.unjudged().with_findings(found)
 
 
 def verdict_table(found: Verdict) -> Table:
@@ -375,8 +381,8 @@ def verdict_table(found: Verdict) -> Table:
 
 
 def doubts(data: xr.Dataset) -> list[str]:
-    """Return all findings that speak against trusting the estimates, as sentences, each once."""
-    return list(dict.fromkeys(finding.sentence for finding in verdict(data).findings))
+    """Return all that speaks against trusting the estimates, as sentences, each once."""
+    return verdict(data).every_sentence
 
 
 def severities(data: xr.Dataset) -> dict[str, Severity]:

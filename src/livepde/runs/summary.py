@@ -12,6 +12,7 @@ import numpy as np
 from livepde.dates import when
 from livepde.diagnostics.identifiability import TRADED, InformationGain
 from livepde.plots.dataset import field_names, interval_95, modes_told, note, prior_left, scalars
+from livepde.records import refused_readings, used_errors
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 
@@ -79,25 +80,30 @@ def shown(value: float, form: str = ".3g", unit: str = "") -> str:
 
 
 class ChannelErrors(NamedTuple):
-    """Errors of a channel: its role, those of all samples, and those of the second half."""
+    """Errors of a channel: its role, those of all samples, and those of the second half.
+
+    Readings that the gate refused are not among them: `refused` is their number.
+    """
 
     role: str
     errors: np.ndarray[Any, Any]
     later: np.ndarray[Any, Any]
+    refused: int = 0
 
 
 def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
     """Return the errors of each channel from the start of the assimilation on."""
     start = float(data.attrs.get("assimilate_from", -math.inf))
     kept = data["time"].values >= start
-    found = {}
+    found, refused = {}, refused_readings(data)
     for variable, dimension, role in CHANNELS:
         if variable not in data:
             continue
-        for k, name in enumerate(data[dimension].values):
-            errors = data[variable].values[kept, k]
-            parts = (errors, errors[len(errors) // 2 :])
-            found[str(name)] = ChannelErrors(role, *(part[np.isfinite(part)] for part in parts))
+        columns = used_errors(data, variable, dimension)[kept].T
+        for name, errors in zip(map(str, data[dimension].values), columns, strict=True):
+            whole, later = (e[np.isfinite(e)] for e in (errors, errors[len(errors) // 2 :]))
+            count = int(refused[name][kept].sum()) if name in refused else 0
+            found[name] = ChannelErrors(role, whole, later, count)
     return found
 
 
@@ -113,6 +119,7 @@ def _grouped(channels: Mapping[str, ChannelErrors]) -> dict[str, ChannelErrors]:
             role,
             np.concatenate([channels[name].errors for name in names]),
             np.concatenate([channels[name].later for name in names]),
+            sum(channels[name].refused for name in names),
         )
         for role, names in roles.items()
     }
@@ -256,19 +263,28 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
             reference = shown(float(attrs.get("reference", math.nan)), ".5g")
             rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
     columns = ("unknown", "value", "± std. dev.", "95 %", "unit")
+    title = f"Estimates{_first_order(data, labels)}"
     if not compared:
-        return Table("Estimates", columns, rows)
+        return Table(title, columns, rows)
     source = str(data.attrs.get("reference_source", ""))
-    title = f"Estimates; reference: {source}" if source else "Estimates"
+    title = f"{title}; reference: {source}" if source else title
     return Table(title, (*columns, "reference", "error"), rows)
+
+
+def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
+    """Return the part of a title that says which values are medians; empty if none is."""
+    found = [name for name in names if "comment" in data[name].attrs]
+    if not found:
+        return ""
+    whose = "" if len(found) == len(names) else f"{', '.join(found)}: "
+    return f" ({whose}median, std. dev. to first order)"
 
 
 def _fields(data: xr.Dataset) -> Table:
     """Return the table of the last snapshots of the unknown fields."""
     rows: list[tuple[Any, ...]] = []
-    for name in field_names(data):
-        if name not in data:
-            continue
+    names = [name for name in field_names(data) if name in data]
+    for name in names:
         last = data[name].values[-1]
         known = f"{name}_std" in data
         std = float(np.mean(data[f"{name}_std"].values[-1])) if known else math.nan
@@ -276,11 +292,13 @@ def _fields(data: xr.Dataset) -> Table:
         unit = data[name].attrs.get("units", "")
         rows.append((name, *numbers, shown(std, ".2g"), _left_out(data, name), unit))
     columns = ("field", "least", "mean", "largest", "mean std. dev.", "left-out modes", "unit")
-    return Table("Estimated fields", columns, rows)
+    return Table(f"Estimated fields{_first_order(data, names)}", columns, rows)
 
 
 def _channels(data: xr.Dataset) -> Table:
-    """Return the table of one-step errors of each channel."""
+    """Return the table of one-step errors of each channel, with the readings that were refused."""
+    channels = _grouped(channel_errors(data))
+    refuses = any(item.refused for item in channels.values())
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
         (
@@ -290,11 +308,13 @@ def _channels(data: xr.Dataset) -> Table:
             shown(rmse(later), ".4g"),
             shown(float(errors.mean()) if len(errors) else math.nan, "+.3g"),
             len(errors),
+            *([refused] if refuses else []),
             unit,
         )
-        for name, (role, errors, later) in _grouped(channel_errors(data)).items()
+        for name, (role, errors, later, refused) in channels.items()
     ]
-    columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", "unit")
+    more = ["refused"] if refuses else []
+    columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from livepde.stepping.banded_stage import BandedStage, member_stage
 from livepde.stepping.corrections import Kept
-from livepde.stepping.interval import Interval, Moments, Span, own_noise
+from livepde.stepping.interval import End, Interval, Moments, Span, own_noise
 from livepde.stepping.member_stage import KeptFactors, MemberStage, StageOfMembers
 from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
 from livepde.stepping.schemes import Advance, Alexander2, ImplicitEuler, Scheme, Stage, advance
@@ -16,6 +16,7 @@ __all__ = [
     "Advance",
     "Alexander2",
     "BandedStage",
+    "End",
     "ForwardStage",
     "ImplicitEuler",
     "Interval",

@@ -3,22 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["Interval", "Moments", "Span", "own_noise"]
+__all__ = ["End", "Interval", "Moments", "Span", "own_noise"]
 
 NO_INPUTS = np.zeros((1, 0))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class End:
+    """What is known at one end of a sample interval.
+
+    Attributes
+    ----------
+    t, inputs, z
+        Time, input channels, and measurements, shape (sensors,), NaN where missing.
+    noise, gaps
+        As of an `Interval` that ends here.
+    """
+
+    t: float
+    inputs: Mapping[str, float]
+    z: Array
+    noise: Array | None = None
+    gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Interval:
     """A sample interval, with inputs and measurements interpolated linearly.
 
@@ -45,6 +63,20 @@ class Interval:
     z1: Array
     noise: Array | None = None
     gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
+
+    @classmethod
+    def between(cls, start: End, stop: End) -> Interval:
+        """Return the interval from one end to another; of no length if both are the same."""
+        return cls(
+            t0=start.t,
+            t1=stop.t,
+            inputs0=start.inputs,
+            inputs1=stop.inputs,
+            z0=start.z,
+            z1=stop.z,
+            noise=stop.noise,
+            gaps=stop.gaps,
+        )
 
     def _weight(self, t: float) -> float:
         return (t - self.t0) / (self.t1 - self.t0)
@@ -96,7 +128,8 @@ def own_noise(noise: ArrayLike) -> Array | None:
     return None if np.isnan(found).all() else found
 
 
-class Moments(NamedTuple):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Moments:
     """One time, with the input channels of each member.
 
     Attributes
@@ -124,7 +157,7 @@ class Moments(NamedTuple):
         return Moment(self.t, Inputs(dict(zip(self.channels, row.tolist(), strict=True))))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Span:
     """Sample intervals of all members, with a common end.
 
@@ -168,12 +201,21 @@ class Span:
             first = last
             if interval.inputs0 is not interval.inputs1:
                 first = np.array([list(map(interval.inputs0.__getitem__, channels))])
-        t0, z0, z1 = np.array([interval.t0]), interval.z0[None], interval.z1[None]
-        noise = None if interval.noise is None else interval.noise[None]
         gaps = None
         if interval.gaps:
             gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T[None]
-        return cls(t0, interval.t1, channels, first, last, z0, z1, interval, noise, gaps)
+        return cls(
+            t0=np.array([interval.t0]),
+            t1=interval.t1,
+            channels=channels,
+            inputs0=first,
+            inputs1=last,
+            z0=interval.z0[None],
+            z1=interval.z1[None],
+            interval=interval,
+            noise=None if interval.noise is None else interval.noise[None],
+            gaps=gaps,
+        )
 
     def __len__(self) -> int:
         return len(self.t0)
@@ -208,12 +250,26 @@ class Span:
         if t != self.t1 and self.inputs0 is not mixed:
             s = (t - self.start) / (self.t1 - self.start)
             mixed = (1 - s) * self.inputs0 + s * mixed
-        return Moments(t, self.channels, mixed, self.interval)
+        return Moments(t=t, channels=self.channels, inputs=mixed, interval=self.interval)
 
     @property
     def end(self) -> Moments:
         """Time and inputs at the end."""
-        return Moments(self.t1, self.channels, self.inputs1, self.interval)
+        return Moments(
+            t=self.t1, channels=self.channels, inputs=self.inputs1, interval=self.interval
+        )
+
+    def part(self, group: IntArray) -> Span:
+        """Return the span of some members."""
+
+        def some(values: Array) -> Array:
+            return values[group] if len(values) > 1 else values
+
+        parts = {item.name: getattr(self, item.name) for item in fields(self)}
+        arrays = {name: some(part) for name, part in parts.items() if isinstance(part, np.ndarray)}
+        if self.inputs0 is self.inputs1:  # the same object says that inputs are held
+            arrays["inputs0"] = arrays["inputs1"]
+        return Span(**(parts | arrays))
 
     def member(self, k: int) -> Interval:
         """Return the interval of one member."""
@@ -223,10 +279,17 @@ class Span:
             Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
             for inputs in (self.inputs0, self.inputs1)
         )
-        noise = None if self.noise is None else self.noise[k]
         gaps = {}
         if self.gaps is not None:
             each = zip(self.channels, *self.gaps[k].tolist(), strict=True)
             gaps = {name: (held, again > 0.0) for name, held, again in each if held or again}
-        z0, z1 = self.z0[k], self.z1[k]
-        return Interval(float(self.t0[k]), self.t1, first, last, z0, z1, noise, gaps)
+        return Interval(
+            t0=float(self.t0[k]),
+            t1=self.t1,
+            inputs0=first,
+            inputs1=last,
+            z0=self.z0[k],
+            z1=self.z1[k],
+            noise=None if self.noise is None else self.noise[k],
+            gaps=gaps,
+        )

@@ -37,6 +37,11 @@ class Scheme(ABC):
 
     order: ClassVar[int]
 
+    @property
+    @abstractmethod
+    def weight(self) -> float:
+        """Weight of the last stage, at the end, in the quadrature; other stages have the rest."""
+
     @abstractmethod
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         """Return the solution at t + h from y at t."""
@@ -47,6 +52,10 @@ class ImplicitEuler(Scheme):
     """The paper's scheme: one stage, first order, L-stable."""
 
     order: ClassVar[int] = 1
+
+    @property
+    def weight(self) -> float:
+        return 1.0
 
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         return stage(y, t + h, h)
@@ -61,6 +70,10 @@ class Alexander2(Scheme):
 
     order: ClassVar[int] = 2
     gamma: ClassVar[float] = 1.0 - np.sqrt(0.5)
+
+    @property
+    def weight(self) -> float:
+        return self.gamma
 
     def advance(self, stage: Stage, y: Array, t: float, h: float) -> Array:
         g = self.gamma
@@ -131,12 +144,28 @@ class Advance:
         return sum(longest < h / 2**k for k in range(MOST_GRADES))
 
 
+def _unwatched(t: float, h: float) -> None:
+    pass
+
+
 def advance(
-    control: Advance, stage: Stage, y: Array, t0: float, t1: float
+    control: Advance,
+    stage: Stage,
+    y: Array,
+    t0: float,
+    t1: float,
+    begin: Callable[[float, float], None] = _unwatched,
 ) -> tuple[Array, int, StepFailed | None]:
     """Advance y from t0 to t1.
 
     Times are computed from integer counts, never accumulated.
+
+    Parameters
+    ----------
+    control, stage, y, t0, t1
+        Step control and implicit stage; the solution at t0; the interval.
+    begin
+        Is told start and length of each substep before it is tried.
 
     Returns
     -------
@@ -166,6 +195,7 @@ def advance(
         # length serves all equal steps. For very short steps that would change more than digits.
         unit, length = 16.0 * math.ulp(max(stop, -t)), stop - t
         length = round(length / unit) * unit if length > 1e6 * unit else length
+        begin(t, length)
         try:
             y = control.scheme.advance(stage, y, t, length)
         except StepFailed as failure:

@@ -48,7 +48,7 @@ def simulate(
     u = model.initial(u0, Moment(times[0], values(times[0])))
     yield times[0], u
     for t0, t1 in pairwise(times):
-        interval = Interval(t0, t1, values(t0), values(t1), none, none)
+        interval = Interval(t0=t0, t1=t1, inputs0=values(t0), inputs1=values(t1), z0=none, z1=none)
 
         # The interval is a default, since a closure would see that of a later round.
         def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:

@@ -400,9 +400,9 @@ def _with(sample: Sample, values: Mapping[str, float]) -> Sample:
     """Return a sample with other values of some channels, in z or inputs as before."""
     inputs = None if sample.inputs is None else dict(sample.inputs)
     if not isinstance(sample.z, Mapping):
-        return Sample(sample.t, sample.z, {**(inputs or {}), **values})
+        return Sample(t=sample.t, z=sample.z, inputs={**(inputs or {}), **values})
     named = dict(sample.z)
     for name, value in values.items():
         target = inputs if inputs is not None and name in inputs else named
         target[name] = value
-    return Sample(sample.t, named, inputs)
+    return Sample(t=sample.t, z=named, inputs=inputs)

@@ -12,11 +12,11 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from itertools import pairwise
-from statistics import median
-from typing import Any, Literal, Protocol
+from itertools import chain, pairwise
+from typing import Any, Literal, Protocol, TypeAlias
 
 from livepde.errors import DataError, SampleError
+from livepde.streams.channel_times import FAR, ChannelTimes, present, usual_of
 from livepde.streams.clock import Clock, is_naive, origin_at, since_1970
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
@@ -58,11 +58,13 @@ class Policy:
     tolerance
         Rows whose times differ by at most so much are of one moment: that of the first.
     leap
-        A row that is later than the newest one by more than this, or by more than a hundred times
-        the longest but one of the last steps, waits for the next one: it is refused, unless that
-        is later still, and by at most `leap`.
+        A row that is later than the newest one by more than this, or by more than ten usual steps
+        of its channels, waits until the rows after it agree with it; a row at the old times
+        refutes it.
     repeated
-        Which of two values of a channel for one moment is kept.
+        Which of two values of a channel for one moment is kept, while the sample waits.
+    shift
+        Correction of a wrong clock, as the user states it: added to all times that come.
     channels
         Channel -> its own options.
     """
@@ -71,6 +73,7 @@ class Policy:
     tolerance: float = 0.0
     leap: float = math.inf
     repeated: Literal["first", "last"] = "first"
+    shift: float = 0.0
     channels: Mapping[str, Habit] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -78,6 +81,8 @@ class Policy:
         for name, value in {"wait": self.wait, "tolerance": self.tolerance, **waits}.items():
             if not (math.isfinite(value) and value >= 0):
                 raise DataError(f"intake: {name} must be a time >= 0; got {value}.")
+        if not math.isfinite(self.shift):
+            raise DataError(f"intake: shift must be a finite time; got {self.shift}.")
         for choice in (self.repeated, *(habit.repeated for habit in self.channels.values())):
             if choice not in ("first", "last", None):
                 raise DataError(f"intake: repeated must be first or last; got {choice!r}.")
@@ -95,14 +100,13 @@ class Policy:
         return self.channels.get(channel, PLAIN)
 
 
-STEPS = 16  # between rows, from which the usual step is known
-LONG = 100.0  # usual steps, after which a row is far ahead
-AGREE = 5  # late rows that agree with each other outweigh the clock before
-INSIST = (
-    50  # of them, where no sample was taken at their times: they may be the backlog of a logger
-)
+AGREE = 16.0  # usual steps for which rows far ahead have to continue before they are used
+FEWEST = 3  # times of rows that are far ahead, or first, before they are used
+MOST_AHEAD = 1000  # rows that wait so; more than these are used without a contradiction
+REMEMBERED = 1024  # accepted samples that are remembered though the journal has them
 PLAIN = Habit()
 NAN = math.nan
+Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an accepted sample
 
 
 @dataclass(frozen=True)
@@ -113,11 +117,12 @@ class Remark:
     ----------
     kind
         Not used: "malformed" (unreadable, or without a value), "invalid" (outside of the valid
-        range), "spike", "late", "leap" (a time too far ahead), "repeated", "outside" (not between
-        start and stop), "skipped" (a sample without a needed channel); a whole row is "repeated" if
-        it was taken before, with the same values. "clock": rows have shown that the clock was wrong
-        or set back. Used all the same: "disordered" (came after a later row), "missing" (a sample
-        without this channel), "interpolated" (the same, with a value between known ones).
+        range), "spike", "late", "conflict" (another value than the one accepted for this time),
+        "leap" (a time too far ahead), "repeated" (a row that was accepted before with the same
+        values), "outside" (not between start and stop), "skipped" (a sample without a needed
+        channel). "clock": late rows follow one another, so that a clock went back. Used all the
+        same: "disordered" (came after a later row), "missing" (a sample without this channel),
+        "interpolated" (the same, with a value between known ones).
     channel
         Channel of the value; '' for a whole row.
     message
@@ -142,7 +147,7 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
     found[key] = remark if same is None else replace(same, number=same.number + remark.number)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Ready:
     """A sample that is complete.
 
@@ -152,15 +157,11 @@ class Ready:
         Time, and values of the channels that have come.
     tokens
         Tokens of the source for the rows of the sample, to acknowledge them.
-    since
-        Samples taken before that are later than this have wrong times, and must be withdrawn before
-        this one is taken. None: there are none.
     """
 
     t: float
     values: dict[str, float]
     tokens: tuple[Any, ...]
-    since: float | None = None
 
 
 @dataclass
@@ -182,22 +183,24 @@ class IntakeOutcome:
 
 
 class Past(Protocol):
-    """The samples taken so far, which distinguish a late row from a wrong clock."""
+    """The samples in the journal, among which repeated rows are looked for."""
 
-    def between(self, low: float, high: float) -> Sequence[tuple[float, Mapping[str, float]]]:
+    @property
+    def last(self) -> float:
+        """Time of the last sample, -inf before any."""
+
+    def between(self, low: float, high: float) -> Sequence[Known]:
         """Return some of the samples between two times, none where they were thinned."""
 
-    def returns_to(self, t: float) -> bool:
-        """Return whether all samples later than a time can be withdrawn."""
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Held:
-    """A row that waits until later rows have confirmed or refuted its time."""
+    """A row as it was read: its time, its values, and remarks on them, made once it is used."""
 
     t: float
-    row: Mapping[str, Any]
+    values: dict[str, float]
     token: Any
+    remarks: tuple[Remark, ...]
 
 
 @dataclass
@@ -228,15 +231,11 @@ class Intake:
     recent
         Times and values of the last samples of an earlier session, for channels that are
         interpolated or screened.
-    shift
-        Offset that is added to the times of rows, because the clock was set back by it.
 
     Attributes
     ----------
     past
-        The samples taken so far, to detect a wrong clock; None: all late rows are refused.
-    anchors
-        Token of the first row with a new shift, and the shift; oldest first.
+        The samples in the journal, to recognise rows that were accepted before it had them all.
     """
 
     def __init__(
@@ -250,7 +249,6 @@ class Intake:
         dates: bool | None = None,
         last: float = -math.inf,
         recent: Iterable[tuple[float, Mapping[str, float]]] = (),
-        shift: float = 0.0,
     ) -> None:
         self.columns = dict(columns)
         self.clock = clock
@@ -260,16 +258,13 @@ class Intake:
         self._dates = dates
         self._last = last
         self._newest = last
-        self._doubted: _Held | None = None
-        self._pending: list[_Held] = []
-        self._steps: deque[float] = deque(maxlen=STEPS)  # from one row to a later one
-        self._released: deque[float] = deque([last], maxlen=2 * INSIST)
-        self._since: float | None = None
-        self.shift = shift
+        self._received = math.nan  # when the newest row was received
         self.past: Past | None = None
-        self.anchors: list[tuple[Any, float]] = []
         self._open: dict[float, _Open] = {}
         self._recent = deque(recent, maxlen=RECENT)
+        self._times = ChannelTimes(self._recent)
+        self._ahead: list[_Held] = []  # rows far ahead, or the first rows, that wait for others
+        self._accepted: deque[tuple[float, dict[str, float]]] = deque()  # values as they came
 
     @property
     def start(self) -> datetime | None:
@@ -281,170 +276,182 @@ class Intake:
     @property
     def waiting(self) -> list[Any]:
         """Tokens of the rows that are in no sample yet."""
-        held = [*self._pending, *([self._doubted] if self._doubted else [])]
         found = [token for sample in self._open.values() for token in sample.tokens]
-        return found + [one.token for one in held]
+        return found + [one.token for one in self._ahead]
 
-    def take(self, row: Mapping[str, Any], token: Any = None) -> IntakeOutcome:
-        """Take a row; return the outcome of it and of rows that waited."""
+    @property
+    def why(self) -> str:
+        """Reason to doubt the clocks of the source, in one sentence; empty if there is none."""
+        remedy = "if a clock is wrong, state its correction with intake.shift"
+        for name, late in self._times.went_back.items():
+            return (
+                f"the times of {name} went back to t = {late:g}, and its rows are late until they "
+                f"are later than t = {self._last:g}; {remedy}"
+            )
+        # One row far ahead is counted when it is refuted; several are a matter of health.
+        if self._begun and len({one.t for one in self._ahead}) > 1:
+            return (
+                f"rows are far ahead of t = {self._newest:g}, from t = {self._ahead[0].t:g} on, "
+                f"and wait until those after them agree; {remedy}"
+            )
+        return ""
+
+    @property
+    def _begun(self) -> bool:
+        """Whether any row has been used."""
+        return self._newest > -math.inf
+
+    def take(
+        self, row: Mapping[str, Any], token: Any = None, received: float = math.nan
+    ) -> IntakeOutcome:
+        """Take a row; return the outcome of it and of rows that waited.
+
+        `received`: seconds of a clock of this machine; a row may be ahead by the time that passed.
+        """
         found = IntakeOutcome(row=token)
-        try:
-            t = self._time(row)
-        except DataError as error:
-            found.remark("malformed", "", str(error))
-        else:
-            if t is None:
-                found.remark("outside", "", "not between start and stop")
-            elif self._judged(_Held(t, row, token), found):
-                self._release(found)
-                return found
-        found.spent.append(token)
+        held = self._read(row, token, found)
+        if held is None or not self._judged(held, received, found):
+            found.spent.append(token)
         self._release(found)
         return found
 
-    def _judged(self, held: _Held, found: IntakeOutcome) -> bool:
-        """Return whether a row is used or waits; a leap and late rows wait for others."""
-        if self._leaps(held.t):
-            self._doubt(held, found)
-            return True
-        # A row at the old pace shows that the one far ahead before it was wrong.
-        if self._doubted is not None:
-            self._refuse_leap(found)
-        if self.past is not None and self._late(held.t):
-            return self._pends(held, self.past, found)
-        # A row in order interrupts a sequence of late ones, which is too short to be believed.
-        self._place_pending(found)
-        return self._placed(held, found)
+    def _read(self, row: Mapping[str, Any], token: Any, found: IntakeOutcome) -> _Held | None:
+        """Return a row with its time and values, None if it is unreadable or outside."""
+        try:
+            times = self._time(row)
+        except DataError as error:
+            found.remark("malformed", "", str(error))
+            return None
+        if times is None:
+            found.remark("outside", "", "not between start and stop")
+            return None
+        about = IntakeOutcome(row=token)
+        values = self._values(row, about)
+        if not values:
+            if not about.remarks:
+                about.remark("malformed", "", "no value of any channel")
+            found.remarks += about.remarks
+            return None
+        t, again = times
+        # An hour that clocks show twice: its second pass, unless these values came in the first.
+        if again and t <= self._last and not self._repeats(t, values):
+            t += again
+        return _Held(t=t, values=values, token=token, remarks=tuple(about.remarks))
 
-    def _leaps(self, t: float) -> bool:
-        """Return whether a row is too far ahead of the newest one."""
-        return t - self._newest > min(self.policy.leap, self._long) and math.isfinite(self._newest)
-
-    @property
-    def _long(self) -> float:
-        """A hundred times the second longest step; infinite if too few steps are known."""
-        # The longest step may be a pause of the source, which must not count as usual.
-        return LONG * sorted(self._steps)[-2] if len(self._steps) == STEPS else math.inf
-
-    def _doubt(self, held: _Held, found: IntakeOutcome) -> None:
-        """Take a row that is far ahead if the row before confirms it; else let it wait."""
-        self._place_pending(found)
-        before = self._doubted
-        if before is not None and 0.0 <= held.t - before.t <= self.policy.leap:
-            self._doubted = None
-            for one in (before, held):
-                if not self._placed(one, found):
-                    found.spent.append(one.token)
-            return
-        if before is not None:
-            self._refuse_leap(found)
-        self._doubted = held
-
-    def _refuse_leap(self, found: IntakeOutcome) -> None:
-        held, self._doubted = self._doubted, None
-        if held is not None:
-            text = f"t = {held.t:g} is far ahead of the newest row at {self._newest:g}"
-            found.remark("leap", "", text, held.token)
-            found.spent.append(held.token)
-
-    def _late(self, t: float) -> bool:
-        return self._moment(t) is None
-
-    def _pends(self, held: _Held, past: Past, found: IntakeOutcome) -> bool:
-        """Return whether a row that is too late is used or waits for others that agree with it.
-
-        A row with time and values of a taken sample is a repetition, as a source sends after a
-        reconnect. Other late rows that follow one another show that the clock was wrong, or was set
-        back.
-        """
-        # Remarks on the values are made once the row is placed, so these are dropped.
-        values = self._values(held.row, IntakeOutcome())
-        near = past.between(held.t - self.policy.tolerance, held.t + self.policy.tolerance)
-        if not values or any(_same(values, known) for _, known in near):
-            self._place_pending(found)
-            if not values:
-                return self._placed(held, found)
-            text = f"t = {held.t:g} has been taken with the same values before"
+    def _judged(self, held: _Held, received: float, found: IntakeOutcome) -> bool:
+        """Return whether a row is used or waits for others."""
+        if self._repeats(held.t, held.values):
+            text = f"t = {held.t:g} has been accepted with the same values before"
             found.remark("repeated", "", text)
             return False
-        if self._pending and not 0.0 <= held.t - self._pending[-1].t <= self._long:
-            self._place_pending(found)
-        self._pending.append(held)
-        # Several rows of one moment are no more evidence than one.
-        if len({one.t for one in self._pending}) >= AGREE:
-            self._anchor(past, found)
-        return True
+        if self._is_ahead(held, received):
+            self._wait(held, received, found)
+            return True
+        if held.t > self._newest:
+            # A row that continues the old times refutes those far ahead, and confirms earlier ones.
+            self._refuse([one for one in self._ahead if one.t > held.t], found)
+            self._use_ahead(found)
+            self._received = received
+        return self._placed(held, found)
 
-    def _place_pending(self, found: IntakeOutcome) -> None:
-        """Place the late rows that wait: they are refused unless the clock was corrected."""
-        pending, self._pending = self._pending, []
-        for held in pending:
-            if not self._placed(held, found):
-                found.spent.append(held.token)
+    def _is_ahead(self, held: _Held, received: float) -> bool:
+        """Return whether a row has to wait for others: the first rows, and rows far ahead."""
+        if not self._begun:
+            return True
+        passed = (received - self._received) * self.clock.second
+        reach = self._reach(self._times.usual(held.values))
+        return held.t - self._newest > (max(reach, passed) if passed > 0.0 else reach)
 
-    def _anchor(self, past: Past, found: IntakeOutcome) -> None:
-        """Correct the clock by late rows that agree: withdraw samples, or shift times."""
-        first, count = self._pending[0].t, len({one.t for one in self._pending})
-        earlier = [t for t in self._released if t < first]
-        # A clock that was wrong for a moment has spoilt few samples, which can be withdrawn. Before
-        # one that was set back all samples are right, and so times are shifted instead.
-        wrong = len(self._released) - len(earlier) + len(self._open)
-        if wrong <= AGREE and earlier and past.returns_to(earlier[-1]):
-            text = (
-                f"{count} rows from t = {first:g} on agree with each other: the clock had been "
-                f"wrong, and {wrong} samples later than t = {earlier[-1]:g} are taken back"
-            )
-            self._go_back(earlier, found)
-        elif count >= INSIST or self._covered(past):
-            # The true length of the pause is unknown, so the rows go on after one usual step.
-            shift = self._newest + self._usual - first
-            self.shift += shift
-            text = (
-                f"{count} rows from t = {first:g} on repeat times that have been: the clock was "
-                f"set back by {shift:g}, which is added to all times from now on"
-            )
-            self._pending = [replace(one, t=one.t + shift) for one in self._pending]
-            # A position before this row belongs to the old shift, and one after it to the new one.
-            self.anchors.append((self._pending[0].token, self.shift))
-        else:
-            return
-        found.remark("clock", "", text)
-        self._place_pending(found)
+    def _reach(self, usual: float) -> float:
+        """Return by how much a row may be ahead of the one before it."""
+        return self.policy.leap if math.isnan(usual) else min(self.policy.leap, FAR * usual)
 
-    @property
-    def _usual(self) -> float:
-        """The median step of the late rows that wait."""
-        gaps = [b.t - a.t for a, b in pairwise(self._pending) if b.t > a.t]
-        return float(median(gaps))
+    def _wait(self, held: _Held, received: float, found: IntakeOutcome) -> None:
+        """Let a row wait for others, and use all rows that wait if they agree."""
+        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
+        latest = held.t + self.policy.tolerance + max(waits, default=0.0)
+        # A row of an earlier time refutes those that have come before it.
+        self._refuse([one for one in self._ahead if one.t > latest], found)
+        self._ahead.append(held)
+        if self._agree() or len(self._ahead) > MOST_AHEAD:
+            self._received = received
+            self._use_ahead(found)
 
-    def _covered(self, past: Past) -> bool:
-        """Return whether samples with their channels were taken in the span of the waiting rows."""
-        named = {name for one in self._pending for name in self._values(one.row, IntakeOutcome())}
-        return any(
-            not all(math.isnan(known.get(name, NAN)) for name in named)
-            for _, known in past.between(self._pending[0].t, self._pending[-1].t)
-        )
+    def _agree(self) -> bool:
+        """Return whether the rows that wait have continued at a usual pace for long enough."""
+        times = sorted({one.t for one in self._ahead})
+        steps = [b - a for a, b in pairwise(times)]
+        usual, own = self._times.usual(self._ahead[-1].values), usual_of(steps)
+        reach = self._reach(own if math.isnan(usual) else max(usual, own))
+        # The last rows of them, without a step that would be far ahead itself.
+        breaks = [k for k, step in enumerate(steps, start=1) if step > reach]
+        last = times[breaks[-1] :] if breaks else times
+        span = 0.0 if math.isnan(usual) else AGREE * usual
+        return len(last) >= FEWEST and last[-1] - last[0] >= span
 
-    def _go_back(self, earlier: list[float], found: IntakeOutcome) -> None:
-        """Drop open samples, and mark released ones later than the first waiting row as wrong."""
-        # Open samples are later than the late rows, so they have times of the wrong clock, too.
-        for sample in self._open.values():
-            found.spent += sample.tokens
-        self._open.clear()
-        self._released = deque(earlier, maxlen=self._released.maxlen)
-        self._since = self._last = self._newest = earlier[-1]
+    def _use_ahead(self, found: IntakeOutcome) -> None:
+        """Use the rows that wait."""
+        waiting, self._ahead = self._ahead, []
+        if self.origin is None:
+            # The first row that is used sets t = 0 for all later ones.
+            first = waiting[0].t if waiting else 0.0
+            self.origin = _microseconds(first / self.clock.second) if self._dates else 0.0
+            zero = self.origin * self.clock.second
+            waiting = [replace(one, t=one.t - zero) for one in waiting]
+        for one in waiting:
+            if not self._placed(one, found):
+                found.spent.append(one.token)
+
+    def _refuse(self, rows: Sequence[_Held], found: IntakeOutcome) -> None:
+        """Refuse rows that have waited, as too far ahead."""
+        refused = {id(one) for one in rows}
+        for one in rows:
+            before = f" of the newest row at {self._newest:g}" if self._begun else ""
+            found.remark("leap", "", f"t = {one.t:g} is far ahead{before}", one.token)
+            found.spent.append(one.token)
+        self._ahead = [one for one in self._ahead if id(one) not in refused]
+
+    def _repeats(self, t: float, values: Mapping[str, float]) -> bool:
+        """Return whether a row was accepted before, or waits, with the same values."""
+        waiting = [one.values for one in self._ahead if one.t == t]
+        remembered, journaled = self._known(t)
+        if any(_same(values, known) for known in (*waiting, *(one for _, one in remembered))):
+            return True
+        # The journal has other values than the rows where gaps and spikes were bridged.
+        habits = {name: self.policy.habit(name) for name in values}
+        bridged = {name for name, one in habits.items() if one.interpolated or one.screened}
+        firm = {name: value for name, value in values.items() if name not in bridged} or values
+        return any(_same(firm, known) for _, known in journaled)
+
+    def _known(self, t: float) -> tuple[list[Known], list[Known]]:
+        """Return the accepted samples of a moment: as they came, and in the journal."""
+        low, high = t - self.policy.tolerance, t + self.policy.tolerance
+        found: list[Known] = [
+            (s, sample.values) for s, sample in self._open.items() if low <= s <= high
+        ]
+        if low > self._last:
+            return found, []
+        for s, values in reversed(self._accepted):
+            if s < low:
+                return found, []  # all samples since then are remembered
+            if s <= high:
+                found.append((s, values))
+        return found, [*self.past.between(low, high)] if self.past is not None else []
 
     def withdraw(self, last: float) -> None:
         """Accept rows later than this time again: the samples after it were withdrawn."""
         self._last = self._newest = last
-        while self._released and self._released[-1] > last:
-            self._released.pop()
+        self._times.withdraw(last)
+        while self._accepted and self._accepted[-1][0] > last:
+            self._accepted.pop()
 
     def flush(self) -> IntakeOutcome:
         """Release all open samples at the end of the source."""
         found = IntakeOutcome()
-        self._refuse_leap(found)
-        self._place_pending(found)
+        # Nothing can confirm a single row far ahead any more; several confirm each other.
+        if self._begun and len({one.t for one in self._ahead}) == 1:
+            self._refuse(self._ahead, found)
+        self._use_ahead(found)
         # With an infinite newest time no sample waits any longer.
         self._newest = math.inf
         self._release(found)
@@ -452,26 +459,38 @@ class Intake:
 
     def _placed(self, held: _Held, found: IntakeOutcome) -> bool:
         """Return whether a row became part of a sample."""
-        t, token, said = held.t, held.token, len(found.remarks)
-        about, found.row = found.row, token
-        values = self._values(held.row, found)
-        if not values and len(found.remarks) == said:
-            found.remark("malformed", "", "no value of any channel")
+        t, values = held.t, held.values
+        about, found.row = found.row, held.token
+        found.remarks += held.remarks
         moment = self._moment(t)
         if moment is None:
-            text = f"t = {t:g} is not later than the last sample at {self._last:g}"
-            for channel in values:
-                found.remark("late", channel, text)
-        elif values:
+            self._refuse_late(held, found)
+        else:
             if t < self._newest - self.policy.tolerance:
                 text = f"t = {t:g} came after {self._newest:g}"
                 found.remark("disordered", "", text)
-            self._add(moment, values, token, found)
-        if 0.0 < t - self._newest < math.inf:
-            self._steps.append(t - self._newest)
+            self._add(moment, values, held.token, found)
+            self._times.use(t, values)
         self._newest = max(self._newest, t)
         found.row = about
-        return moment is not None and bool(values)
+        return moment is not None
+
+    def _refuse_late(self, held: _Held, found: IntakeOutcome) -> None:
+        """Count the values of a row that is too late: other values than known ones, or new ones."""
+        both = chain(*self._known(held.t))
+        near = sorted(both, key=lambda sample: abs(sample[0] - held.t))
+        known = near[0][1] if near else {}
+        for name in present(held.values):
+            value, before = held.values[name], known.get(name, NAN)
+            if math.isnan(before):
+                text = f"t = {held.t:g} is not later than the last sample at {self._last:g}"
+                found.remark("late", name, text)
+            elif value != before:
+                text = f"t = {held.t:g} was accepted with {before:g}, and came again with {value:g}"
+                found.remark("conflict", name, text)
+        if self._times.refuse(held.t, held.values):
+            text = f"times went back from t = {self._newest:g} to {held.t:g}: such rows are late"
+            found.remark("clock", "", text)
 
     def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
         """Return the valid values of a row, NaN for missing and invalid ones."""
@@ -493,9 +512,13 @@ class Intake:
             values[channel] = value
         return values
 
-    def _time(self, row: Mapping[str, Any]) -> float | None:
-        """Return the model time of a row, None if it is not between start and stop."""
-        t, dates = row_time(row, self.clock, before=self._dates)
+    def _time(self, row: Mapping[str, Any]) -> tuple[float, float] | None:
+        """Return the time of a row, and how much later the clocks show it again; None: outside.
+
+        It is the model time once t = 0 is known, else seconds since 1970 if times are dates.
+        """
+        stated, dates = row_time(row, self.clock, before=self._dates)
+        t = stated + self.policy.shift
         low, high = self.clock.bounds(dates, "data")
         if not low <= t <= high:
             return None
@@ -503,15 +526,13 @@ class Intake:
             was, is_now = ("number", "date") if dates else ("date", "number")
             raise SampleError(f"the time is a {is_now}; it was a {was} before")
         self._dates = dates
-        # The first row within the bounds sets t = 0 for all later ones.
-        if self.origin is None:
-            self.origin = _microseconds(t / self.clock.second) if dates else 0.0
         if not dates:
-            return t + self.shift
-        moment = t - self.origin * self.clock.second + self.shift
-        if moment <= self._last and is_naive(row.get(self.clock.name), self.clock):
-            moment += self.clock.repeated_hour(t)  # the second pass at the end of summer time
-        return moment
+            return t, 0.0
+        if self.origin is None:
+            _microseconds(t / self.clock.second)  # raises for a time that is no date in UTC
+        naive = is_naive(row.get(self.clock.name), self.clock)
+        again = self.clock.repeated_hour(stated) if naive else 0.0
+        return t - (self.origin or 0.0) * self.clock.second, again
 
     def _moment(self, t: float) -> float | None:
         """Return the moment that a time belongs to, None if its sample was released."""
@@ -527,9 +548,9 @@ class Intake:
         sample.tokens.append(token)
         for channel, value in values.items():
             known = sample.values.get(channel, math.nan)
-            if not (math.isnan(known) or math.isnan(value)):
+            if not (math.isnan(known) or math.isnan(value)) and value != known:
                 text = f"a second value for t = {moment:g}: {value:g} after {known:g}"
-                found.remark("repeated", channel, text)
+                found.remark("conflict", channel, text)
                 if self.policy.keeps(channel) == "first":
                     continue
             # An empty cell of a second row must not erase a value that has come.
@@ -547,6 +568,7 @@ class Intake:
 
     def _complete(self, t: float, sample: _Open, found: IntakeOutcome) -> None:
         """Release a sample, or leave it out if a channel is missing that it needs."""
+        came = dict(sample.values)
         for channel in self.columns:
             self._bridge(channel, t, sample, found)
         for channel in without_noise(self.columns, sample.values):
@@ -563,9 +585,16 @@ class Intake:
             found.spent += sample.tokens
             return
         self._recent.append((t, sample.values))
-        self._released.append(t)
-        since, self._since = self._since, None
-        found.ready.append(Ready(t, sample.values, tuple(sample.tokens), since))
+        self._remember(t, came)
+        found.ready.append(Ready(t=t, values=sample.values, tokens=tuple(sample.tokens)))
+
+    def _remember(self, t: float, came: dict[str, float]) -> None:
+        """Remember an accepted sample, at least until the journal has it."""
+        self._accepted.append((t, came))
+        if len(self._accepted) > 2 * REMEMBERED:
+            kept = math.inf if self.past is None else self.past.last
+            while len(self._accepted) > REMEMBERED and self._accepted[0][0] <= kept:
+                self._accepted.popleft()
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""
@@ -621,10 +650,11 @@ class Intake:
 
 
 def _same(values: Mapping[str, float], known: Mapping[str, float]) -> bool:
-    """Return whether a sample has the same values in all channels that both have, if any."""
-    pairs = [(value, known.get(name, NAN)) for name, value in values.items()]
-    both = [(a, b) for a, b in pairs if not (math.isnan(a) or math.isnan(b))]
-    return bool(both) and all(a == b for a, b in both)
+    """Return whether the values of a row are those of a sample."""
+    return all(
+        known.get(name, NAN) == value or (math.isnan(value) and name in known)
+        for name, value in values.items()
+    )
 
 
 def _microseconds(stamp: float) -> float:

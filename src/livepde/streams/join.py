@@ -76,8 +76,10 @@ def join_tables(
     remarks = Counter({("skipped", name): n for name, n in zip(needed, lacking, strict=True)})
     remarks = sum((Counter(table.remarks) for table in tables), remarks)  # drops counts of zero
     if first is None:
-        return DataTable(t, values, tuple(names), None, remarks)
-    return DataTable(t - t[0], values, tuple(names), origin_at(first + t[0] / second), remarks)
+        return DataTable(t, values, tuple(names), origin=None, remarks=remarks)
+    return DataTable(
+        t - t[0], values, tuple(names), origin=origin_at(first + t[0] / second), remarks=remarks
+    )
 
 
 def _on_one_clock(

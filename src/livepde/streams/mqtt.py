@@ -328,16 +328,16 @@ class MqttSource(_Peer, RowSource):
         if column is None:
             return json_row(payload, token)
         if len(payload) > LONGEST:
-            return Row({}, token, f"longer than {LONGEST} characters")
+            return Row({}, token=token, broken=f"longer than {LONGEST} characters")
         try:
             found = json.loads(payload)
         except (ValueError, RecursionError) as error:
-            return Row({}, token, f"not a number ({type(error).__name__})")
+            return Row({}, token=token, broken=f"not a number ({type(error).__name__})")
         values = found if isinstance(found, dict) else {"value": found}
         if self._time not in values and old:
-            return Row({}, token, "kept by the broker without a time")
+            return Row({}, token=token, broken="kept by the broker without a time")
         moment = values.get(self._time, datetime.now(UTC).isoformat())
-        return Row({self._time: moment, column: values.get("value")}, token)
+        return Row({self._time: moment, column: values.get("value")}, token=token)
 
     def _columns(self, topic: str) -> list[str | None]:
         """Return the column of a topic that is listened to, nothing for others."""

@@ -161,7 +161,7 @@ class OpcuaSource(RowSource):
         if self._seen.get(column) == moment:
             return
         self._seen[column] = moment
-        row = Row({}, None, f"'{column}' is {found.StatusCode.name}")
+        row = Row({}, token=None, broken=f"'{column}' is {found.StatusCode.name}")
         if found.StatusCode.is_good():
             time = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
             row = Row({self._time: time.isoformat(), column: found.Value.Value})

@@ -179,12 +179,12 @@ class Smoothed(Iterable[Sample]):
 
     def _write(self, sample: Sample, smooth: Array) -> Sample:
         if not isinstance(sample.z, Mapping):
-            return Sample(sample.t, smooth, sample.inputs)
+            return Sample(t=sample.t, z=smooth, inputs=sample.inputs)
         named = dict(sample.z)
         for name, value in zip(self._names or (), smooth.tolist(), strict=True):
             if name in named:
                 named[name] = value
-        return Sample(sample.t, named, sample.inputs)
+        return Sample(t=sample.t, z=named, inputs=sample.inputs)
 
     def _learn(self, t: float, z: Array) -> None:
         if self.smoother.noise is not None:

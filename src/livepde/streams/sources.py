@@ -12,7 +12,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -45,6 +45,7 @@ class Row:
     """
 
     values: Mapping[str, Any]
+    _: KW_ONLY
     token: Any = None
     broken: str = ""
 
@@ -82,14 +83,14 @@ class RowSource(Protocol):
 def json_row(text: str | bytes, token: Any = None) -> Row:
     """Return the row in a line of JSON: an object, column -> value."""
     if len(text) > LONGEST:
-        return Row({}, token, f"longer than {LONGEST} characters")
+        return Row({}, token=token, broken=f"longer than {LONGEST} characters")
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:
-        return Row({}, token, f"not JSON ({type(error).__name__})")
+        return Row({}, token=token, broken=f"not JSON ({type(error).__name__})")
     if not isinstance(found, dict):
-        return Row({}, token, "not an object, column -> value")
-    return Row(found, token)
+        return Row({}, token=token, broken="not an object, column -> value")
+    return Row(found, token=token)
 
 
 def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
@@ -121,7 +122,7 @@ class Follow(RowSource):
 
     A line is read once its end has been written. A file that is replaced by another (rotated logs)
     is read to its end before the new one; one that has become shorter is read again from its start,
-    where known samples are late. Unread rows of a file that was renamed are lost after a crash.
+    where known rows are repeated. Unread rows of a file that was renamed are lost after a crash.
 
     Parameters
     ----------
@@ -265,22 +266,24 @@ class Follow(RowSource):
         if self._json:
             return json_row(line, token)
         if len(line) > LONGEST:
-            return Row({}, token, f"longer than {LONGEST} characters")
+            return Row({}, token=token, broken=f"longer than {LONGEST} characters")
         try:
             cells = self._cells(line)
         except (UnicodeError, csv.Error) as error:
             if self._head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-                return Row({}, token, "the file is in UTF-16, not to be followed: write UTF-8")
-            return Row({}, token, f"not a line of a CSV file ({type(error).__name__})")
+                return Row(
+                    {}, token=token, broken="the file is in UTF-16, not to be followed: write UTF-8"
+                )
+            return Row({}, token=token, broken=f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
             self._header = _names(cells)
             twice = sorted(set(cells) - set(self._header))
             text = "two columns are called '{}', and none of them is taken: rename one"
-            return Row({}, token, text.format(twice[0])) if twice else None
+            return Row({}, token=token, broken=text.format(twice[0])) if twice else None
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
-            return Row({}, token, text)
-        return Row(dict(zip(self._header, cells, strict=False)), token)
+            return Row({}, token=token, broken=text)
+        return Row(dict(zip(self._header, cells, strict=False)), token=token)
 
     def _cells(self, line: bytes) -> list[str]:
         text = line.decode(self._encoding)

@@ -7,7 +7,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from datetime import datetime
 from itertools import chain, islice
 from pathlib import Path
@@ -110,6 +110,7 @@ class DataTable:
     t: Array
     values: Array
     names: tuple[str, ...]
+    _: KW_ONLY
     origin: datetime | None = None
     remarks: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
@@ -118,7 +119,7 @@ class DataTable:
 
     def __iter__(self) -> Iterator[Sample]:
         for t, row in zip(self.t.tolist(), self.values.tolist(), strict=True):
-            yield Sample(t, dict(zip(self.names, row, strict=True)))
+            yield Sample(t=t, z=dict(zip(self.names, row, strict=True)))
 
 
 def read_json_lines(
@@ -270,7 +271,9 @@ def to_table(
     if dates:
         origin = origin_at(float(t[0]) / clock.second)
         t = t - t[0]
-    return DataTable(t, values, tuple(columns), origin, +remarks)  # + drops counts of zero
+    return DataTable(
+        t, values, tuple(columns), origin=origin, remarks=+remarks
+    )  # + drops counts of zero
 
 
 def _chosen(
@@ -346,7 +349,7 @@ class JsonLines:
             last = t
             values = self._values(row, where)
             if not any(math.isnan(values[channel]) for channel in needed):
-                yield Sample(t - zero, values)
+                yield Sample(t=t - zero, z=values)
 
     def _values(self, row: Mapping[str, Any], where: str) -> dict[str, float]:
         """Return the values of the channels in a row, NaN where they are missing or not valid."""

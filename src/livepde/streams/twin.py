@@ -205,7 +205,7 @@ class Twin:
         for t, z in zip(self.times, self.exact_data, strict=True):
             if self.noise is not None:
                 z = z + self.noise.std(z, self._gram) * rng.standard_normal(len(z))
-            yield Sample(float(t), z.copy(), self._inputs(float(t)) or None)
+            yield Sample(t=float(t), z=z.copy(), inputs=self._inputs(float(t)) or None)
 
     def _inputs(self, t: float) -> Mapping[str, float]:
         return self.inputs(t) if self.inputs is not None else {}

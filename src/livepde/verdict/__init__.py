@@ -1,12 +1,15 @@
-"""Verdict of a run on itself: trusted, caution or do not trust, with the findings against it."""
+"""Verdict of a run on itself: its level, with the findings against it."""
 
 from livepde.verdict.assess import Position, assess
 from livepde.verdict.channel_ledgers import InputLedger, WithheldLedger
 from livepde.verdict.directions import Dictionary, ScoreDirection
 from livepde.verdict.findings import (
+    FEWEST,
     FLAT,
     LEVELS,
     MOST,
+    NOT_JUDGED,
+    NUMBERS,
     TELLING,
     Cause,
     Finding,
@@ -14,15 +17,19 @@ from livepde.verdict.findings import (
     Verdict,
     at_bound,
     flat,
+    too_few,
 )
 from livepde.verdict.judge import Judge, ScoredSample
 from livepde.verdict.ledger import WINDOWS, Ledger
 from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
 
 __all__ = [
+    "FEWEST",
     "FLAT",
     "LEVELS",
     "MOST",
+    "NOT_JUDGED",
+    "NUMBERS",
     "REFINE",
     "TELLING",
     "WINDOWS",
@@ -44,4 +51,5 @@ __all__ = [
     "discretised",
     "flat",
     "held_inputs",
+    "too_few",
 ]

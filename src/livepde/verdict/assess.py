@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -24,18 +24,26 @@ from livepde.verdict.evidence import (
     mean_squares,
     quiet,
 )
-from livepde.verdict.findings import Cause, Finding, Severity, Verdict, channel_setting
+from livepde.verdict.findings import (
+    FEWEST,
+    Cause,
+    Finding,
+    Severity,
+    Verdict,
+    channel_setting,
+    too_few,
+)
 from livepde.verdict.ledger import Ledger
 
 __all__ = ["Position", "assess"]
 
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
-FEWEST = 20  # samples before which there is nothing to judge by
 LARGER = 1.5  # times the stated noise that is worth a note
 SMALLER = 0.5
 FAR = 3.0  # standard deviations between a sensor that stands still and its prediction
 REFUSED = 0.02  # share of the readings that a gate refuses
 MENDED = 128  # samples of a new window after which a fault may count as mended
+BRIEF = 10  # readings that contradict the model after a pause, say
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
@@ -69,6 +77,11 @@ class Position:
         Label of each reduced unknown that stays.
     moving
         Whether unknowns move.
+    aside
+        Sensors that are set aside: name -> (since when, last reading minus prediction).
+    apart, strain
+        How many sensors correct the state but not the unknowns, and the number of readings of one
+        sensor that did so, since a disturbance began.
     """
 
     ledger: Ledger
@@ -80,20 +93,22 @@ class Position:
     time_unit: str
     unknowns: Sequence[str]
     moving: bool
+    aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    apart: int = 0
+    strain: int = 0
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
     """Return the verdict on one member."""
     seen = int(at.ledger.seen)
     if seen < FEWEST:
-        text = f"There are {seen} samples: too few to judge by."
-        few = Finding("samples", "caution", text, evidence=float(seen))
-        return Verdict.of([few], dictionary.left_out)
+        untested = (too_few("innovations", seen), *dictionary.left_out)
+        return Verdict.of((), untested, judged=False)
     evidence = causes_of(at.ledger)
     findings = list(_misfit(dictionary, at, evidence))
     if not findings:
         findings += _records(at, evidence)
-    findings += [*_noise(at), *_stuck(at), *_refused(at), *_prior(at)]
+    findings += [*_noise(at), *_stuck(at), *_aside(at), *_disturbed(at), *_refused(at), *_prior(at)]
     return Verdict.of(findings, dictionary.left_out, _unseen(dictionary, at))
 
 
@@ -388,9 +403,41 @@ def _stuck(at: Position) -> Iterator[Finding]:
     off = np.abs(ledger.value - ledger.last) / at.noise
     for i in np.flatnonzero((ledger.stuck >= STANDS - 1) & (off > FAR)):
         name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
+        if name in at.aside:  # its readings are not used
+            continue
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
         cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
+
+
+def _aside(at: Position) -> Iterator[Finding]:
+    """Return which sensors are not used, because their readings contradict all else."""
+    time = f" {at.time_unit}" if at.time_unit else ""
+    for name, (since, off) in at.aside.items():
+        unit = f" {at.unit.replace('degC', 'K')}" if at.unit else ""
+        text = (
+            f"{name} is set aside since t = {since:g}{time}: its readings disagree with the model "
+            f"and with the other sensors or its own past, at last by {off:+.3g}{unit}."
+        )
+        cause = Cause("sensor", name, f"sensor {name} is broken or displaced")
+        remedy = (
+            f"Check {name}. If it shows a value that stands for no reading, add it to `missing`."
+        )
+        yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
+
+
+def _disturbed(at: Position) -> Iterator[Finding]:
+    """Return whether most readings contradict the model, or did so until a short while ago."""
+    if not at.strain:
+        return
+    text = (
+        "Most readings contradict the model, or did so in the last samples: the process or an "
+        "input has changed. They correct the state; the unknowns are kept as they were before."
+    )
+    remedy = "Allow jumps with `law.jumps = true`, or model the change with `evolution`."
+    # A few readings correct a state that is wrong after a pause: unknowns may stay well.
+    severity: Severity = "do not trust" if at.apart or at.strain > BRIEF else "caution"
+    yield Finding("changed", severity, text, evidence=float(at.strain), remedy=remedy)
 
 
 def _refused(at: Position) -> Iterator[Finding]:

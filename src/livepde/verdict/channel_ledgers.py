@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -10,13 +11,12 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray
 from livepde.verdict.evidence import chance
-from livepde.verdict.findings import Cause, Finding, channel_setting
+from livepde.verdict.findings import FEWEST, Cause, Finding, channel_setting
 from livepde.verdict.shifts import Shifts
 
 __all__ = ["InputLedger", "WithheldLedger"]
 
 HELD = 0.02  # share of the samples in which the last value of an input was held
-FEWEST = 20  # values before which there is nothing to judge by
 CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
 SIMILAR = 0.05  # relative difference of a slope to that of a unit
 UNITS = (
@@ -38,15 +38,20 @@ class InputLedger:
         Number of samples, and of those in which each channel was held, shape (1 + channels,).
     held
         Time for which each channel has been held by now, shape (channels,); 0 if it has a value.
+    unstated
+        1 for each channel without a value at the initial time, whose first one was held over the
+        first interval, shape (channels,).
     """
 
     counts: IntArray
     held: Array
+    unstated: Array
 
     @classmethod
     def start(cls, channels: int) -> InputLedger:
         """Return the value before any sample."""
-        return cls(np.zeros(1 + channels, dtype=np.int64), np.zeros(channels))
+        none = np.zeros(channels)
+        return cls(counts=np.zeros(1 + channels, dtype=np.int64), held=none, unstated=none)
 
     def add(self, length: float, missing: Array) -> InputLedger:
         """Return the value after an interval; `missing`: 1 for channels that are held at its end.
@@ -56,7 +61,7 @@ class InputLedger:
         counts = self.counts.copy()
         counts[0] += 1  # of all samples
         counts[1:] += missing > 0.0
-        return InputLedger(counts, (self.held + length) * missing)
+        return replace(self, counts=counts, held=(self.held + length) * missing)
 
     def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
         """Return for how long channels were held by now, and whether they are once more."""
@@ -64,7 +69,7 @@ class InputLedger:
         return {name: (held, again) for name, held, again in each if held or again}
 
     def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
-        """Return which channels were held in more than 2 % of the samples.
+        """Return which channels were held in more than 2 % of the samples, and which at the start.
 
         Parameters
         ----------
@@ -79,6 +84,13 @@ class InputLedger:
             if by
             else " By how much that moves the estimates is not known."
         )
+        for name in itertools.compress(names, self.unstated.tolist()):
+            text = (
+                f"Channel {name} had no value at the initial time: its first one was held over the "
+                "first interval."
+            )
+            remedy = f"Send a sample with {name} at the initial time."
+            yield Finding("input", "note", text, name, remedy=remedy)
         for name, count in zip(names, self.counts[1:].tolist(), strict=True):
             share = count / samples
             if share <= HELD:

@@ -217,8 +217,7 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     step = SHIFT * float((high - low).max())
-    block, _ = observed.state.component(observation.of)
-    found = []
+    found, sensors = [], range(len(at))
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
         # Central differences; at the edge of the box they are one-sided, and `width` is shorter.
@@ -226,13 +225,10 @@ def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], fl
             moved = at.copy()
             moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])
             try:
-                rows = sp.csr_array(block.probe(moved.T, "sensor"))
+                ends.append(observation.rows(observed.state, moved, sensors))
             except ObservationError:  # outside of a mesh that is no box
                 moved = at.copy()
-                rows = sp.csr_array(block.probe(moved.T, "sensor"))
-            if rows.shape[0] != len(at):  # sensors of vectors, each with several readings
-                return [], np.nan
-            ends.append(observed.state.widen(rows, observation.of))
+                ends.append(observation.rows(observed.state, moved, sensors))
             width += sign * moved[:, axis]
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
         found.append(sp.csr_array(scale @ (ends[1] - ends[0])))

@@ -10,9 +10,12 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 __all__ = [
+    "FEWEST",
     "FLAT",
     "LEVELS",
     "MOST",
+    "NOT_JUDGED",
+    "NUMBERS",
     "TELLING",
     "Cause",
     "Finding",
@@ -22,14 +25,22 @@ __all__ = [
     "at_bound",
     "channel_setting",
     "flat",
+    "too_few",
 ]
 
-Level: TypeAlias = Literal["trusted", "caution", "do not trust"]
+Level: TypeAlias = Literal["trusted", "caution", "not judged", "do not trust"]
 Severity: TypeAlias = Literal["note", "caution", "do not trust"]
 Measure: TypeAlias = Literal["e-value", "p-value", "number"]
 
-LEVELS: tuple[Level, ...] = ("trusted", "caution", "do not trust")
-RANK = {"note": 0, "trusted": 0, "caution": 1, "do not trust": 2}
+NOT_JUDGED: Literal["not judged"] = "not judged"
+# From the best to the worst: of a run that nobody has judged nothing is known, not even what a
+# caution says.
+LEVELS: tuple[Level, ...] = ("trusted", "caution", NOT_JUDGED, "do not trust")
+NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not trust": 2}
+"""Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
+
+WORST: dict[Severity, Level] = {"note": "trusted", "caution": "caution", "do not trust": LEVELS[-1]}
+FEWEST = 20  # samples before which there is nothing to judge by
 FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
@@ -165,6 +176,11 @@ def channel_setting(name: str, key: str, value: str) -> str:
     return f"channels.{quoted}.{key}={value}"
 
 
+def too_few(what: str, samples: int) -> str:
+    """Return why a test was not made, for `Verdict.untested`: there are too few samples."""
+    return f"{what}: there are {samples} samples, {FEWEST} are needed"
+
+
 def at_bound(label: str, value: float) -> Finding:
     """Return the finding of an unknown that ends at a bound."""
     text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
@@ -187,20 +203,25 @@ class Verdict:
     Attributes
     ----------
     level
-        "trusted", "caution" or "do not trust".
+        "trusted", "caution", "not judged" or "do not trust". A run whose main tests were not made
+        is not judged, unless something says not to trust it.
     findings
         Findings against the estimates, the worst first, and notes.
     untested
-        Tests that were not made, and why.
+        Tests that were not made, and why; of a run that is not judged the main ones come first.
     unseen
         Errors that the data would not show and that would yet move an estimate by more than its
         interval, as sentences, the worst first.
+    judged
+        Whether the main tests were made: what is left of the readings, or of the equation, is noise
+        if the model is right.
     """
 
     level: Level
     findings: tuple[Finding, ...] = ()
     untested: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
+    judged: bool = True
 
     @classmethod
     def of(
@@ -208,23 +229,37 @@ class Verdict:
         findings: Iterable[Finding],
         untested: Iterable[str] = (),
         unseen: Iterable[str] = (),
+        *,
+        judged: bool = True,
     ) -> Verdict:
         """Return the verdict of some findings: the worst of them counts."""
-        ordered = sorted(findings, key=lambda finding: -RANK[finding.severity])
-        worst = max((RANK[finding.severity] for finding in ordered), default=0)
-        untested = tuple(dict.fromkeys(untested))
-        return cls(LEVELS[worst], tuple(ordered), untested, tuple(unseen))
+
+        def rank(finding: Finding) -> int:
+            return LEVELS.index(WORST[finding.severity])
+
+        ordered = sorted(findings, key=rank, reverse=True)
+        least = LEVELS.index("trusted" if judged else NOT_JUDGED)
+        return cls(
+            level=LEVELS[max([least, *map(rank, ordered)])],
+            findings=tuple(ordered),
+            untested=tuple(dict.fromkeys(untested)),
+            unseen=tuple(unseen),
+            judged=judged,
+        )
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
         """Return the verdict that `to_dict` has written."""
         findings = [Finding.from_dict(item) for item in stored["findings"]]
-        return cls.of(findings, stored["untested"], stored["unseen"])
+        # Earlier versions stored no "judged", but said in `untested` that nothing was.
+        told = any(text.startswith(("innovations", "everything")) for text in stored["untested"])
+        judged = stored.get("judged", not told)
+        return cls.of(findings, stored["untested"], stored["unseen"], judged=judged)
 
     @classmethod
     def unjudged(cls) -> Verdict:
         """Return the verdict where nothing was looked at."""
-        return cls.of((), ("everything: no law has judged the run",))
+        return cls.of((), ("everything: no law has judged the run",), judged=False)
 
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
         """Return the verdict with more findings, none of which is said twice.
@@ -235,12 +270,22 @@ class Verdict:
         new = [finding for finding in more if finding.text not in said]
         later = {(finding.what, finding.subject) for finding in new if finding.subject}
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
-        return Verdict.of([*kept, *new], self.untested, self.unseen)
+        return Verdict.of([*kept, *new], self.untested, self.unseen, judged=self.judged)
+
+    @property
+    def every_sentence(self) -> list[str]:
+        """Whether the run is not judged, and all findings: a sentence each, the worst first."""
+        first = [] if self.judged else [self._not_judged()]
+        return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
+
+    def _not_judged(self) -> str:
+        why = f" ({self.untested[0]})" if self.untested else ""
+        return f"Not judged: whether the model holds was not tested{why}."
 
     @property
     def sentences(self) -> list[str]:
         """At most five sentences, the worst first, each once."""
-        return list(dict.fromkeys(finding.sentence for finding in self.findings))[:MOST]
+        return self.every_sentence[:MOST]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON can hold it."""
@@ -249,6 +294,7 @@ class Verdict:
             "findings": [finding.to_dict() for finding in self.findings],
             "untested": list(self.untested),
             "unseen": list(self.unseen),
+            "judged": self.judged,
         }
 
     def __str__(self) -> str:

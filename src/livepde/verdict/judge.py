@@ -26,8 +26,8 @@ estimate of the unknowns for each unit of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
-from typing import Any, NamedTuple
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +45,8 @@ MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
 
 
-class ScoredSample(NamedTuple):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ScoredSample:
     """Prior of a filter at a sample, with the sample; in units of the noise.
 
     Attributes

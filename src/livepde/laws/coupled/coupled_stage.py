@@ -27,9 +27,7 @@ from livepde.stepping import Near, Newton, Solution, StepFailed
 
 __all__ = ["CoupledStage", "KeptFactor", "nearest_root"]
 
-SMALLEST = 1e-8  # theta at which the search for it begins at the least, in 1/time
 STRIDE = 1.5  # factor between two values of theta that are tried
-WIDEST = 1e6  # factor to both sides within which theta is searched
 SAME = 1e-9  # of a step: steps that are the same but for rounding
 ACCURACY = 1e-8  # relative, of theta: Newton goes on from there
 
@@ -92,23 +90,29 @@ class _CoupledEquation:
         return self.solver.terms.limited(self.data, at, allowed)
 
 
-def nearest_root(function: Callable[[float], float], start: float) -> float | None:
+def nearest_root(
+    function: Callable[[float], float], start: float, least: float, most: float
+) -> float | None:
     """Return a root of a function of a positive number, the nearest one to both sides of a start.
 
-    None: there is none within a factor of `WIDEST`.
+    None: there is none between the two ends.
     """
     # Each value is asked for once: that of a stage depends on where its iteration began.
     values = cache(function)
+    start = min(max(start, least), most)
     first = values(start)
     if first == 0.0:
         return start
-    outward = 1 if first > 0.0 else -1  # where theta is too small a root lies above it
-    for k in range(1, int(math.log(WIDEST) / math.log(STRIDE)) + 1):
-        for end in (outward * k, -outward * k):
-            inner = end - 1 if end > 0 else end + 1
-            near, far = start * STRIDE**inner, start * STRIDE**end
-            if (values(far) > 0.0) != (values(near) > 0.0):
-                low, high = sorted((near, far))
+    # Where theta is too small a root lies above it.
+    ends = {1: most, -1: least}
+    sides = (1, -1) if first > 0.0 else (-1, 1)
+    near = dict.fromkeys(sides, start)
+    while any(near[side] != ends[side] for side in sides):
+        for side in sides:
+            inner, end = near[side], ends[side]
+            near[side] = min(inner * STRIDE, end) if side > 0 else max(inner / STRIDE, end)
+            if (values(near[side]) > 0.0) != (values(inner) > 0.0):
+                low, high = sorted((inner, near[side]))
                 return float(scipy.optimize.brentq(values, low, high, rtol=ACCURACY))
     return None
 
@@ -176,7 +180,8 @@ class CoupledStage:
         """Return the solution whose theta is nearest to that of the start; raises `StepFailed`.
 
         Where theta is given the stage is all but linear. So theta is found as the root of one
-        scalar function, which has a root: a rule is bounded and continuous.
+        scalar function. It has a root between ends that are known beforehand: a rule is continuous,
+        positive without any pull, and bounded, by mu/(floor ||u_alpha||_V~) for a constant mu.
         """
         data, newton = equation.data, replace(self.newton, share=0.0)
         y = start
@@ -189,8 +194,8 @@ class CoupledStage:
             y = at.y
             return self.terms.damped(data, at.norms) - theta
 
-        first = max(equation.evaluate(start).theta, SMALLEST)
-        root = nearest_root(gap, first)
+        first, ends = equation.evaluate(start).theta, self.terms.bracket(data)
+        root = nearest_root(gap, first, *ends)
         if root is None:
             raise StepFailed("not_converged", "no weight theta of the damping solves the stage")
         gap(root)

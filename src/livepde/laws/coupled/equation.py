@@ -340,6 +340,14 @@ class StageTerms:
         """
         return min(self.damping.theta(norms), STIFFEST / data.problem.h)
 
+    def bracket(self, data: StageData) -> tuple[float, float]:
+        """Return two ends between which the theta of a solved stage lies.
+
+        Below the first the pull is rounding. The second is the bound of the rule.
+        """
+        h = data.problem.h
+        return 1.0 / (STIFFEST * h), min(self.damping.most(data.observed()), STIFFEST / h)
+
     def theta(self, data: StageData, norms: Residual) -> float:
         """Return the weight of R^T M_op r."""
         own = data.problem.metric.theta

@@ -1,0 +1,294 @@
+"""Rows that arrive twice, clocks that go back, bits that flip, and variables that a case asks for.
+
+A rod's end is warmed and cooled; rows 200 to 299 come again after row 299, by a file, by standard
+input and by a broker. Right are the estimates of the run without the repeat, to the bit, and by a
+fit that does not use livepde (finite differences, Crank-Nicolson, `scipy.optimize.least_squares`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_banded
+from scipy.optimize import least_squares
+
+from benchmarks.faults.plants import BROKER, Mosquitto, Topic
+from livepde.cases import Case, load
+from livepde.cases.data import passwords_of
+from livepde.cases.live_case import LiveCase
+from livepde.errors import CaseError, RunError
+from livepde.linalg import Array
+from livepde.result import Estimate
+from livepde.runs import RunWriter
+from livepde.runs import open as open_run
+from livepde.runs.live_loop import Sink
+from livepde.runs.outcome import Check
+
+__all__ = ["checks"]
+
+COUNT, FIRST, END = 600, 200, 300  # rows, and those of them that come again
+ALPHA, STEP, NOISE = 2e-5, 60.0, 0.05  # m^2/s, s, K
+CELLS, SUBSTEPS = 120, 4  # of the finite differences
+BACK, EVERY = 3.5, 30  # steps by which the clock goes back, and how often
+FLIPS = 200
+PATIENCE = 60.0  # seconds for the run of a broker
+_CASE = """equation = "heat"
+initial = "interpolate"
+
+[mesh]
+from = "0 m"
+to = "1 m"
+cells = 40
+
+[data]
+time = "time"
+{source}
+
+[unknowns.alpha]
+prior = "3e-5 m^2/s"
+std = "1e-5 m^2/s"
+bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
+
+[channels]
+left = {{ role = "boundary", column = "left", at = "left", unit = "degC" }}
+T_3 = {{ role = "sensor", column = "T_3", at = "0.3 m", unit = "degC" }}
+T_6 = {{ role = "sensor", column = "T_6", at = "0.6 m", unit = "degC" }}
+
+[boundary]
+right = "20 degC"
+
+[law]
+kind = "sensitivity"
+noise = "{noise} K"
+"""
+Row = dict[str, float]
+
+
+def checks() -> list[Check]:
+    """Return the checks of repeated rows, clocks, flipped bits and variables."""
+    rows = rod()
+    repeated = [*rows[:END], *rows[FIRST:END], *rows[END:]]
+    back = [{**row, "time": row["time"] - BACK * STEP * (k // EVERY)} for k, row in enumerate(rows)]
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        right = _from_file(folder / "right", rows)
+        found = [
+            *_fitted(right, fit(rows)),
+            *_repeats("file", _from_file(folder / "file", repeated), right),
+            *_repeats("standard input", _from_lines(folder / "lines", repeated), right),
+            *_from_topic(folder / "topic", repeated, right),
+            *_went_back(_from_file(folder / "back", back), back),
+        ]
+        return [*found, *_flips(folder / "flips", right.data), *_variables(folder / "variables")]
+
+
+def rod() -> list[Row]:
+    """Return the rows of a rod by finite differences, with white noise on its sensors."""
+    rng = np.random.default_rng(36)
+    times = STEP * np.arange(COUNT)
+    left = 20.0 + 5.0 * np.sin(2e-4 * times) + 3.0 * np.sin(9e-4 * times)
+    T = simulated(ALPHA, left) + NOISE * rng.standard_normal((COUNT, 2))
+    columns = {"time": times, "left": left, "T_3": T[:, 0], "T_6": T[:, 1]}
+    return [{name: float(values[k]) for name, values in columns.items()} for k in range(COUNT)]
+
+
+def simulated(alpha: float, left: Array) -> Array:
+    """Return the temperatures at 0.3 and 0.6 m of a rod at 20 degrees whose left end is given."""
+    h, dt = 1.0 / CELLS, STEP / SUBSTEPS
+    r = 0.5 * alpha * dt / h**2
+    bands = np.zeros((3, CELLS - 1))
+    bands[0], bands[1], bands[2] = -r, 1.0 + 2.0 * r, -r
+    u, found = np.full(CELLS + 1, 20.0), []
+    places = [round(0.3 * CELLS), round(0.6 * CELLS)]
+    for k, end in enumerate(left):
+        start = left[max(k - 1, 0)]
+        for j in range(SUBSTEPS if k else 0):
+            b = u[1:-1] + r * np.diff(u, 2)
+            u[0] = start + (end - start) * (j + 1) / SUBSTEPS
+            b[0] += r * u[0]
+            b[-1] += r * u[-1]
+            u[1:-1] = solve_banded((1, 1), bands, b)
+        found.append(u[places].copy())
+    return np.array(found)
+
+
+def fit(rows: Sequence[Row]) -> float:
+    """Return the diffusivity by least squares on all rows."""
+    left = np.array([row["left"] for row in rows])
+    measured = np.array([[row["T_3"], row["T_6"]] for row in rows])
+
+    def residual(p: Array) -> Array:
+        off: Array = (simulated(1e-5 * float(p[0]), left) - measured).ravel() / NOISE
+        return off
+
+    answer = least_squares(residual, [3.0])
+    return 1e-5 * float(answer.x[0])
+
+
+class _Done:
+    """What is kept of a run: its dataset, counts, times and events."""
+
+    def __init__(self, live: Any) -> None:
+        self.data = live.result.to_xarray()
+        self.counts = live.journal.counts
+        self.events = [event.message for event in live.journal.events]
+        self.times = [record.t for record in live.journal]
+
+    @property
+    def alpha(self) -> tuple[float, float]:
+        """Final estimate and its standard deviation."""
+        return float(self.data["alpha"][-1]), float(self.data["alpha_std"][-1])
+
+
+class _Last(Sink):
+    """Stops a run, which a broker never ends, at its last estimate."""
+
+    def __init__(self, stopping: threading.Event) -> None:
+        self._stopping = stopping
+
+    def put(self, estimate: Estimate) -> None:
+        """Take one estimate."""
+        if estimate.t >= STEP * (COUNT - 1):
+            self._stopping.set()
+
+
+def _case(folder: Path, source: str = "") -> Case:
+    folder.mkdir(exist_ok=True)
+    path = folder / "case.toml"
+    path.write_text(_CASE.format(source=source, noise=NOISE))
+    return load(path)
+
+
+def _ran(case: Case, data: Any = None) -> _Done:
+    with LiveCase(case, data) as wiring:
+        live = wiring.live()
+        if live is None:
+            raise RunError("benchmark silent: a run did not begin.")
+        live.run()
+        return _Done(live)
+
+
+def _from_file(folder: Path, rows: Sequence[Row]) -> _Done:
+    case = _case(folder, 'file = "rows.csv"')
+    lines = [",".join(rows[0]), *(",".join(map(repr, row.values())) for row in rows)]
+    (folder / "rows.csv").write_text("\n".join(lines) + "\n")
+    return _ran(case, str(folder / "rows.csv"))
+
+
+def _from_lines(folder: Path, rows: Sequence[Row]) -> _Done:
+    return _ran(_case(folder), iter([json.dumps(row) + "\n" for row in rows]))
+
+
+def _from_topic(folder: Path, rows: Sequence[Row], right: _Done) -> list[Check]:
+    if shutil.which("mosquitto", path=BROKER) is None:
+        text = "MQTT: left out, there is no broker here (install mosquitto)"
+        return [_none(text, 0)]
+    folder.mkdir()
+    with ExitStack() as stack:
+        broker = Mosquitto(folder)
+        stack.callback(broker.close)
+        topic = Topic(broker, rows, "repeats")
+        stack.callback(topic.close)
+        topic.supply(len(rows))
+        stopping = threading.Event()
+        watch = threading.Timer(PATIENCE, stopping.set)
+        stack.callback(watch.cancel)
+        watch.start()
+        wiring = stack.enter_context(LiveCase(_case(folder, topic.source)))
+        live = wiring.live([_Last(stopping)], stopping)
+        if live is None:
+            raise RunError("benchmark silent: a run did not begin.")
+        live.run()
+        return _repeats("MQTT", _Done(live), right)
+
+
+def _fitted(right: _Done, alpha: float) -> list[Check]:
+    """Return whether the run without the repeat agrees with the fit of another code."""
+    value, std = right.alpha
+    off = abs(value - alpha) / std
+    return [Check("no repeats: alpha, standard deviations off the fit", off, 2.0, "<=")]
+
+
+def _none(what: str, value: float) -> Check:
+    """Return the check that something does not occur."""
+    return Check(what, value, 0, "<=")
+
+
+def _repeats(source: str, found: _Done, right: _Done) -> list[Check]:
+    """Return whether a run with repeated rows is the run without them."""
+    invented = set(found.times) - set(right.times)
+    same = [np.array_equal(found.data[n], right.data[n]) for n in ("alpha", "alpha_std", "time")]
+    counted = abs(found.counts.get(("repeated", ""), 0) - (END - FIRST))
+    return [
+        _none(f"{source}: samples too many or too few", abs(len(found.times) - COUNT)),
+        _none(f"{source}: samples at times that were never measured", len(invented)),
+        _none(f"{source}: estimates that differ in a bit", same.count(False)),
+        _none(f"{source}: repeated rows that are not counted", counted),
+        _none(f"{source}: rows called late, or other", len(found.counts) - 1),
+    ]
+
+
+def _went_back(found: _Done, rows: Sequence[Row]) -> list[Check]:
+    """Return whether the samples are those rows that are later than all before, and it is said."""
+    newest = np.maximum.accumulate([row["time"] for row in rows])
+    kept = [0.0, *newest[1:][np.diff(newest) > 0].tolist()]
+    late = sum(n for (kind, name), n in found.counts.items() if name == "left")
+    episodes, clock = (len(rows) - 1) // EVERY, found.counts.get(("clock", ""), 0)
+    return [
+        _none("clock back: times that were never stated", len(set(found.times) ^ set(kept))),
+        _none("clock back: late rows that are not counted", abs(late - len(rows) + len(kept))),
+        _none("clock back: episodes that are not counted", abs(clock - episodes)),
+        _none("clock back: no event says so", int(not any("went back" in e for e in found.events))),
+    ]
+
+
+def _flips(folder: Path, data: Any) -> list[Check]:
+    """Return how many changed bits of the files of a finished run are not detected."""
+    writer = RunWriter.create(folder, version="1", command=[], title="flips")
+    writer.finish(status="finished", dataset=data)
+    path, rng = folder / "estimates.nc", np.random.default_rng(36)
+    whole, silent = path.read_bytes(), 0
+    for bit in rng.integers(0, 8 * len(whole), FLIPS).tolist():
+        content = bytearray(whole)
+        content[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(content)
+        try:
+            _ = open_run(folder).dataset
+        except RunError:
+            continue
+        silent += 1
+    return [_none(f"estimates.nc: changed bits of {FLIPS} that are not detected", silent)]
+
+
+@contextmanager
+def _variable(name: str) -> Iterator[None]:
+    """Set an environment variable for a while."""
+    os.environ[name] = "a secret"
+    try:
+        yield
+    finally:
+        del os.environ[name]
+
+
+def _variables(folder: Path) -> list[Check]:
+    """Return how often a case gets a variable that the command line has not allowed."""
+    sent = 0
+    for name, allowed in (("MY_SECRET", ()), ("MY_SECRET", ("OTHER",)), ("LIVEPDE_TOKEN", ())):
+        source = f'mqtt = {{ rows = ["a"], port = 1, password_env = "{name}" }}'
+        with _variable(name):
+            case = _case(folder, source)
+            try:
+                passwords_of(case, True, allowed)
+            except CaseError:
+                continue
+            sent += 1
+    return [_none("password_env: variables sent without leave", sent)]

@@ -1,0 +1,176 @@
+"""What a run begins with, and what the numbers of an estimate are.
+
+A boundary value at the start, by finite differences; sensors of a vector, by an exact solution; a
+replay of an unknown that moves, which is refused; moments of a log-normal unknown, in closed form.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import solve_banded
+from skfem import ElementVector
+
+import livepde as lp
+from livepde.runs.outcome import Check
+
+__all__ = ["checks"]
+
+D = 0.3  # diffusivity of the rod
+K = 0.05  # diffusivity of the plate
+CLOSE = 0.003  # of u(0.9), on 20 cells
+
+
+def checks() -> list[Check]:
+    """Return the checks of this part."""
+    return [*_first_value(), *_replay(), *_vector(), *_moments()]
+
+
+# --- a boundary value that u0 states -------------------------------------------------------------
+
+
+def _rod() -> lp.Identifier:
+    mesh = lp.interval(0.0, 1.0, 20)
+    ends: dict[str, Any] = {"left": 0.0, "right": lp.Channel("T")}
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh), dirichlet=ends),
+        {"s": lp.Normal(0.0, std=1.0)},
+        A=lambda q, u, v, x: -q.s * v,
+        B=lambda u, v, x: D * lp.dot(lp.grad(u), lp.grad(v)) - x.inputs["Q"] * v,
+        inputs=["Q"],
+    )
+    law = lp.SensitivityLaw(shadows=None)
+    return lp.Identifier(model, lp.Points({"a": 0.9}, noise=0.01), law, u0=0.0, q0={"s": 0.0})
+
+
+def _differences() -> float:
+    """Return u(0.9) at 0.1 if u(1) goes from 0 to 1 in a straight line: implicit Euler."""
+    cells, steps = 400, 1000
+    r = D * (0.1 / steps) * cells**2
+    bands = np.zeros((3, cells + 1))
+    bands[1], bands[0, 2:], bands[2, :-2] = 1.0 + 2.0 * r, -r, -r
+    bands[1, [0, cells]] = 1.0
+    u = np.zeros(cells + 1)
+    for k in range(steps):
+        u[0], u[cells] = 0.0, (k + 1) / steps
+        u = solve_banded((1, 1), bands, u)
+    return float(u[round(0.9 * cells)])
+
+
+def _first_value() -> list[Check]:
+    expected = _differences()
+    rod = _rod()
+    forecast = float(rod.forecast([0.1], {"T": 1.0, "Q": 0.0})["a"][0])
+    estimate = rod.step(0.1, {"a": np.nan, "T": 1.0, "Q": 0.0})
+    found = float(rod.forecast([0.1])["a"][0])
+    named = [item.subject for item in estimate.verdict.findings if item.what == "input"]
+    return [
+        Check(
+            "error of u(0.9), boundary value at the start by u0", abs(found - expected), CLOSE, "<="
+        ),
+        Check(
+            "the same of a forecast before the first sample", abs(forecast - expected), CLOSE, "<="
+        ),
+        Check(
+            "inputs without a value at the start that are not named",
+            float(named != ["Q"]),
+            0.0,
+            "<=",
+        ),
+    ]
+
+
+# --- a replay of what moves ----------------------------------------------------------------------
+
+
+def _refused(evolution: Any, drift: float = 0.0) -> bool:
+    unknown = lp.Scalar(lp.Normal(1.0, std=0.5), **evolution)
+    mesh = lp.interval(0.0, 1.0, 4)
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh)), {"k": unknown}, A=lambda q, u, v, x: q.k * u * v
+    )
+    law = lp.SensitivityLaw(drift=drift)
+    try:
+        lp.Identifier(model, lp.Points([0.5], noise=0.1), law)
+    except lp.errors.LawError as error:
+        return "leave out `replay`" in str(error)
+    return False
+
+
+def _replay() -> list[Check]:
+    walks = _refused({"evolution": lp.RandomWalk(1.0)})
+    reverts = _refused({"evolution": lp.MeanReverting(1.0)})
+    drifts = _refused({}, drift=0.1)
+    stays = not _refused({})
+    answers = (walks, reverts, drifts, stays)
+    return [
+        Check(
+            "replays of moving unknowns that are not refused",
+            float(answers.count(False)),
+            0.0,
+            "<=",
+        )
+    ]
+
+
+# --- sensors of a vector -------------------------------------------------------------------------
+
+
+def _exact(x: Any, t: float = 0.0) -> Any:
+    """Return two eigenfunctions of the Laplacian on the unit square, which decay separately."""
+    first = np.exp(-2.0 * np.pi**2 * K * t) * np.sin(np.pi * x[0]) * np.sin(np.pi * x[1])
+    other = np.exp(-5.0 * np.pi**2 * K * t) * np.sin(np.pi * x[0]) * np.sin(2.0 * np.pi * x[1])
+    return np.stack([first, other])
+
+
+def _vector() -> list[Check]:
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (5, 5))
+    model = lp.Model(
+        lp.Field(mesh, ElementVector(lp.fem.quadratic(mesh)), dirichlet={"boundary": 0.0}),
+        {"k": lp.LogNormal(0.03, std=0.015)},
+        A=lambda q, u, v, x: q.k * lp.fem.ddot(lp.grad(u), lp.grad(v)),
+    )
+    at, component = {"x": (0.3, 0.4), "y": (0.3, 0.3)}, [0, 1]
+    sensors = lp.Points(at, component=component, noise=1e-3)
+    run = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=_exact)
+    for t in np.linspace(0.05, 1.0, 20):
+        places = zip(at.items(), component, strict=True)
+        estimate = run.step(t, {name: float(_exact(x, t)[c]) for (name, x), c in places})
+    error = abs(estimate.parameters["k"][0] / K - 1.0)
+    try:
+        lp.Identifier(model, lp.Points(at, noise=1e-3), lp.SensitivityLaw(), u0=0.0)
+        said = False
+    except lp.errors.ObservationError:
+        said = True
+    return [
+        Check("relative error of k from two components", error, 0.005, "<="),
+        Check("vector states without component that are not refused", float(not said), 0.0, "<="),
+    ]
+
+
+# --- moments of a log-normal unknown -------------------------------------------------------------
+
+
+def _moments() -> list[Check]:
+    """Return the errors of the moments of a decay rate that one reading tells little of."""
+    mesh = lp.interval(0.0, 1.0, 4)
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh)),
+        {"k": lp.LogNormal(1.0, std=0.8)},
+        A=lambda q, u, v, x: q.k * u * v,
+    )
+    run = lp.Identifier(model, lp.Points([0.5], noise=0.3), lp.SensitivityLaw(), u0=1.0)
+    k = run.step(0.5, [0.7])["k"]
+    spread = (np.log(k.interval(0.95)[1]) - np.log(k.median)) / 1.959963984540054
+    mean = k.median * np.exp(spread**2 / 2.0)
+    return [
+        Check("relative error of the mean", abs(k.mean / mean - 1.0), 1e-9, "<="),
+        Check(
+            "relative error of the standard deviation",
+            abs(k.std / (mean * np.sqrt(np.expm1(spread**2))) - 1.0),
+            1e-9,
+            "<=",
+        ),
+        Check("spread of the logarithm, so that it counts", spread, 0.3, ">="),
+    ]

@@ -1,0 +1,257 @@
+"""The gate: which readings are used, which sensors are set aside, and when they return."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from livepde.laws.member_arrays import changed
+from livepde.linalg import Array, IntArray, Mask
+
+__all__ = ["Gate", "Gated", "Screened"]
+
+MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
+LASTING = 100  # readings that misfit, after which constants have to explain them as well
+CALM = 50  # samples without a correction of the state, after which a disturbance is over
+PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
+SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
+ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """What the gate remembers of each sensor; arrays have the shape (members, sensors).
+
+    Attributes
+    ----------
+    refused, changes
+        Refusals in a row, and how many of these readings differed from the one before.
+    fits
+        Readings in a row that fit, of a sensor of which too many did not.
+    taken
+        Readings that were used, at most `SETTLED`.
+    aside
+        Sensors that are set aside.
+    apart
+        Sensors that are believed, and correct the state but not the unknowns.
+    since, off
+        Time of the first refusal in a row, and the last innovation; NaN without a refusal.
+    low, high
+        Range of the readings that were used; NaN before.
+    last, run, longest
+        The last reading, how often it has been repeated, and the longest repetition of a reading
+        that was used.
+    strain
+        Readings that misfit while they corrected the state, since a disturbance began.
+    calm
+        Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
+    pace
+        Longest usual interval between samples, shape (members,); 0 before.
+    """
+
+    refused: IntArray
+    changes: IntArray
+    fits: IntArray
+    taken: IntArray
+    aside: Mask
+    apart: Mask
+    since: Array
+    off: Array
+    low: Array
+    high: Array
+    last: Array
+    run: IntArray
+    longest: IntArray
+    strain: IntArray
+    calm: IntArray
+    pace: Array
+
+    @classmethod
+    def start(cls, sensors: int, members: int = 1) -> Screened:
+        """Return the value before any sample."""
+        never, none = np.full((members, sensors), np.nan), np.zeros((members, sensors), np.int64)
+        no = none > 0
+        return cls(
+            refused=none,
+            changes=none,
+            fits=none,
+            taken=none,
+            aside=no,
+            apart=no,
+            since=never,
+            off=never,
+            low=never,
+            high=never,
+            last=never,
+            run=none,
+            longest=none,
+            strain=none,
+            calm=np.full(members, CALM),
+            pace=np.zeros(members),
+        )
+
+    def paused(self, length: Array) -> tuple[Screened, Mask]:
+        """Return the value after intervals of a length (members,), and which were pauses."""
+        longer: Mask = length > self.pace
+        if not np.count_nonzero(longer):
+            return self, longer
+        pause = longer & (self.pace > 0.0) & (length > PAUSE * self.pace)
+        # A pace that changes for good is usual after a few samples.
+        usual = np.where(pause, PAUSE * self.pace, length)
+        return changed(self, pace=np.maximum(self.pace, usual)), pause
+
+    def fitted(self, z: Array, present: Mask) -> Screened:
+        """Return the value after a sample that all fit, of members that refuse nothing."""
+        last, run, _ = self.shown(z, present)
+        return changed(self, last=last, run=run).used(z, present, present)
+
+    def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
+        """Return the last reading and its repetitions after a sample, and which ones it repeats."""
+        same: Mask = present & (z == self.last)
+        repeats = np.count_nonzero(same) or np.count_nonzero(self.run)
+        run = np.where(same, self.run + 1, 0) if repeats else self.run
+        if np.count_nonzero(present) == present.size:
+            return z, run, same
+        return np.where(present, z, self.last), np.where(present, run, self.run), same
+
+    def used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
+        """Return the value with the readings that are used in the past of their sensors."""
+        if np.count_nonzero(kept) < kept.size:
+            z = np.where(kept, z, np.nan)
+        parts = {"low": np.fmin(self.low, z), "high": np.fmax(self.high, z)}
+        # Most samples repeat nothing, come after the first ones, and in no disturbance.
+        if np.count_nonzero(self.run):
+            parts["longest"] = np.maximum(self.longest, np.where(kept, self.run, 0))
+        if self.taken.min() < SETTLED:
+            parts["taken"] = np.minimum(self.taken + learned, SETTLED)
+        if np.count_nonzero(self.strain):
+            calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
+            parts |= {"calm": calm, "strain": np.where(calm[:, None] < CALM, self.strain, 0)}
+        return changed(self, **parts)
+
+
+class Gated(NamedTuple):
+    """Outcome of the gate for a sample, each of shape (members, sensors).
+
+    Attributes
+    ----------
+    kept
+        Readings that are used.
+    anchored
+        Readings that correct the state alone.
+    counted
+        Readings that count in the test for jumps.
+    state
+        What the gate remembers.
+    """
+
+    kept: Mask
+    anchored: Mask
+    counted: Mask
+    state: Screened
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Refuses readings that do not fit, and decides what a lasting misfit means.
+
+    A reading fits if its innovation is at most `beyond` expected standard deviations. After
+    `patience` refusals in a row the sensor is believed if its readings are plausible and most of
+    the sensors that can be believed misfit as well: then the process has changed. Else the sensor
+    is set aside, until `patience` readings in a row fit again.
+
+    If `anchors`, believed readings correct the state alone until `patience` of them in a row fit,
+    or `LASTING` did not: a disturbance that passes says nothing on constants of the model. Sensors
+    that were never used much are believed at once, because a poor start misfits as well.
+
+    Readings are implausible if they repeat a value more often than the sensor ever did, if they
+    repeat a value outside its past range by more than the largest range of all sensors, or if they
+    lie outside by ten times that. The range counts once it shows how far the process moves.
+    """
+
+    beyond: float = math.inf
+    patience: int = 10
+    anchors: bool = False
+
+    def __call__(
+        self,
+        x: Screened,
+        z: Array,
+        d: Array,
+        noise: Array,
+        far: Mask,
+        used: Mask,
+        t: float,
+        pause: Mask,
+    ) -> Gated:
+        """Return what is used of a sample at time t.
+
+        Parameters
+        ----------
+        z, d, noise
+            Readings, innovations and their noise, shapes (members, sensors).
+        far, used
+            Readings that do not fit, and those that are present.
+        pause
+            Members for which the sample follows a pause, shape (members,).
+        """
+        last, run, same = x.shown(z, used)
+        outside, absurd = self._out_of_range(x, z, noise)
+        stuck = run > x.longest
+        implausible = absurd | (outside & (run > 0)) | stuck
+        # A constant that the prediction crosses fits by chance.
+        misfit = far | (used & same & stuck & (x.refused > 0))
+        waiting = x.aside | x.apart
+        over = used & ~misfit & ~waiting
+        refused = np.where(misfit, x.refused + 1, np.where(over, 0, x.refused))
+        changes = np.where(misfit & ~same, x.changes + 1, np.where(over, 0, x.changes))
+        fits = np.where(misfit, 0, np.where(used & ~stuck & waiting, x.fits + 1, x.fits))
+        voters = used & ~implausible
+        most = 2 * (voters & misfit).sum(axis=1) > voters.sum(axis=1)
+        together = most[:, None] & voters
+        # What misfits after a pause shows that the state is wrong.
+        sudden = misfit & together & pause[:, None] & (x.taken >= SETTLED) & self.anchors
+        refused = np.where(sudden, np.maximum(refused, self.patience + 1), refused)
+        late, first = misfit & (refused > self.patience), x.refused == self.patience
+        believed = late & together & (sudden | (2 * changes >= self.patience))
+        aside = np.where(late & ~believed, x.aside | first | implausible, x.aside & ~believed)
+        back = waiting & used & ~misfit & (fits >= self.patience)
+        aside = aside & ~back
+        refused, changes = np.where(back, 0, refused), np.where(back, 0, changes)
+        kept = used & ~aside & (~misfit | late)
+        again = misfit & (refused > 1) & ~aside & ~implausible & (~outside | together)
+        apart = (refused > self.patience) & ~aside & (x.taken >= SETTLED) & self.anchors
+        strain = x.strain + (apart & misfit)
+        lasting = (strain > LASTING).any(axis=1)[:, None]
+        apart = apart & ~lasting
+        state = changed(
+            x,
+            # Constants that have to explain what lasts begin again with a poor fit.
+            taken=np.where(lasting, -LASTING, x.taken),
+            refused=refused,
+            changes=changes,
+            fits=np.where(back, 0, fits),
+            aside=aside,
+            apart=apart,
+            strain=np.where(lasting, 0, strain),
+            since=np.where(refused > 0, np.where(x.refused > 0, x.since, t), np.nan),
+            off=np.where(misfit, d, np.where(refused > 0, x.off, np.nan)),
+            last=last,
+            run=run,
+        )
+        # One value alone is no change of the process; a second one in a row may be.
+        anchored = kept & apart.any(axis=1)[:, None]
+        learned = kept & ~anchored
+        return Gated(learned, anchored, learned | again, state.used(z, kept, learned))
+
+    @staticmethod
+    def _out_of_range(x: Screened, z: Array, noise: Array) -> tuple[Mask, Mask]:
+        """Return which readings lie outside their past by more than one range, and by ten."""
+        ranges, beyond = (x.high - x.low) / noise, np.fmax(x.low - z, z - x.high) / noise
+        # That of the sensor that has varied most: others may lie where little has happened yet.
+        span = np.fmax.reduce(ranges, axis=1, initial=0.0)[:, None]
+        moved = span > MOVED
+        return moved & (beyond > span), moved & (beyond > ABSURD * span)

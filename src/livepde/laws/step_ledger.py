@@ -1,0 +1,80 @@
+"""How the steps of a run ended: samples that failed or departed, and the findings on them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from livepde.laws.law import Status
+from livepde.linalg import IntArray
+from livepde.records import STATUS_CODES
+from livepde.verdict import Finding, Severity
+
+__all__ = ["StepLedger", "step_findings"]
+
+SOME = 0.02  # share of the samples from which failed steps are more than a mishap
+MOST = 0.5  # share from which little is left of the data
+WORDS = {
+    "departed": "departed: the unknowns were held, since prior and data do not allow for where "
+    "they would have gone",
+    "not_converged": "failed: no step converged",
+    "not_finite": "failed: the step gave numbers that are not finite",
+    "singular": "failed: the step met a singular matrix",
+}
+"""Code of a status that is not ok -> what has happened to such a sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepLedger:
+    """Numbers of samples by the status of their step, in the order of `STATUS_CODES`."""
+
+    counts: IntArray
+
+    @classmethod
+    def start(cls) -> StepLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros(len(STATUS_CODES), dtype=np.int64))
+
+    def add(self, code: str) -> StepLedger:
+        """Return the value after a sample whose step ended with a status."""
+        counts = self.counts.copy()
+        counts[STATUS_CODES.index(code)] += 1
+        return StepLedger(counts)
+
+    @property
+    def failed(self) -> bool:
+        """Whether any step was not ok."""
+        return bool(self.counts.sum() > self.counts[STATUS_CODES.index("ok")])
+
+    def findings(self) -> Iterator[Finding]:
+        """Return a finding for each way in which steps have failed."""
+        return step_findings(dict(zip(STATUS_CODES, self.counts.tolist(), strict=True)))
+
+
+def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
+    """Return a finding for each way in which steps have failed.
+
+    Parameters
+    ----------
+    counts
+        Code of a status -> number of samples.
+    """
+    samples = sum(counts.values())
+    for code, words in WORDS.items():
+        count = counts.get(code, 0)
+        if not count:
+            continue
+        text = f"{count} of {samples} samples {words}."
+        severity = _severity(code, count / samples)
+        remedy = Status(code).remedy
+        yield Finding("steps", severity, text, code, float(count), remedy=remedy)
+
+
+def _severity(code: str, share: float) -> Severity:
+    """Return how grave it is that a share of the samples has ended so."""
+    # A right model departs in one of a million cases: there is no mishap of that sort.
+    if share > (SOME if code == "departed" else MOST):
+        return "do not trust"
+    return "caution" if code == "departed" or share > SOME else "note"

@@ -1,0 +1,182 @@
+"""A Kalman filter and a fixed-interval smoother of a rod in NumPy, which use no code of ours.
+
+The rod is u_t = 0.3 u_xx - 0.4 u + s + c x + Q on (0, 1) with u(0) = T_0, linear elements; s and c
+are unknown numbers, and so is an offset that all sensors share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+DIFFUSION, DECAY = 0.3, 0.4
+STAGES = {"euler": 1.0, "alexander": 1.0 - math.sqrt(0.5)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """Boundary value and source at one time."""
+
+    T_0: float
+    Q: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Row:
+    """What is measured at one time: NaN where nothing is, and the deviation of each reading."""
+
+    t: float
+    inputs: Inputs
+    z: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Gaussian:
+    """Mean and covariance of (u, s, c, offset)."""
+
+    mean: np.ndarray
+    cov: np.ndarray
+
+    @property
+    def std(self) -> np.ndarray:
+        return np.sqrt(np.maximum(np.diag(self.cov), 0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rod:
+    """The rod with its time steps.
+
+    `hold`: inputs have their later value over a whole interval. `input_std`: deviation of the error
+    of T_0, constant over an interval, independent from one to the next.
+    """
+
+    cells: int
+    scheme: str = "alexander"
+    dt_max: float = math.inf
+    hold: bool = False
+    input_std: float = 0.0
+
+    @property
+    def nodes(self) -> np.ndarray:
+        return np.linspace(0.0, 1.0, self.cells + 1)
+
+    def matrices(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mass, the rest of the operator, and the loads of 1 and of x."""
+        n, h, x = self.cells + 1, 1.0 / self.cells, self.nodes
+        M, B, loads = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, 2))
+        for k in range(self.cells):
+            mass = h / 6.0 * np.array([[2.0, 1.0], [1.0, 2.0]])
+            part = np.ix_([k, k + 1], [k, k + 1])
+            M[part] += mass
+            B[part] += DIFFUSION / h * np.array([[1.0, -1.0], [-1.0, 1.0]]) + DECAY * mass
+            loads[k : k + 2, 0] += h / 2.0
+            loads[k : k + 2, 1] += mass @ x[k : k + 2]
+        return M, B, loads
+
+    def step(
+        self, state: np.ndarray, t0: float, t1: float, first: Inputs, last: Inputs
+    ) -> np.ndarray:
+        """Return (u, s, c, offset) after an interval."""
+        M, B, loads = self.matrices()
+        n = self.cells + 1
+        u, (s, c) = state[:n].copy(), state[n : n + 2]
+        count = 1 if t1 - t0 <= self.dt_max else math.ceil((t1 - t0) / self.dt_max - 1e-9)
+        h = (t1 - t0) / count
+        start = last if self.hold else first
+
+        def stage(before: np.ndarray, t: float, length: float) -> np.ndarray:
+            share = (t - t0) / (t1 - t0)
+            T_0, Q = (
+                (1.0 - share) * getattr(start, name) + share * getattr(last, name)
+                for name in ("T_0", "Q")
+            )
+            S = M / length + B
+            right = M @ before / length + (s + Q) * loads[:, 0] + c * loads[:, 1]
+            found = np.empty(n)
+            found[0] = T_0
+            found[1:] = np.linalg.solve(S[1:, 1:], right[1:] - S[1:, 0] * T_0)
+            return found
+
+        g = STAGES[self.scheme]
+        for k in range(count):
+            t = t0 + k * h
+            if self.scheme == "euler":
+                u = stage(u, t + h, h)
+            else:
+                inner = stage(u, t + g * h, g * h)
+                u = stage(u + (1.0 - g) / g * (inner - u), t + h, g * h)
+        return np.concatenate([u, state[n:]])
+
+    def linear(
+        self, t0: float, t1: float, first: Inputs, last: Inputs
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return F, g and Q of state -> F state + g + N(0, Q)."""
+        size = self.cells + 4
+        g = self.step(np.zeros(size), t0, t1, first, last)
+        F = np.column_stack([self.step(e, t0, t1, first, last) - g for e in np.eye(size)])
+        ends = (replace(one, T_0=one.T_0 + self.input_std) for one in (first, last))
+        off = self.step(np.zeros(size), t0, t1, *ends) - g
+        return F, g, np.outer(off, off)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Filtered:
+    """Beliefs after each row, and what a smoother needs to go back over them."""
+
+    beliefs: list[Gaussian]
+    steps: list[tuple[np.ndarray, np.ndarray]]  # F and I - K H
+    weights: list[tuple[np.ndarray, np.ndarray]]  # H' S^-1 H and H' S^-1 d
+
+
+def updated(
+    belief: Gaussian, row: Row, H: np.ndarray
+) -> tuple[Gaussian, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a belief after a row, with I - K H, H' S^-1 H and H' S^-1 d."""
+    seen = np.isfinite(row.z)
+    H, R = H[seen], np.diag(row.std[seen] ** 2)
+    S = H @ belief.cov @ H.T + R
+    d = row.z[seen] - H @ belief.mean
+    K = np.linalg.solve(S, H @ belief.cov).T
+    left = np.eye(len(belief.mean)) - K @ H
+    cov = left @ belief.cov @ left.T + K @ R @ K.T
+    after = Gaussian(mean=belief.mean + K @ d, cov=cov)
+    return after, left, H.T @ np.linalg.solve(S, H), H.T @ np.linalg.solve(S, d)
+
+
+def filtered(
+    rod: Rod, rows: Sequence[Row], H: np.ndarray, start: Gaussian, t0: float, inputs: Inputs
+) -> Filtered:
+    """Return the beliefs after each row; `inputs` are those at t0."""
+    belief, beliefs, steps, weights = start, [], [], []
+    for row in rows:
+        F = np.eye(len(start.mean))
+        if row.t > t0:
+            F, g, Q = rod.linear(t0, row.t, inputs, row.inputs)
+            belief = Gaussian(mean=F @ belief.mean + g, cov=F @ belief.cov @ F.T + Q)
+        belief, left, information, score = updated(belief, row, H)
+        beliefs.append(belief)
+        steps.append((F, left))
+        weights.append((information, score))
+        t0, inputs = row.t, row.inputs
+    return Filtered(beliefs=beliefs, steps=steps, weights=weights)
+
+
+def smoothed(run: Filtered) -> list[Gaussian]:
+    """Return the beliefs given all rows.
+
+    The smoother of Rauch, Tung and Striebel in the form of Bryson and Frazier, which inverts no
+    covariance of the state: those of a state that is known at the start are singular.
+    """
+    size = len(run.beliefs[0].mean)
+    r, L, found = np.zeros(size), np.zeros((size, size)), []
+    rounds = zip(run.beliefs, run.steps, run.weights, strict=True)
+    for belief, (F, left), (information, score) in reversed(list(rounds)):
+        mean, cov = belief.mean + belief.cov @ r, belief.cov - belief.cov @ L @ belief.cov
+        found.append(Gaussian(mean=mean, cov=cov))
+        r = F.T @ (score + left.T @ r)
+        L = F.T @ (information + left.T @ L @ left) @ F
+    return found[::-1]

@@ -1,0 +1,20 @@
+"""The study of what laws find outside the observed part: its data fit its sensors, all laws run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from experiments import outside
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("process", outside.PROCESSES)
+def test_all_laws_run_on_the_data_of_the_study(process, monkeypatch):
+    monkeypatch.setattr(outside, "TIMES", outside.TIMES[:6])
+    data = outside.draw(outside.PROCESSES[process], 0)
+    found = outside.rows(data)
+    # A diffusivity is refused by the law that tunes itself, a reaction is not.
+    assert ("gradient, auto" in found) == (process == "reaction")
+    assert all(np.isfinite(score.error).all() for score in found.values())
+    assert outside.STEPS.failed == 0
