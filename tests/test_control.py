@@ -173,6 +173,48 @@ def test_a_nonlinear_model_is_linearised_where_it_is_said():
         assert rate[1] == pytest.approx((2000.0 * ROOM - 1e-5 * u**4) / 3.6e6, rel=0.05)
 
 
+def warm_conductor() -> lp.Model:
+    """u_t = (D0 (1 + b u) u_x)_x, hot at the left, 0 at the right."""
+    mesh = lp.interval(0.0, 1.0, 16)
+    return lp.Model(
+        lp.Field(mesh, ElementLineP1(), dirichlet={"left": lp.Channel("hot"), "right": 0.0}),
+        {"b": lp.Normal(0.5, 0.2)},
+        A=lambda q, u, v, x: 0.1 * q.b * u * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+
+
+def test_a_nonlinear_model_is_not_linearised_where_nobody_said():
+    seen = lp.Points({"middle": 0.5})
+    with pytest.raises(lp.errors.ConfigurationError, match="name that with u="):
+        ct.reduce(warm_conductor(), seen, ["hot"])
+    with pytest.raises(lp.errors.ModelError, match="'b' has no effect on the model linearised"):
+        ct.reduce(warm_conductor(), seen, ["hot"], u=0.0)
+
+
+def test_a_nonlinear_model_responds_as_its_exact_steady_state():
+    """u + b u^2/2 is linear in x in a steady state, so that its derivatives are known."""
+    b, hot = 0.5, 1.0
+
+    def steady(x: Any) -> Any:
+        return (np.sqrt(1.0 + 2.0 * b * (hot + b * hot**2 / 2) * (1.0 - x[0])) - 1.0) / b
+
+    seen = lp.Points({"middle": 0.5})
+    small = ct.reduce(warm_conductor(), seen, ["hot"], u=steady, inputs={"hot": hot})
+
+    def middle(value: float, control: float) -> float:
+        K, E, f = small.system(np.array([value]))
+        c = np.array([control])
+        return float(small.outputs(np.linalg.solve(K, E @ c + f), c)[0])
+
+    u = float(steady([0.5]))
+    by_hot = 0.5 * (1.0 + b * hot) / (1.0 + b * u)
+    by_b = (hot**2 / 4.0 - u**2 / 2.0) / (1.0 + b * u)
+    assert middle(b, hot) == pytest.approx(u, rel=1e-3)
+    assert middle(b, hot + 0.1) - middle(b, hot) == pytest.approx(0.1 * by_hot, rel=1e-2)
+    assert middle(b + 1e-3, hot) - middle(b, hot) == pytest.approx(1e-3 * by_b, rel=1e-2)
+
+
 def test_the_error_is_relative_to_the_largest_response_to_any_control():
     """In five seconds a weak heater does not reach the tip; the room does."""
     sources = [

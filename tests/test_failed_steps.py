@@ -18,7 +18,6 @@ LAWS = {
     "auto": lp.AutoLaw(),
     "sensitivity": lp.SensitivityLaw(),
     "gradient": lp.GradientLaw(),
-    "gradient, auto": lp.GradientLaw(gain="auto"),
 }
 
 

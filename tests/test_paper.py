@@ -7,7 +7,9 @@ import pytest
 
 import livepde as lp
 from experiments import reference
-from livepde.reproduce import seed
+from livepde.laws.coupled.coupled_stage import nearest_root
+from livepde.laws.damping import Residual
+from livepde.reproduce import boiger2016, seed
 
 
 def test_the_papers_space() -> None:
@@ -73,6 +75,68 @@ def test_every_step_is_solved_to_rounding() -> None:
     )
     q = np.array([estimate.q for estimate in estimates])
     assert np.abs(q - found.Q).max() < 1e-6 * np.abs(found.Q).max()
+
+
+@pytest.mark.slow
+def test_a_stage_is_solved_whose_root_is_a_million_times_from_its_start() -> None:
+    """Nodal noise of 1 %, constant mu: theta 7.5e2 follows 4.5e-4; the reference confirms it."""
+    case, variant, count = boiger2016.paper_case(), boiger2016.PAPER["nodal, mu = 1"], 106
+    twin = case.twin
+    run = lp.Identifier(
+        twin.model, twin.observation, variant.law, q0=0.0, u0=case.start, halvings=0
+    )
+    samples = list(case.samples("nodal", 0.01, 3))[:count]
+    estimates = [run.step(sample.t, sample.z) for sample in samples]
+    assert all(estimate.status.ok for estimate in estimates)
+    setting = reference.Setting(
+        q_true=lambda x: 0.025 * x**2 - 0.025 * x,
+        u_true=lambda x, t: np.sin(np.pi * x) / (1 + t),
+        f=lambda x, t: seed.f([x], t),
+        state_ends="clamped",
+        parameter_ends="clamped",
+        omega=seed.OMEGA,
+        gain=100.0,
+        mu=1.0,
+    )
+    at = reference.Discretisation(setting)
+    _, _, loads = reference.truth(at, 0.6 * np.arange(count))
+    G = twin.observed.G
+    Z = np.array([G.T @ sample.z for sample in samples])
+    Q, U = (np.array([getattr(e, name) for e in estimates]) for name in "qu")
+    left = reference.residuals(at, Q[-2:], U[-2:], Z[-2:], at.X.extend(loads)[-2:])
+    assert left.max() <= 1e-6
+
+
+def test_the_search_for_theta_ends_where_the_rule_ends() -> None:
+    def gap(theta: float) -> float:
+        asked.append(theta)
+        return 3.0 - theta
+
+    asked: list[float] = []
+    assert nearest_root(gap, 1e-6, 1e-12, 10.0) == pytest.approx(3.0)  # 3e6 from the start
+    assert max(asked) <= 10.0
+    assert nearest_root(gap, 1e6, 1e-12, 1e7) == pytest.approx(3.0)
+    assert nearest_root(gap, 1.0, 0.1, 2.0) is None
+    assert nearest_root(lambda theta: 0.0, 1.0, 0.1, 2.0) == 1.0
+
+
+def test_a_constant_mu_bounds_theta_beforehand() -> None:
+    """mu/(floor ||u_alpha||_V~), whatever r is."""
+    rule = lp.laws.ConstantDamping(mu=2.0, floor=1e-2)
+    observed = Residual(1.0, 1.0, lambda: 25.0)
+    assert rule.most(observed) == pytest.approx(40.0)
+    for size in (0.0, 1e-8, 1.0, 1e8):
+        r = Residual(size, size, lambda size=size: size, lambda: observed)
+        assert rule.theta(r) <= rule.most(observed) * (1 + 1e-12)
+
+
+def test_nothing_learned_is_no_shift_to_the_right() -> None:
+    x, (low, high) = np.linspace(0.0, 1.0, 61), seed.SHIFTED
+    exact = seed.q_true([x])
+    for q in (0.0 * x, exact, 1e-3 * exact * (1.0 + x)):
+        assert not low <= seed.shift(x, q) <= high
+    # By hand: of x (x - x^2) the first moment is 1/20, half of the integral 1/24.
+    assert seed.shift(x, exact * x) == pytest.approx((1 / 20 - 1 / 24) / (1 / 6), rel=1e-2)
 
 
 @pytest.mark.parametrize("values", [{}, {"boundary": 1.0}, {"left": lambda x, t: t}])

@@ -88,6 +88,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
 
         "auto": the law tunes itself, from r, the excitation and the prior (`std` of the unknowns)
         alone (`livepde.laws.information`). Then `damping`, `M_op` and `sigma` are not to be given.
+        It needs data of the whole state. With partial data it is experimental: they are not
+        smoothed, and an A with derivatives of u, such as a diffusivity, is refused.
     damping
         Rule for theta = mu / ||r||_V~.
     nu
