@@ -20,7 +20,7 @@ from livepde.stepping import StepFailed
 __all__ = ["Fit", "livepde_fit", "plain_seconds"]
 
 Array = NDArray[Any]
-PLAIN = {"start_window": 0}
+PLAIN = {"start_window": 0}  # FALLBACK, too: the option that turns refits off
 """Options of a filter that takes no sample twice."""
 
 

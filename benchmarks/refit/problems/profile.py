@@ -34,7 +34,7 @@ class Profile(Problem):
     unknowns = MappingProxyType({"k": Unknown(0.1)})
     points = MappingProxyType({f"T_{n}": n / 8 for n in range(1, 8)})
     noise = 0.02
-    times = np.linspace(0.0, 10.0, 61)
+    times = np.linspace(0.0, 7.0, 71)
     law = MappingProxyType({"modes": MODES})
 
     @staticmethod
@@ -43,7 +43,7 @@ class Profile(Problem):
 
     @staticmethod
     def _inputs(t: Array) -> Array:
-        left = np.sin(0.6 * np.pi * t) + 0.4 * np.sin(2.2 * np.pi * t)
+        left = np.sin(0.6 * np.pi * t) + 0.4 * np.sin(1.4 * np.pi * t)
         return np.column_stack([left, 0.6 * np.sin(0.4 * np.pi * t)])
 
     @property
