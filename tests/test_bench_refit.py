@@ -10,8 +10,7 @@ from scipy.optimize import minimize
 
 import livepde as lp
 from benchmarks.refit.estimator import Fit
-from benchmarks.refit.jumps import AT, ROD, JumpTrial
-from benchmarks.refit.jumps import K as CONDUCTIVITY
+from benchmarks.refit.jumps import AT, PROCESSES, JumpTrial
 from benchmarks.refit.objective import LOST, Objective
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.problems.column import Column
@@ -203,8 +202,31 @@ def test_outliers_are_a_fifth_of_the_readings():
 
 
 def test_the_rod_of_the_jumps_comes_to_rest_on_a_line():
-    shown = ROD.shown(np.full(2000, 1.5))
-    np.testing.assert_allclose(shown[-1], 1.5 / CONDUCTIVITY * np.array([0.9, 0.7, 0.4]), rtol=1e-6)
+    shown = PROCESSES["rod"].shown(np.full(2000, 1.5))
+    np.testing.assert_allclose(shown[-1], 1.5 / 0.2 * np.array([0.9, 0.7, 0.4]), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROCESSES)
+def test_truths_with_jumps_agree_with_livepde(name):
+    process, levels = PROCESSES[name], np.repeat([1.0, 1.6], 30)
+    model = process.model()
+    observed = process_observed(process, model)
+    u, q, found = model.initial(process.u0), {"k": 0.2, "D": 0.5}[process.constant], []
+    control = lp.Advance(lp.Alexander2())
+    for n, v in enumerate(levels.tolist()):
+        t = [n * process.step, (n + 1) * process.step]
+        values = np.array([q, v])
+        inputs = process.inputs
+        *_, (_, u) = lp.simulate(model, model.latent.inverse(values), u, t, control, inputs)
+        found.append(observed.predict(u, values, Moment(t[1], Inputs(dict(inputs(t[1]))))))
+    difference = (np.array(found) - process.shown(levels))[2:] / process.noise
+    assert np.sqrt(np.mean(difference**2)) < 1.0
+
+
+def process_observed(process, model):
+    sensors = lp.Points(list(process.points), noise=process.noise)
+    return lp.Identifier(model, sensors, lp.SensitivityLaw()).observed
 
 
 # --- checks --------------------------------------------------------------------------------------
@@ -264,7 +286,7 @@ def test_checks_of_bad_fits(cost, changes, names):
     ],
 )
 def test_checks_of_jumps(changes, names):
-    good = JumpTrial(seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
+    good = JumpTrial(process="rod", seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
     assert failed([], [replace(good, **changes)]) == names
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,19 +15,17 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 import livepde as lp
+from benchmarks.refit.elements import interpolation
+from livepde.models import advection_dispersion
 
-__all__ = ["JumpTrial", "jump_trial"]
+__all__ = ["AT", "PROCESSES", "JumpTrial", "jump_trials"]
 
 Array = NDArray[Any]
-AT = (80, 140, 200)  # samples before which the flux jumps
+AT = (80, 140, 200)  # samples before which the unknown v jumps
 SAMPLES = 260
-STEP = 0.05
-CELLS, FINE = 20, 120
-K = 0.2
-NOISE = 2e-3
-POINTS = (0.1, 0.3, 0.6)
+FINE = 120  # cells of the truths
 SOON = 15  # samples within which an alarm is that of a jump
-LEVELS = (0.6, 3.0)  # of the flux
+LEVELS = (0.6, 2.0)  # between which v is drawn
 CHANGE = 1.3  # least factor of a jump
 
 
@@ -35,10 +35,10 @@ class JumpTrial:
 
     Attributes
     ----------
-    seed
-        Of the truth.
+    process, seed
+        The process, and which of its truths.
     one, every
-        Jumps that are found if the flux alone may jump, and if all unknowns may.
+        Jumps that are found if v alone may jump, and if all unknowns may.
     shift
         Largest distance of the constant from its estimate before the first jump, while later jumps
         are learned, in standard deviations of that estimate.
@@ -46,6 +46,7 @@ class JumpTrial:
         Largest standard deviation of the constant after the first jump over that before.
     """
 
+    process: str
     seed: int
     one: int
     every: int
@@ -53,36 +54,139 @@ class JumpTrial:
     widest: float
 
 
-class _Rod:
-    """u_t = k u_xx with the flux v on the left and u = 0 on the right, by finite volumes."""
+class Jumping(ABC):
+    """A process with the unknown v, which jumps, and a constant.
 
-    @cached_property
-    def _step(self) -> tuple[Array, Array]:
-        """Exact response of a step to the state and to a constant flux."""
-        h = 1.0 / FINE
-        A = K / h**2 * (np.eye(FINE, k=1) + np.eye(FINE, k=-1) - 2.0 * np.eye(FINE))
-        # Volumes about the nodes; the first one is half of the others.
-        A[0] = K / h**2 * (2.0 * np.eye(FINE)[1] - 2.0 * np.eye(FINE)[0])
-        block = np.zeros((FINE + 1, FINE + 1))
-        block[:FINE, :FINE], block[0, FINE] = A * STEP, 2.0 / h * STEP
-        found = sla.expm(block)
-        return found[:FINE, :FINE], found[:FINE, FINE]
+    Attributes
+    ----------
+    constant
+        Label of the unknown that stays as it is.
+    step, noise
+        Time between two samples, and the standard deviation of the readings.
+    points
+        Places of the sensors.
+    u0
+        Initial state.
+    """
+
+    constant: str
+    step: float
+    noise: float
+    points: tuple[float, ...]
+    u0 = 0.0
+
+    @abstractmethod
+    def system(self, v: float) -> tuple[Array, Array]:
+        """Return A and B of the truth y' = A y + B g: finite volumes about nodes."""
+
+    @abstractmethod
+    def model(self) -> lp.Model:
+        """Return the model as a user of livepde writes it."""
+
+    @property
+    @abstractmethod
+    def length(self) -> float:
+        """Length of the rod or column."""
+
+    def signal(self, t: Array) -> Array:
+        """Return the input g; it is straight between samples."""
+        return np.ones_like(t)
+
+    def inputs(self, t: float) -> Mapping[str, float]:
+        """Return the input channels at a sample."""
+        return {}
 
     def shown(self, levels: Array) -> Array:
-        """Return what the sensors show, shape (samples, sensors), for the flux before each."""
-        once, response = self._step
-        u, found = np.zeros(FINE), []
-        for level in levels:
-            u = once @ u + response * level
-            found.append(u[[round(x * FINE) for x in POINTS]])
+        """Return what the sensors show, shape (samples, sensors), for v before each sample."""
+        seen = interpolation(np.array(self.points), FINE, 0.0, self.length)[:, : self._nodes]
+        y, found = np.full(self._nodes, self.u0), []
+        g = self.signal(self.step * np.arange(len(levels) + 1))
+        for n, v in enumerate(levels.tolist()):
+            once, first, last = self._response(v)
+            y = once @ y + first * g[n] + last * g[n + 1]
+            found.append(seen @ y)
         return np.array(found)
 
+    @property
+    def _nodes(self) -> int:
+        return FINE + 1
 
-ROD = _Rod()
+    @cache  # noqa: B019  as many processes as there are classes
+    def _response(self, v: float) -> tuple[Array, Array, Array]:
+        """Return the exact response of a step to the state and to the inputs at both ends."""
+        A, B = self.system(v)
+        n = len(A)
+        block = np.zeros((n + 2, n + 2))
+        block[:n, :n], block[:n, n], block[n, n + 1] = A * self.step, B * self.step, 1.0
+        found = sla.expm(block)
+        return found[:n, :n], found[:n, n] - found[:n, n + 1], found[:n, n + 1]
 
 
-def _flux(rng: np.random.Generator) -> Array:
-    """Return the flux before each sample: four levels, each well apart from the one before."""
+class Rod(Jumping):
+    """u_t = k u_xx with the flux v on the left and u = 0 on the right."""
+
+    constant, step, noise, points = "k", 0.05, 2e-3, (0.1, 0.3, 0.6)
+    K = 0.2
+
+    length = 1.0
+
+    def system(self, v: float) -> tuple[Array, Array]:
+        h, n = self.length / FINE, self._nodes
+        A = self.K / h**2 * (np.eye(n, k=1) + np.eye(n, k=-1) - 2.0 * np.eye(n))
+        A[0] *= 2.0  # half of a volume
+        A[0, 0] /= 2.0
+        A[-1] = 0.0
+        B = np.zeros(n)
+        B[0] = 2.0 * v / h
+        return A, B
+
+    def model(self) -> lp.Model:
+        mesh = lp.interval(0.0, 1.0, 20)
+        return lp.Model(
+            lp.Field(mesh, lp.linear(mesh), dirichlet={"right": 0.0}),
+            {"k": lp.LogNormal(0.3, 0.15), "v": lp.Normal(1.0, 1.0)},
+            A=[
+                lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+                lp.On("left", lambda q, u, v, x: -q.v * v),
+            ],
+        )
+
+
+class Column(Jumping):
+    """c_t = D c_xx - v c_x, fed on the left."""
+
+    constant, step, noise, points = "D", 0.16, 0.02, (2.0, 5.0, 8.0)
+    D = 0.5
+
+    length = 10.0
+
+    def system(self, v: float) -> tuple[Array, Array]:
+        h, n = self.length / FINE, self._nodes
+        one = np.eye(n)
+        # Fluxes through the faces between nodes, and on the right, where c goes with the water.
+        flux = 0.5 * v * (one[1:] + one[:-1]) - self.D / h * (one[1:] - one[:-1])
+        flux = np.vstack([0.0 * one[:1], flux, v * one[-1:]])
+        volume = np.full(n, h)
+        volume[[0, -1]] = 0.5 * h
+        return -np.diff(flux, axis=0) / volume[:, None], v / volume[0] * one[0]
+
+    def signal(self, t: Array) -> Array:
+        turn = 2 * np.pi * t / 40.0
+        return np.asarray(0.7 * np.sin(2 * turn) + 0.5 * np.sin(5 * turn) + 0.3 * np.sin(11 * turn))
+
+    def inputs(self, t: float) -> Mapping[str, float]:
+        return {"c_in": float(self.signal(np.array(t)))}
+
+    def model(self) -> lp.Model:
+        mesh = lp.interval(0.0, self.length, 40)
+        return advection_dispersion(mesh, lp.LogNormal(0.4, std=0.2), lp.LogNormal(1.0, std=0.4))
+
+
+PROCESSES: Mapping[str, Jumping] = {"rod": Rod(), "column": Column()}
+
+
+def _levels(rng: np.random.Generator) -> Array:
+    """Return v before each sample: four levels, each well apart from the one before."""
     levels = [1.0]
     while len(levels) <= len(AT):
         level = float(np.exp(rng.uniform(*np.log(LEVELS))))
@@ -91,40 +195,35 @@ def _flux(rng: np.random.Generator) -> Array:
     return np.array(levels)[np.searchsorted(AT, np.arange(SAMPLES), side="right")]
 
 
-def _identifier(jumps: lp.Jumps) -> lp.Identifier:
-    mesh = lp.interval(0.0, 1.0, CELLS)
-    model = lp.Model(
-        lp.Field(mesh, lp.linear(mesh), dirichlet={"right": 0.0}),
-        {"k": lp.LogNormal(0.3, 0.15), "v": lp.Normal(1.0, 1.0)},
-        A=[
-            lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-            lp.On("left", lambda q, u, v, x: -q.v * v),
-        ],
-    )
+def jump_trials(seed: int) -> list[JumpTrial]:
+    """Run one truth of each process; the same seed gives the same numbers."""
+    found = []
+    for name, process in PROCESSES.items():
+        rng = np.random.default_rng([zlib.crc32(f"jumps {name}".encode()), seed])
+        shown = process.shown(_levels(rng))
+        z = shown + process.noise * rng.standard_normal(shown.shape)
+        with threadpool_limits(1):
+            one, constant, std = _run(process, lp.Jumps(unknowns=("v",)), z)
+            every, *_ = _run(process, lp.Jumps(), z)
+        before = AT[0] - 1
+        shift = float(np.abs(constant[AT[0] :] - constant[before]).max() / std[before])
+        widest = float(std[AT[0] :].max() / std[before])
+        found.append(JumpTrial(name, seed, one, every, shift, widest))
+    return found
+
+
+def _run(process: Jumping, jumps: lp.Jumps, z: Array) -> tuple[int, Array, Array]:
+    """Return how many jumps are found, and estimates of the constant with standard deviations."""
+    sensors = lp.Points(list(process.points), noise=process.noise)
     law = lp.SensitivityLaw(jumps=jumps)
-    return lp.Identifier(model, lp.Points(list(POINTS), noise=NOISE), law, u0=0.0)
-
-
-def jump_trial(seed: int) -> JumpTrial:
-    """Run one truth; the same seed gives the same numbers."""
-    rng = np.random.default_rng([zlib.crc32(b"jumps"), seed])
-    shown = ROD.shown(_flux(rng))
-    z = shown + NOISE * rng.standard_normal(shown.shape)
-    with threadpool_limits(1):
-        one, k, std = _run(lp.Jumps(unknowns=("v",)), z)
-        every, *_ = _run(lp.Jumps(), z)
-    before = AT[0] - 1
-    shift = float(np.abs(k[AT[0] :] - k[before]).max() / std[before])
-    return JumpTrial(seed, one, every, shift, float(std[AT[0] :].max() / std[before]))
-
-
-def _run(jumps: lp.Jumps, z: Array) -> tuple[int, Array, Array]:
-    """Return how many jumps are found, and estimates of k with their standard deviations."""
-    alarms, k = [], []
-    identifier = _identifier(jumps)
-    for n, row in enumerate(z):
-        estimate = identifier.step((n + 1) * STEP, row)
+    identifier = lp.Identifier(process.model(), sensors, law, u0=process.u0)
+    if identifier.inputs:
+        identifier.step(0.0, np.full(len(process.points), np.nan), process.inputs(0.0))
+    alarms, known = [], []
+    for n, row in enumerate(z, start=1):
+        t = n * process.step
+        estimate = identifier.step(t, row, process.inputs(t))
         alarms.append(bool(estimate.diagnostics.jump > 0.0))
-        k.append(estimate.parameters["k"])
+        known.append(estimate.parameters[process.constant])
     found = sum(any(alarms[at : at + SOON]) for at in AT)
-    return found, *np.array(k).T
+    return found, *np.array(known).T

@@ -46,7 +46,8 @@ def outcome(trials: Iterable[Trial], jumps: Sequence[JumpTrial]) -> Outcome:
         tables.append(_missed(missed))
     if jumps:
         tables.append(_jumps(jumps))
-        checks += _jump_checks(jumps)
+        for name in dict.fromkeys(item.process for item in jumps):
+            checks += _jump_checks(name, [item for item in jumps if item.process == name])
     return Outcome(tables, checks, NOTES if order else ())
 
 
@@ -134,16 +135,24 @@ def _missed(trials: Sequence[Trial]) -> Table:
 
 
 def _jumps(trials: Sequence[JumpTrial]) -> Table:
-    rows = [[t.seed, t.one, t.every, t.shift, t.widest] for t in trials]
-    columns = ["seed", "one may jump", "all may jump", "constant moved", "constant widened"]
+    rows = [[t.process, t.seed, t.one, t.every, t.shift, t.widest] for t in trials]
+    columns = [
+        "process",
+        "seed",
+        "one may jump",
+        "all may jump",
+        "constant moved",
+        "constant widened",
+    ]
     return Table(f"Found of {len(AT)} jumps of one unknown among two", columns, rows)
 
 
-def _jump_checks(trials: Sequence[JumpTrial]) -> Iterator[Check]:
+def _jump_checks(name: str, trials: Sequence[JumpTrial]) -> Iterator[Check]:
     jumps = len(AT) * len(trials)
     one, every = (sum(getattr(t, name) for t in trials) / jumps for name in ("one", "every"))
-    yield Check("jumps: found where one unknown may jump", one, 1.0, ">=")
-    yield Check("jumps: found, one may jump less all may jump", one - every, 0.0, ">=")
+    yield Check(f"jumps, {name}: found where one unknown may jump", one, 1.0, ">=")
+    yield Check(f"jumps, {name}: found, one may jump less all may jump", one - every, 0.0, ">=")
     shift, widest = (max(getattr(t, name) for t in trials) for name in ("shift", "widest"))
-    yield Check("jumps: constant moved, in standard deviations", shift, KEPT, "<=")
-    yield Check("jumps: standard deviation of the constant / before", widest, WIDENED, "<=")
+    yield Check(f"jumps, {name}: constant moved, in standard deviations", shift, KEPT, "<=")
+    text = f"jumps, {name}: standard deviation of the constant / before"
+    yield Check(text, widest, WIDENED, "<=")

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 
 from benchmarks.jobs import each
-from benchmarks.refit.jumps import JumpTrial, jump_trial
+from benchmarks.refit.jumps import JumpTrial, jump_trials
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.report import outcome
 from benchmarks.refit.trial import Trial, trial
@@ -37,11 +37,12 @@ def refit(
     """
     jobs = [(name, seed) for seed in range(seeds) for name in (only or PARTS)]
     workers = workers or os.cpu_count() or 1
-    done = [run for _, run in each(_job, jobs, "fits", workers=workers, progress=progress)]
+    several = each(_job, jobs, "fits", workers=workers, progress=progress)
+    done = [run for _, runs in several for run in runs]
     trials = sorted((r for r in done if isinstance(r, Trial)), key=lambda r: (r.problem, r.seed))
-    jumps = sorted((r for r in done if isinstance(r, JumpTrial)), key=lambda r: r.seed)
+    jumps = sorted((r for r in done if isinstance(r, JumpTrial)), key=lambda r: (r.process, r.seed))
     return outcome(trials, jumps)
 
 
-def _job(name: str, seed: int) -> Trial | JumpTrial:
-    return jump_trial(seed) if name == JUMPS else trial(name, seed)
+def _job(name: str, seed: int) -> Sequence[Trial | JumpTrial]:
+    return jump_trials(seed) if name == JUMPS else [trial(name, seed)]
