@@ -313,7 +313,7 @@ def honest(
 def refit(
     *,
     only: Annotated[list[str] | None, several("Only this problem, or jumps.")] = None,
-    seeds: Annotated[int, Count(24, 4, "Priors of each problem.")],
+    seeds: Annotated[int, Count(24, 4, "Priors of each problem, and twice the truths with jumps.")],
     workers: Workers = None,
 ) -> Outcome:
     """Fit stored samples from far priors, and compare with the best known fit.

@@ -40,10 +40,10 @@ class JumpTrial:
     one, every
         Jumps that are found if v alone may jump, and if all unknowns may.
     shift
-        Largest distance of the constant from its estimate before the first jump, while later jumps
-        are learned, in standard deviations of that estimate.
+        Largest distance of the constant from its estimate before the first jump, once each jump has
+        been learned, in standard deviations of that estimate.
     widest
-        Largest standard deviation of the constant after the first jump over that before.
+        Largest standard deviation of the constant then over that before the first jump.
     """
 
     process: str
@@ -205,9 +205,9 @@ def jump_trials(seed: int) -> list[JumpTrial]:
         with threadpool_limits(1):
             one, constant, std = _run(process, lp.Jumps(unknowns=("v",)), z)
             every, *_ = _run(process, lp.Jumps(), z)
-        before = AT[0] - 1
-        shift = float(np.abs(constant[AT[0] :] - constant[before]).max() / std[before])
-        widest = float(std[AT[0] :].max() / std[before])
+        before, *later = [at - 1 for at in (*AT, SAMPLES)]
+        shift = float(np.abs(constant[later] - constant[before]).max() / std[before])
+        widest = float(std[later].max() / std[before])
         found.append(JumpTrial(name, seed, one, every, shift, widest))
     return found
 

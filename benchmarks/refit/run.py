@@ -31,11 +31,17 @@ def refit(
     Parameters
     ----------
     seeds
-        Priors of each problem, and truths with jumps.
+        Priors of each problem; of truths with jumps half as many.
     workers
         Processes; default one for each processor. One runs in this process.
     """
-    jobs = [(name, seed) for seed in range(seeds) for name in (only or PARTS)]
+    # A truth with jumps has two processes, each of which is run twice.
+    jobs = [
+        (name, seed)
+        for seed in range(seeds)
+        for name in (only or PARTS)
+        if name != JUMPS or seed % 2 == 0
+    ]
     workers = workers or os.cpu_count() or 1
     several = each(_job, jobs, "fits", workers=workers, progress=progress)
     done = [run for _, runs in several for run in runs]
