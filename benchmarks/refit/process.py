@@ -29,7 +29,7 @@ Factor: TypeAlias = tuple[Array, Array]
 GAMMA = 1.0 - np.sqrt(0.5)
 GRADES = 3  # times a step near the start is halved at most
 NEWTON = 30  # updates of a stage at most
-SMALL = 1e-10  # of an update of a stage, relative to the state
+SMALL = 1e-6  # of the last update of a stage, relative to the state: its square is left
 
 
 class LostError(ArithmeticError):
