@@ -314,6 +314,23 @@ def honest(
     return benchmark(names, kinds, seeds=seeds, workers=workers, progress=True)
 
 
+@program.command(quick="Few priors: one that misses the best cost breaks the bound on their share.")
+def refit(
+    *,
+    only: Annotated[list[str] | None, several("Only this problem, or jumps.")] = None,
+    seeds: Annotated[int, Count(24, 4, "Priors of each problem, and twice the truths with jumps.")],
+    workers: Workers = None,
+) -> Outcome:
+    """Fit stored samples from far priors, and compare with the best known fit.
+
+    Example:  python -m benchmarks refit --only column --seeds 8
+    """
+    from benchmarks.refit import PARTS
+    from benchmarks.refit import refit as benchmark
+
+    return benchmark(chosen(only, PARTS, "problem"), seeds=seeds, workers=workers, progress=True)
+
+
 @program.command(quick="The same: all parts together take less than five minutes.")
 def silent(
     *,

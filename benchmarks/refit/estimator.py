@@ -1,0 +1,101 @@
+"""What livepde makes of stored samples: its fit at the end of a batch run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from time import process_time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.refit.objective import Objective
+from benchmarks.refit.problem import Priors, Problem
+from benchmarks.refit.unknowns import Belief
+from livepde.errors import LivepdeError
+from livepde.result import Result
+from livepde.stepping import StepFailed
+
+__all__ = ["Fit", "livepde_fit", "plain_seconds"]
+
+Array = NDArray[Any]
+PLAIN = {"start_window": 0}  # FALLBACK, too: the option that turns refits off
+"""Options of a filter that takes no sample twice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The fit of one data set.
+
+    Attributes
+    ----------
+    a
+        Coordinates of the final estimate, shape (k,); NaN if there is none.
+    cost, claimed
+        Its cost by the lean forward model, and the cost that livepde reports.
+    passes
+        Passes over all samples that livepde reports, NaN if it reports none.
+    converged, level
+        Whether livepde reports a fit that has converged; level of its verdict.
+    seconds
+        Processor time of the run.
+    failure
+        What ended the run, if anything did.
+    """
+
+    a: Array
+    cost: float
+    claimed: float
+    passes: float
+    converged: bool
+    level: str
+    seconds: float
+    failure: str = ""
+
+
+def livepde_fit(problem: Problem, priors: Priors, z: Array) -> Fit:
+    """Return livepde's fit of readings z, shape (samples, sensors), with its defaults."""
+    objective = Objective(problem, priors, z)
+    begun = process_time()
+    try:
+        result = problem.identifier(priors).run(problem.stream(z))
+    except (LivepdeError, StepFailed, ArithmeticError, np.linalg.LinAlgError) as error:
+        lost = np.full(objective.coordinates.size, np.nan)
+        text = f"{type(error).__name__}: {error}"
+        # A run that ends with an error does not claim anything.
+        spent = process_time() - begun
+        return Fit(lost, np.inf, np.nan, np.nan, False, "do not trust", spent, text)
+    seconds = process_time() - begun
+    return _judged(objective, result, seconds)
+
+
+def _judged(objective: Objective, result: Result, seconds: float) -> Fit:
+    last: Any = result.last
+    with np.errstate(all="ignore"):
+        a = objective.coordinates.inverse(np.asarray(last.q))
+    cost = objective.cost(a) if np.isfinite(a).all() else np.inf
+    # FALLBACK: until estimates have a `fit`, nothing is reported, and every fit counts as one that
+    # claims to have converged.
+    fit: Any = getattr(last, "fit", None)
+    claimed = float(getattr(fit, "cost", np.nan))
+    passes = float(getattr(fit, "passes", np.nan))
+    converged = bool(getattr(fit, "converged", True))
+    # END OF FALLBACK
+    return Fit(a, cost, claimed, passes, converged, last.verdict.level, seconds)
+
+
+@lru_cache(maxsize=64)
+def plain_seconds(problem: Problem) -> float:
+    """Return the processor time of a filter that takes no sample twice.
+
+    Its prior is the truth, so that no safeguard acts; what a fit takes beyond this is its own.
+    """
+    near = {
+        name: item.prior or Belief(item.truth, 0.1 * float(item.slope(item.latent(item.truth))))
+        for name, item in problem.unknowns.items()
+    }
+    z = problem.readings(0)
+    begun = process_time()
+    problem.identifier(near, **PLAIN).run(problem.stream(z))
+    return process_time() - begun

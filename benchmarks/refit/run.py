@@ -1,0 +1,54 @@
+"""All priors, in several processes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from benchmarks.jobs import each
+from benchmarks.refit.jumps import JumpTrial, jump_trials
+from benchmarks.refit.problems import PROBLEMS
+from benchmarks.refit.report import outcome
+from benchmarks.refit.trial import Trial, trial
+from livepde.runs.outcome import Outcome
+
+__all__ = ["JUMPS", "PARTS", "refit"]
+
+JUMPS = "jumps"
+PARTS = (*PROBLEMS, JUMPS)
+"""What can be run by itself: the problems, and jumps of one unknown."""
+
+
+def refit(
+    only: Sequence[str] = (),
+    *,
+    seeds: int,
+    workers: int | None = None,
+    progress: bool = False,
+) -> Outcome:
+    """Run so many priors of each problem, default all of `PARTS`.
+
+    Parameters
+    ----------
+    seeds
+        Priors of each problem; of truths with jumps half as many.
+    workers
+        Processes; default one for each processor. One runs in this process.
+    """
+    # A truth with jumps has two processes, each of which is run twice.
+    jobs = [
+        (name, seed)
+        for seed in range(seeds)
+        for name in (only or PARTS)
+        if name != JUMPS or seed % 2 == 0
+    ]
+    workers = workers or os.cpu_count() or 1
+    several = each(_job, jobs, "fits", workers=workers, progress=progress)
+    done = [run for _, runs in several for run in runs]
+    trials = sorted((r for r in done if isinstance(r, Trial)), key=lambda r: (r.problem, r.seed))
+    jumps = sorted((r for r in done if isinstance(r, JumpTrial)), key=lambda r: (r.process, r.seed))
+    return outcome(trials, jumps)
+
+
+def _job(name: str, seed: int) -> Sequence[Trial | JumpTrial]:
+    return jump_trials(seed) if name == JUMPS else [trial(name, seed)]

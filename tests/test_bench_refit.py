@@ -1,0 +1,304 @@
+"""The benchmark of refits: its lean forward models, truths, priors, references and checks."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import bench
+from scipy.optimize import minimize
+
+import livepde as lp
+from benchmarks.refit.estimator import Fit
+from benchmarks.refit.jumps import AT, PROCESSES, JumpTrial
+from benchmarks.refit.objective import LOST, Objective
+from benchmarks.refit.problems import PROBLEMS
+from benchmarks.refit.problems.column import Column
+from benchmarks.refit.process import LostError, stages_of
+from benchmarks.refit.reference import Reference, enough, reference
+from benchmarks.refit.report import outcome
+from benchmarks.refit.trial import Trial, with_outliers
+from benchmarks.refit.unknowns import Belief, Coordinates, Unknown, drawn
+from livepde.fem import Inputs, Moment
+from livepde.laws.reduction import Reduction
+from livepde.stepping import advance
+
+SMALL = 0.15  # of the noise, root mean square: what truth and lean model may differ by
+
+
+def at_random(problem, seed=5):
+    """Return an objective and coordinates away from prior and truth."""
+    objective = Objective(problem, problem.priors(seed), problem.readings(seed))
+    a = 0.5 * np.random.default_rng(seed).standard_normal(objective.coordinates.size)
+    return objective, a
+
+
+# --- the lean forward model ----------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_lean_model_is_livepde_s(name):
+    problem = PROBLEMS[name].at(6)
+    priors = problem.priors(5)
+    identifier = problem.identifier(priors)
+    model = identifier.model
+    assert tuple(model.parameter_space.labels or problem.unknowns) == tuple(problem.unknowns)
+    objective, a = at_random(problem)
+    q = objective.coordinates.value(a)
+
+    def moment(t):
+        signals = {key: np.interp(t, problem.times, row) for key, row in problem.signals.items()}
+        return Moment(t, Inputs({key: float(value) for key, value in signals.items()}))
+
+    control = replace(identifier.problem.control, start=0.0)
+    latent, times = model.latent.inverse(q), problem.times.tolist()
+    run = lp.simulate(model, latent, problem.u0, times, control, lambda t: dict(moment(t).inputs))
+    expected = np.array([identifier.observed.predict(u, q, moment(t)) for t, u in run])[1:]
+    process = problem.process
+    found = process.predicted(process.states(problem.theta(q)[0]), q)
+    np.testing.assert_allclose(found, expected, atol=1e-7 * np.abs(expected).max())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_derivatives_of_the_residual(name):
+    objective, a = at_random(PROBLEMS[name].at(6))
+    steps = 1e-5 * np.eye(len(a))
+    expected = [(objective.residual(a + s) - objective.residual(a - s)) / 2e-5 for s in steps]
+    tolerance = 1e-6 * np.abs(expected).max()
+    np.testing.assert_allclose(objective.jacobian(a), np.transpose(expected), atol=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("times", "longest"),
+    [(np.linspace(0.0, 2.0, 9), np.inf), (np.array([0.0, 28.0, 28.75, 30.0]), 0.5)],
+)
+def test_steps_are_those_of_livepde(times, longest):
+    expected = []
+
+    def stage(c, t, h):
+        expected.append((t, h))
+        return c
+
+    control = lp.Advance(lp.ImplicitEuler(), longest, start=0.0)
+    for t0, t1 in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        advance(control, stage, np.zeros(1), t0, t1)
+    starts, lengths, last = stages_of(times, longest)
+    np.testing.assert_allclose(np.column_stack([starts + lengths, lengths]), expected, rtol=1e-12)
+    np.testing.assert_allclose((starts + lengths)[last], times[1:], rtol=1e-12)
+
+
+def test_the_field_has_the_prior_of_livepde():
+    problem = PROBLEMS["profile"]
+    priors = problem.priors(3)
+    identifier = problem.identifier(priors)
+    expected = Reduction.of(identifier.problem, dict.fromkeys(problem.unknowns, 14)).Phi
+    found = problem.coordinates(priors).Phi
+    # Modes have no sign: the covariance has one.
+    np.testing.assert_allclose(found @ found.T, expected @ expected.T, atol=1e-9)
+
+
+def test_a_model_without_a_solution_is_lost_and_not_an_error():
+    problem = PROBLEMS["column"]
+    with pytest.raises(LostError):
+        problem.process.states(np.array([np.inf, 1.0]))
+    objective, _ = at_random(problem)
+    far = np.array([1e4, 0.0])
+    np.testing.assert_array_equal(objective.residual(far)[:-2], LOST)
+    np.testing.assert_array_equal(objective.jacobian(far)[:-2], 0.0)
+
+
+# --- truths and priors ---------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_lean_model_is_close_to_the_truth(name):
+    """So far apart that they are no twins, so close that the noise is the larger error."""
+    problem = PROBLEMS[name].at(6)
+    q = problem.q_true
+    shown = problem.process.predicted(problem.process.states(problem.theta(q)[0]), q)
+    difference = (shown - problem.shown[1:]) / problem.noise
+    if name == "layers":
+        off = difference[:, 1]  # this sensor is not where it is said to be
+        assert 1.0 < np.sqrt(np.mean(off**2)) < 5.0
+        difference = np.delete(difference, 1, axis=1)
+    assert 1e-6 < np.sqrt(np.mean(difference**2)) < SMALL
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_priors_are_honest_and_those_of_a_seed(name):
+    problem = PROBLEMS[name]
+    for seed in range(2, 24):
+        priors = problem.priors(seed)
+        assert priors == problem.priors(seed)
+        for label, unknown in problem.unknowns.items():
+            centre = unknown.latent(priors[label].median)
+            std = priors[label].std / unknown.slope(centre)
+            off = abs(unknown.latent(unknown.truth) - centre)
+            assert off <= 3.0 * std * (1 + 1e-9)
+            assert unknown.kind == "normal" or off <= np.log(10.0) * (1 + 1e-9)
+    np.testing.assert_array_equal(problem.readings(3), problem.readings(3))
+    assert not np.array_equal(problem.readings(3)[1:], problem.readings(4)[1:])
+
+
+def test_priors_that_a_user_has_reported_are_among_them():
+    assert PROBLEMS["column"].priors(0) == {"D": Belief(0.1, 0.1), "v": Belief(0.7, 0.5)}
+    priors = PROBLEMS["column-offset"].priors(1)
+    assert (priors["D"], priors["v"]) == (Belief(0.01, 0.01), Belief(0.1, 0.1))
+
+
+def test_few_samples_are_two_to_eight():
+    samples = [len(PROBLEMS["few"].at(seed).readings(seed)) - 1 for seed in range(7)]
+    assert samples == [2, 3, 4, 5, 6, 7, 8]
+
+
+@pytest.mark.parametrize("kind", ["log", "logit", "normal"])
+def test_coordinates_are_those_of_livepde_s_priors(kind):
+    unknown = Unknown(0.4, kind)
+    prior = unknown.declared(Belief(0.2, 0.1))
+    coordinates = Coordinates.of({"p": unknown}, {"p": Belief(0.2, 0.1)})
+    assert coordinates.centre[0] == pytest.approx(prior.latent_mean)
+    assert coordinates.Phi[0, 0] == pytest.approx(prior.latent_std)
+    a = np.array([0.7])
+    expected = prior.transform.value(coordinates.centre + coordinates.Phi @ a)
+    np.testing.assert_allclose(coordinates.value(a), expected)
+    np.testing.assert_allclose(coordinates.inverse(coordinates.value(a)), a)
+    assert kind == "normal" or drawn({"p": unknown}, np.random.default_rng(0))["p"].median > 0.0
+
+
+# --- the reference -------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_no_other_method_finds_less_than_the_reference():
+    problem = PROBLEMS["column"]
+    priors, z = problem.priors(2), problem.readings(2)
+    found = reference(problem, priors, z)
+    objective = Objective(problem, priors, z)
+    start = objective.coordinates.inverse(problem.q_true)
+    other = minimize(objective.cost, start, method="Nelder-Mead", options={"xatol": 1e-6})
+    assert found.cost == pytest.approx(other.fun, abs=1e-4)
+    np.testing.assert_allclose(found.a, other.x, atol=1e-3)
+    assert found.cost == pytest.approx(objective.cost(found.a))
+
+
+def test_what_is_enough():
+    assert enough(10.0) == 10.5
+    assert enough(1e4) == pytest.approx(1e4 + 10.0)
+
+
+def test_outliers_are_a_fifth_of_the_readings():
+    z = np.zeros((2000, 2))
+    wild = with_outliers(z, 0.1, np.random.default_rng(0))
+    moved = wild[wild != 0.0]
+    assert len(moved) / z.size == pytest.approx(0.2, abs=0.02)
+    assert 1.0 <= np.abs(moved).min() <= np.abs(moved).max() <= 10.0
+    assert abs(np.sign(moved).mean()) < 0.1
+
+
+# --- jumps ---------------------------------------------------------------------------------------
+
+
+def test_the_rod_of_the_jumps_comes_to_rest_on_a_line():
+    shown = PROCESSES["rod"].shown(np.full(2000, 1.5))
+    np.testing.assert_allclose(shown[-1], 1.5 / 0.2 * np.array([0.9, 0.7, 0.4]), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROCESSES)
+def test_truths_with_jumps_agree_with_livepde(name):
+    process, levels = PROCESSES[name], np.repeat([1.0, 1.6], 30)
+    model = process.model()
+    observed = process_observed(process, model)
+    u, q, found = model.initial(process.u0), {"k": 0.2, "D": 0.5}[process.constant], []
+    control = lp.Advance(lp.Alexander2())
+    for n, v in enumerate(levels.tolist()):
+        t = [n * process.step, (n + 1) * process.step]
+        values = np.array([q, v])
+        inputs = process.inputs
+        *_, (_, u) = lp.simulate(model, model.latent.inverse(values), u, t, control, inputs)
+        found.append(observed.predict(u, values, Moment(t[1], Inputs(dict(inputs(t[1]))))))
+    difference = (np.array(found) - process.shown(levels))[2:] / process.noise
+    assert np.sqrt(np.mean(difference**2)) < 1.0
+
+
+def process_observed(process, model):
+    sensors = lp.Points(list(process.points), noise=process.noise)
+    return lp.Identifier(model, sensors, lp.SensitivityLaw()).observed
+
+
+# --- checks --------------------------------------------------------------------------------------
+
+
+def trial(seed, cost, **changes):
+    a = np.zeros(2)
+    fit = Fit(a, cost, cost, 5.0, True, "trusted", 3.0)
+    scipy = Reference(a, 40.0, {"lm": 40.0, "trf": 90.0}, {"lm": 1.0, "trf": 0.5})
+    own = {name: changes.pop(name) for name in ("shifted",) if name in changes}
+    return Trial("column", seed, 40.0, replace(fit, **changes), 1.5, scipy, own.get("shifted", 0.5))
+
+
+def failed(trials, jumps=()):
+    return {check.name.split(": ", 1)[1] for check in outcome(trials, jumps).checks if not check.ok}
+
+
+def test_checks_of_good_fits():
+    found = outcome([trial(0, 40.0), trial(1, 40.4, shifted=np.nan)], [])
+    assert found.ok
+    (table,) = found.tables
+    row = dict(zip(table.columns, table.rows[0], strict=True))
+    assert (row["priors"], row["reached"], row["SciPy reached"]) == (2, 2, 2)
+    assert row["time/SciPy"] == pytest.approx(1.5)  # trf is quicker, but fails
+    assert row["outliers kept"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("cost", "changes", "names"),
+    [
+        (50.0, {}, {"share that reaches the best cost", "wrong without a word"}),
+        (50.0, {"level": "do not trust"}, {"share that reaches the best cost"}),
+        (50.0, {"converged": False}, {"share that reaches the best cost"}),
+        (40.0, {"passes": 12.0}, {"passes, median"}),
+        (40.0, {"passes": 14.0}, {"passes, median", "passes, nine of ten"}),
+        (40.0, {"passes": np.nan}, {"passes, median", "passes, nine of ten"}),
+        (40.0, {"claimed": 41.0}, {"reported cost, relative difference"}),
+        (40.0, {"seconds": 4.0}, {"processor time / SciPy, median"}),
+        (40.0, {"shifted": 1.1}, {"outliers, share within one standard deviation"}),
+    ],
+)
+def test_checks_of_bad_fits(cost, changes, names):
+    assert failed([trial(0, cost, **changes)]) == names
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({}, set()),
+        ({"one": 2, "every": 2}, {"found where one unknown may jump"}),
+        (
+            {"one": 2},
+            {"found where one unknown may jump", "found, one may jump less all may jump"},
+        ),
+        ({"shift": 3.1}, {"constant moved, in standard deviations"}),
+        ({"widest": 1.3}, {"standard deviation of the constant / before"}),
+    ],
+)
+def test_checks_of_jumps(changes, names):
+    good = JumpTrial(process="rod", seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
+    assert failed([], [replace(good, **changes)]) == names
+
+
+@pytest.mark.study
+def test_the_command():
+    _, output = bench("refit", "--only", "few", "--seeds", "1", "--workers", "1", "--json")
+    found = json.loads(output)
+    (row, *_) = found["tables"][0]["rows"]
+    assert row[:2] == ["few", 1]
+    assert {check["name"].split(":")[0] for check in found["checks"]} == {"few"}
+
+
+def test_the_column_is_the_one_of_the_report():
+    column = Column()
+    assert [item.truth for item in column.unknowns.values()] == [0.0357, 0.258]
