@@ -20,7 +20,7 @@ from livepde.stepping import StepFailed
 __all__ = ["Fit", "livepde_fit", "plain_seconds"]
 
 Array = NDArray[Any]
-PLAIN = {"start_window": 0}  # FALLBACK, too: the option that turns refits off
+PLAIN = {"refit": None}
 """Options of a filter that takes no sample twice."""
 
 
@@ -75,14 +75,10 @@ def _judged(objective: Objective, result: Result, seconds: float) -> Fit:
     with np.errstate(all="ignore"):
         a = objective.coordinates.inverse(np.asarray(last.q))
     cost = objective.cost(a) if np.isfinite(a).all() else np.inf
-    # FALLBACK: until estimates have a `fit`, nothing is reported, and every fit counts as one that
-    # claims to have converged.
-    fit: Any = getattr(last, "fit", None)
-    claimed = float(getattr(fit, "cost", np.nan))
-    passes = float(getattr(fit, "passes", np.nan))
-    converged = bool(getattr(fit, "converged", True))
-    # END OF FALLBACK
-    return Fit(a, cost, claimed, passes, converged, last.verdict.level, seconds)
+    fit = last.fit
+    if fit is None:
+        return Fit(a, cost, np.nan, np.nan, True, last.verdict.level, seconds)
+    return Fit(a, cost, fit.cost, fit.passes, fit.converged, last.verdict.level, seconds)
 
 
 @lru_cache(maxsize=64)
