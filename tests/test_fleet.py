@@ -93,7 +93,9 @@ def law(**options) -> lp.SensitivityLaw:
 
     Its start is short and without shadows: "usual" is the law that has both as they are by default.
     """
-    return lp.SensitivityLaw(**{"refit": lp.laws.Refit(start=4), "shadows": None, "verdict": False, **options})
+    return lp.SensitivityLaw(
+        **{"refit": lp.laws.Refit(start=4), "shadows": None, "verdict": False, **options}
+    )
 
 
 LAWS = {

@@ -80,8 +80,8 @@ def test_an_overconfident_linearisation_is_iterated():
         scheme=lp.SensitivityLaw.scheme,
     )
 
-    def end(guards: Any, start_window: int = 0) -> tuple[float, float]:
-        law = filter_alone(noise=1e-4, guards=guards, start_window=start_window)
+    def end(guards: Any, refit: Any = None) -> tuple[float, float]:
+        law = filter_alone(noise=1e-4, guards=guards, refit=refit)
         identifier = lp.Identifier(
             model, sensors, law, q0=0.0, u0=lambda x: seed_excited.u_true(x, 0.0)
         )
@@ -92,18 +92,22 @@ def test_an_overconfident_linearisation_is_iterated():
     error, inflation = end(None)
     assert error > 0.5
     assert inflation > 50
-    for error, inflation in (end(lp.laws.Guards()), end(None, 64), end(lp.laws.Guards(), 64)):
+    for error, inflation in (
+        end(lp.laws.Guards()),
+        end(None, lp.Refit()),
+        end(lp.laws.Guards(), lp.Refit()),
+    ):
         assert error < 0.05
         assert inflation < 1.2
 
 
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
 @pytest.mark.long
-def test_guards_do_nothing_where_all_is_well(replay: Any):
+def test_guards_do_nothing_where_all_is_well(refit: Any):
     model = rod()
     stream = samples(model, 0.25, 60)
-    with_guards = run(model, stream, replay=replay)
-    without = run(model, stream, replay=replay, guards=None)
+    with_guards = run(model, stream, refit=refit)
+    without = run(model, stream, refit=refit, guards=None)
     assert counts(with_guards) == {}
     for one, other in zip(with_guards, without, strict=True):
         assert np.array_equal(one.q, other.q)

@@ -245,24 +245,6 @@ def test_a_jump_stays_a_jump():
     np.testing.assert_allclose(smoothed.a_std[-1], data.a_std[-1], rtol=0.05)
 
 
-CHANGES = {
-    "swings": lambda t: 0.1 + 0.04 * np.sin(0.6 * t),
-    "jumps": lambda t: np.where(t < 5.0, 0.1, 0.2),
-}
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", CHANGES)
-def test_the_bank_smooths_by_the_member_that_explains_all_samples(name):
-    """With `jumps` a member leads at the end whose unknown has stayed since."""
-    result = run(lp.AutoLaw(shadows=None), q=CHANGES[name])
-    data, smoothed = result.to_xarray(), result.smoothed()
-    errors = [d.a.values - CHANGES[name](data.time.values) for d in (smoothed, data)]
-    mine, filtered = (np.sqrt(np.mean(error**2)) for error in errors)
-    assert mine < 0.8 * filtered
-    assert np.mean(np.abs(errors[0]) < 1.96 * smoothed.a_std.values) > 0.85
-
-
 @pytest.mark.long
 def test_steps_that_failed_repeat_the_last_that_was_taken():
     stream = swinging(lambda t: 0.12)[:20]

@@ -430,9 +430,9 @@ def test_a_first_sample_at_the_start_says_what_is_unknown_there():
         lambda q, u, v, x: 0.1 * u * v + 0.0 * q.u0 * v,
         initial=lambda q, v, x: q.u0 * v,
     )
-    for replay in (None, lp.Replay(first=2)):
+    for refit in (None, lp.Refit()):
         sensors = lp.Points(SENSORS, noise=NOISE)
-        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=replay))
+        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=refit))
         start = model.initial_state(np.array([2.0]))
         first = identifier.step(0.0, identifier.observed.G @ start)
         np.testing.assert_allclose(first.innovation, 1.0, atol=0.1)
