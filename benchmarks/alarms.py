@@ -209,7 +209,7 @@ def _burgers() -> Process:
 PROCESSES: Mapping[str, Callable[[], Process]] = {
     "heat": cache(lambda: _heat(SensitivityLaw(jumps=Jumps()), "diffusivity, three points")),
     "heat, replayed": cache(
-        lambda: _heat(SensitivityLaw(jumps=Jumps(), replay=Replay()), "diffusivity, three points")
+        lambda: _heat(SensitivityLaw(jumps=Jumps()), "diffusivity, three points")
     ),
     "reaction": _reaction_number,
     "reaction field": _reaction_field,
@@ -358,7 +358,7 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
     data = _seen(suspect.right, Points(POINTS), states, times, q, rng)
     told = []
     for model in (suspect.right, suspect.wrong):
-        law = SensitivityLaw(replay=Replay())
+        law = SensitivityLaw()
         identifier = Identifier(model, data.observation, law, u0=0.0)
         run = identifier.run(zip(times[1:], data.z[1:], strict=True))
         told.append(unexplained(run.to_xarray()))

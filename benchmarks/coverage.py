@@ -77,7 +77,7 @@ class Problem:
 
     title: str
     unknowns: Mapping[str, Any]
-    law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw(replay=Replay()))
+    law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw())
     sensors: Sequence[float] = (0.25, 0.5, 0.75)
     loss: Callable[[np.random.Generator], float] | None = None
     contrast: Callable[[np.random.Generator], float] | None = None
@@ -129,16 +129,16 @@ PROBLEMS: Mapping[str, Problem] = {
     "field": Problem(
         "diffusivity a(x), positive",
         {"a": PROFILE},
-        SensitivityLaw(modes=15, replay=Replay()),
+        SensitivityLaw(modes=15),
         SPREAD,
     ),
     "field, few modes": Problem(
-        "the same with 6 modes", {"a": PROFILE}, SensitivityLaw(modes=6, replay=Replay()), SPREAD
+        "the same with 6 modes", {"a": PROFILE}, SensitivityLaw(modes=6), SPREAD
     ),
     "field, seen in part": Problem(
         "the same, seen from 0.1 to 0.4",
         {"a": PROFILE},
-        SensitivityLaw(modes="auto", replay=Replay()),
+        SensitivityLaw(modes="auto"),
         (0.1, 0.175, 0.25, 0.325, 0.4),
     ),
     "random walk": Problem(

@@ -4,7 +4,7 @@ It is written as a user would write it for one problem, and shares no code with 
 matrices assembled once for one time step, in the order of a band; a leading axis of members, whose
 bands stand one behind the other, so that one factorisation serves all of them. No safeguards, no
 missing samples, no bounds, no substeps. For unknowns in which the process is linear it gives the
-numbers of `SensitivityLaw(guards=None, start_window=0, shadows=None)` with implicit Euler.
+numbers of `SensitivityLaw(guards=None, refit=None, shadows=None)` with implicit Euler.
 """
 
 from __future__ import annotations

@@ -297,7 +297,7 @@ def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Ou
 
 def _fleet_pair(given: Rod, members: int, samples: Sequence[Any]) -> tuple[float, float, float]:
     """Return median and mean cost of a sample over the reference's, and how q differs."""
-    law = SensitivityLaw(guards=None, start_window=0, shadows=None)  # as the reference
+    law = SensitivityLaw(guards=None, refit=None, shadows=None)  # as the reference
     together = Fleet(
         given.model, given.sensors, law, members, u0=0.0, scheme=ImplicitEuler(), halvings=0
     )

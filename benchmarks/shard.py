@@ -40,8 +40,8 @@ GIGABYTES, CORE, FASTER = 0.5, 1.0, 1.5  # the promises: at most, at most, at le
 PATIENCE = 600.0  # seconds for a worker
 STARTED = 10  # members whose iterated start is timed
 LAWS = {
-    "without shadows": SensitivityLaw(start_window=0, shadows=None),
-    "usual": SensitivityLaw(start_window=0),
+    "without shadows": SensitivityLaw(refit=None, shadows=None),
+    "usual": SensitivityLaw(refit=None),
 }
 
 Found = TypeVar("Found")
@@ -105,7 +105,7 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
             "Memory: the largest that a process has had, dumps of one shard after the other "
             "included; that of fewer members is taken for 10 000 in proportion. Time: of the "
             "processor, one thread, all members with samples at the same times, after the first "
-            f"{WARM} samples of each, by a law whose start is not iterated (start_window=0). "
+            f"{WARM} samples of each, by a law whose start is not iterated (refit=None). "
             "Without shadows (shadows=None) errors of the discretisation do not widen what is "
             "reported. Throughput: samples over processor time of each worker, while all run."
         ],

@@ -165,7 +165,7 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
             for beside, shadows, verdict in BESIDE:
                 name, bound = f"sensitivity, modes {count}{beside}", 2.0 + count / 3.0
                 law = SensitivityLaw(
-                    modes=count, noise=1e-3, start_window=0, shadows=shadows, verdict=verdict
+                    modes=count, noise=1e-3, refit=None, shadows=shadows, verdict=verdict
                 )
                 ratios = np.array(_ratios(given, given.points, law))
                 low, middle, high = np.quantile(ratios, (0.0, 0.5, 1.0)).tolist()

@@ -20,7 +20,7 @@ class LiveShard:
 
     def __init__(self, folder, name):
         model = heat(lp.interval(0, 1, 99), lp.Normal(0.5, 0.2), {"left": 0.0, "right": 0.0})
-        sensors, law = lp.Points([0.3, 0.6], noise=0.01), lp.SensitivityLaw(start_window=0)
+        sensors, law = lp.Points([0.3, 0.6], noise=0.01), lp.SensitivityLaw(refit=None)
         self.shard = lp.fleet.Shard(
             model, sensors, law, [f"{name}{k}" for k in range(RODS)], u0=1.0
         )

@@ -32,7 +32,7 @@ def main():
     truth = {"q_true": {"k": 21.0, "eps": 0.8}, "u0": 300.0, "inputs": lambda t: {"a": 300.0}}
     times, noise = 10.0 * np.arange(121), AbsoluteNoise(1.0)
     stream = Twin(model=model, observation=sensors, times=times, noise=noise, **truth)  # yours here
-    law = lp.SensitivityLaw(replay=lp.Replay(first=10))
+    law = lp.SensitivityLaw()
     return lp.Identifier(model, sensors, law, u0=300.0).run(stream).last.parameters
 
 

@@ -184,7 +184,7 @@ def advanced(
 
 def filter_alone(**options: Any) -> lp.SensitivityLaw:
     """Return a sensitivity law without its iterated start, shadows and verdict, for speed."""
-    return lp.SensitivityLaw(**{"start_window": 0, "shadows": None, "verdict": False, **options})
+    return lp.SensitivityLaw(**{"refit": None, "shadows": None, "verdict": False, **options})
 
 
 def observe(model: lp.Model, observation: lp.observation.Observation) -> Any:

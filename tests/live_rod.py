@@ -31,7 +31,7 @@ def identifier(*, verdict: bool = True) -> lp.Identifier:
     )
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
     law = lp.SensitivityLaw(
-        replay=lp.Replay(first=8), start_window=4, shadows=None, verdict=verdict
+        refit=lp.laws.Refit(start=4), shadows=None, verdict=verdict
     )
     return lp.Identifier(model, sensors, law)
 

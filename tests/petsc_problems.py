@@ -24,7 +24,7 @@ class Filter(lp.SensitivityLaw):
 
 def plain(**options):
     """The filter without all that stands around it."""
-    around = {"start_window": 0, "guards": None, "shadows": None, "verdict": False}
+    around = {"refit": None, "guards": None, "shadows": None, "verdict": False}
     return Filter(noise=NOISE, gate=np.inf, **around, **options)
 
 

@@ -133,7 +133,7 @@ def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
         seed=2,
         scheme=lp.SensitivityLaw.scheme,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=16), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(model, sensor, law, u0=START)
     for sample in twin:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)

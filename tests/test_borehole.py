@@ -140,7 +140,7 @@ def test_a_twin_finds_conductivity_and_resistance():
         seed=3,
         **steps,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=16), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(process, sensor, law, u0=10.0, **steps)
     for sample in twin:
         estimate = identifier.step(sample.t, sample.z, sample.inputs)

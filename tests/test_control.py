@@ -51,7 +51,7 @@ GOAL = ct.Goal(track={"tip": 1.0}, move={"heater": 500.0}, inputs={"heater": (0.
 
 def identifier(**options: Any) -> lp.Identifier:
     given = {
-        "law": lp.SensitivityLaw(start_window=4, shadows=None),
+        "law": lp.SensitivityLaw(refit=lp.laws.Refit(start=4), shadows=None),
         "hold": True,
         "scheme": lp.Alexander2(),
         **options,

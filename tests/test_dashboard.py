@@ -63,7 +63,7 @@ def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Ident
             mesh, alpha, {"left": lp.Channel("T0")}, loss=lp.Scalar(lp.Normal(0.2, 0.1), unit="1/s")
         ),
         lp.Points({"a": spot[0]}, noise=0.1, unit="degC"),
-        law or lp.SensitivityLaw(start_window=0),
+        law or lp.SensitivityLaw(refit=None),
         withheld=lp.Points({"b": spot[1]}),
     )
 

@@ -62,7 +62,7 @@ def identifier(kind: str = "line", field: bool = False) -> lp.Identifier:
     return lp.Identifier(
         heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=loss),
         lp.Points({"a": points[0]}, noise=0.1, unit="degC"),
-        lp.SensitivityLaw(start_window=0),
+        lp.SensitivityLaw(refit=None),
         withheld=lp.Points({"b, inside": points[1]}),
     )
 

@@ -272,8 +272,8 @@ RUNS = {
         partial(unjudged_readings, spoiled=True), partial(unjudged_readings, spoiled=False)
     ),
     "run_verdict: replay": Pair(
-        partial(warned_of, FAR, replay=lp.Replay(first=75, iterations=1)),
-        partial(warned_of, ONE, replay=lp.Replay()),
+        partial(warned_of, FAR),
+        partial(warned_of, ONE),
     ),
     "run_verdict: held": Pair(partial(decayed, 0.01), partial(decayed, 0.5)),
     "run_verdict: left out": Pair(

@@ -93,7 +93,9 @@ def law(**options) -> lp.SensitivityLaw:
 
     Its start is short and without shadows: "usual" is the law that has both as they are by default.
     """
-    return lp.SensitivityLaw(**{"start_window": 4, "shadows": None, "verdict": False, **options})
+    return lp.SensitivityLaw(
+        **{"refit": lp.laws.Refit(start=4), "shadows": None, "verdict": False, **options}
+    )
 
 
 LAWS = {
@@ -102,7 +104,7 @@ LAWS = {
     "rank": law(rank=8),
     "plain": law(),
     "gate, noise": law(gate=3.0, noise="auto"),
-    "replay": law(replay=lp.Replay(first=5)),
+    "replay": law(),
     "jumps": law(jumps=lp.Jumps(settle=5)),
     "no guards, memory": law(guards=None, memory=2.0),
 }
@@ -369,7 +371,7 @@ def test_sensors_that_see_an_unknown_step_one_by_one():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("law", [LAWS["plain"], lp.SensitivityLaw(replay=lp.Replay(first=5))])
+@pytest.mark.parametrize("law", [LAWS["plain"], lp.SensitivityLaw()])
 def test_goes_on_from_a_checkpoint_with_the_same_numbers(law, tmp_path):
     model = rod()
     fleet, other = (lp.Fleet(model, SENSORS, law, ["a", "b"]) for _ in range(2))
@@ -547,7 +549,7 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
 def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
     model = MODELS[name]()
-    law = lp.SensitivityLaw(gate=3.0, noise="auto", start_window=4, verdict=False)
+    law = lp.SensitivityLaw(gate=3.0, noise="auto", refit=lp.laws.Refit(start=4), verdict=False)
     fleet = lp.Fleet(model, SENSORS, law, 3, withheld=lp.Points({"hidden": 0.4}))
     kept = FleetRecords(model, 4)
     results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]

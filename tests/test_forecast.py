@@ -18,7 +18,7 @@ LAWS = {
     "gradient": lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(c1=1.0)),
     "sensitivity": lp.SensitivityLaw(drift=0.01, jumps=lp.Jumps()),
     # At once: a replay under way would go on with samples in which nothing is measured.
-    "replay": lp.SensitivityLaw(replay=lp.Replay(first=2, slice=100)),
+    "replay": lp.SensitivityLaw(),
     "auto": lp.AutoLaw(),
 }
 

@@ -226,7 +226,7 @@ def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     samples = [(t, G @ u) for t, u in lp.simulate(model, exact, 0.0, times, control)]
 
     def identifier():
-        law = lp.SensitivityLaw(modes=3, noise=1e-3, start_window=0)
+        law = lp.SensitivityLaw(modes=3, noise=1e-3, refit=None)
         return lp.Identifier(model, points, law, q0=0.0, u0=0.0)
 
     whole, resumed = identifier(), identifier()

@@ -80,8 +80,8 @@ def test_an_overconfident_linearisation_is_iterated():
         scheme=lp.SensitivityLaw.scheme,
     )
 
-    def end(guards: Any, start_window: int = 0) -> tuple[float, float]:
-        law = filter_alone(noise=1e-4, guards=guards, start_window=start_window)
+    def end(guards: Any, refit: Any = None) -> tuple[float, float]:
+        law = filter_alone(noise=1e-4, guards=guards, refit=refit)
         identifier = lp.Identifier(
             model, sensors, law, q0=0.0, u0=lambda x: seed_excited.u_true(x, 0.0)
         )
@@ -92,18 +92,22 @@ def test_an_overconfident_linearisation_is_iterated():
     error, inflation = end(None)
     assert error > 0.5
     assert inflation > 50
-    for error, inflation in (end(lp.laws.Guards()), end(None, 64), end(lp.laws.Guards(), 64)):
+    for error, inflation in (
+        end(lp.laws.Guards()),
+        end(None, lp.Refit()),
+        end(lp.laws.Guards(), lp.Refit()),
+    ):
         assert error < 0.05
         assert inflation < 1.2
 
 
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
 @pytest.mark.long
-def test_guards_do_nothing_where_all_is_well(replay: Any):
+def test_guards_do_nothing_where_all_is_well(refit: Any):
     model = rod()
     stream = samples(model, 0.25, 60)
-    with_guards = run(model, stream, replay=replay)
-    without = run(model, stream, replay=replay, guards=None)
+    with_guards = run(model, stream, refit=refit)
+    without = run(model, stream, refit=refit, guards=None)
     assert counts(with_guards) == {}
     for one, other in zip(with_guards, without, strict=True):
         assert np.array_equal(one.q, other.q)
@@ -121,7 +125,7 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     scheme = lp.ImplicitEuler()
     clean = samples(model, 2.0, 90, scheme=scheme)
     stream = [(t, z + size * (40 <= k < 40 + length)) for k, (t, z) in enumerate(clean)]
-    options = {"scheme": scheme, "drift": 0.1, "gate": np.inf, "start_window": 0}
+    options = {"scheme": scheme, "drift": 0.1, "gate": np.inf, "refit": None}
     stuck = run(model, stream, **options, guards=None)
     assert sum(not estimate.status.ok for estimate in stuck) > 40  # of the 50 that are left
     assert abs(stuck[-1].parameters["q"][0] - 2.0) > 5.0
@@ -190,7 +194,7 @@ def test_no_burst_follows_a_rest():
         stream = samples(process, 0.3, 320, seed, scheme=scheme)
         for guards, found in ends.items():
             # With shadows the gate knows the error of the step, and lets the burst be corrected.
-            options = {"guards": guards, "start_window": 0}
+            options = {"guards": guards, "refit": None}
             estimates = run(model, stream, scheme, halvings=0, **options)
             found.append([e.parameters["a"][0] for e in estimates[240:]])
     assert np.min(ends[None]) < 0.0  # a burst

@@ -34,7 +34,7 @@ HIDDEN = lp.Points({"c": 0.8}, unit="degC")
 
 def identifier(**options):
     options = {"withheld": HIDDEN, **options}
-    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(start_window=4), **options)
+    return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(refit=lp.laws.Refit(start=4)), **options)
 
 
 def sample(t=0.1, **changes):
@@ -221,7 +221,7 @@ def test_halvings_that_cannot_be_meant(halvings):
     [
         lp.GradientLaw(gain=100.0),
         lp.SensitivityLaw(modes=5, noise=0.01),
-        lp.SensitivityLaw(modes=5, noise=0.01, replay=lp.Replay(window=12, first=4)),
+        lp.SensitivityLaw(modes=5, noise=0.01),
     ],
 )
 def test_a_continued_run_is_bit_identical(law, tmp_path):

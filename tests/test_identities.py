@@ -180,7 +180,7 @@ def observation(calibrated: str, frame: Frame) -> lp.Observation:
 
 def law(o: Options, kind: type[lp.SensitivityLaw] = lp.SensitivityLaw) -> lp.SensitivityLaw:
     return kind(
-        replay=lp.Replay(first=3, slice=50) if o.replay else None,
+         if o.replay else None,
         jumps=lp.Jumps(settle=3) if o.jumps else None,
         gate=o.gate,
         gate_patience=2,

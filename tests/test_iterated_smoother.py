@@ -55,7 +55,7 @@ def ends(model, law, samples, u0=0.0):
 def test_nothing_changes_where_all_is_linear(evolution):
     model = sourced(evolution)
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(start_window=0, shadows=None), samples)
+    plain = ends(model, lp.SensitivityLaw(refit=None, shadows=None), samples)
     iterated = ends(model, lp.SensitivityLaw(shadows=None), samples)
     assert any(not np.isnan(estimate.diagnostics.smoother_moved) for estimate in iterated)
     for one, other in zip(plain, iterated, strict=True):
@@ -173,7 +173,7 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
     monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda samples: None)
     model = sourced()
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(start_window=0), samples)[-1]
+    plain = ends(model, lp.SensitivityLaw(refit=None), samples)[-1]
     found = ends(model, lp.SensitivityLaw(), samples)
     assert found[0].diagnostics.smoother_moved == np.inf
     np.testing.assert_array_equal(found[-1].q, plain.q)
@@ -182,7 +182,7 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
 @pytest.mark.slow
 def test_a_settled_run_iterates_no_more():
     model = sourced()
-    found = ends(model, lp.SensitivityLaw(start_window=8), readings(model, [1.5]))
+    found = ends(model, lp.SensitivityLaw(refit=lp.laws.Refit(start=8)), readings(model, [1.5]))
     moved = [not np.isnan(estimate.diagnostics.smoother_moved) for estimate in found]
     assert any(moved[:16])
     assert not any(moved[32:])
@@ -218,7 +218,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
 @pytest.mark.slow
 def test_a_direction_that_is_not_told_keeps_the_start_open():
     model = sourced()
-    law = lp.SensitivityLaw(start_window=16)
+    law = lp.SensitivityLaw(refit=lp.laws.Refit(start=16))
     identifier = lp.Identifier(model, SENSORS, law, u0=0.0)
     for t in TIMES[1:]:
         identifier.step(t, np.full(3, np.nan) if t < 2.0 else np.zeros(3))
@@ -238,7 +238,7 @@ def test_a_search_that_hardly_moves_the_unknowns_corrects_the_state():
     bare = {"shadows": None, "verdict": False}
     whole = ends(model, lp.SensitivityLaw(), samples, start)
     alone = ends(model, lp.SensitivityLaw(**bare), samples, start)
-    plain = ends(model, lp.SensitivityLaw(start_window=0, **bare), samples, start)
+    plain = ends(model, lp.SensitivityLaw(refit=None, **bare), samples, start)
     moved = [one.diagnostics.smoother_moved for one in whole]
     assert 0.0 < np.nanmax(moved) <= iterated_smoother.HOLDS
     for one, other in zip(whole, alone, strict=True):

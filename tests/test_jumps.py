@@ -36,22 +36,22 @@ def run(law: lp.SensitivityLaw, stream: Any, guess: float = NOISE, **options: An
     return found
 
 
-# Every two of replay, change and seed once.
+# Every two of refit, change and seed once.
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("seed", "replay", "change"),
+    ("seed", "refit", "change"),
     [
         (0, None, 0.8),
-        (0, lp.Replay(), 1.2),
+        (0, lp.Refit(), 1.2),
         (1, None, 1.2),
-        (1, lp.Replay(), 0.8),
+        (1, lp.Refit(), 0.8),
     ],
 )
-def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, seed: int):
+def test_a_jump_of_a_fifth_is_flagged_and_learned(refit: Any, change: float, seed: int):
     def a(t: float) -> float:
         return 0.3 if t < 7.5 else 0.3 * change
 
-    law = lp.SensitivityLaw(jumps=Jumps(), replay=replay)
+    law = lp.SensitivityLaw(jumps=Jumps(), refit=refit)
     found = run(law, samples(a, 350, seed))
     alarms = [k for k, estimate in enumerate(found) if estimate.diagnostics.jump > 0.0]
     late = [k for k in alarms if k >= 149]
@@ -62,11 +62,11 @@ def test_a_jump_of_a_fifth_is_flagged_and_learned(replay: Any, change: float, se
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
 @pytest.mark.parametrize("seed", [1, 5, 7])
-def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(replay: Any, seed: int):
+def test_after_an_alarm_the_samples_since_the_jump_are_taken_again(refit: Any, seed: int):
     """What the state has gone astray by in the meantime is not taken for a still larger jump."""
-    law, scheme = lp.SensitivityLaw(jumps=Jumps(), replay=replay), lp.ImplicitEuler()
+    law, scheme = lp.SensitivityLaw(jumps=Jumps(), refit=refit), lp.ImplicitEuler()
     stream = samples(lambda t: 0.3 if t < 15.0 else 0.24, 340, seed, scheme=scheme)
     found = run(law, stream, scheme=scheme)
     values = [estimate.parameters["a"][0] for estimate in found[299:]]
@@ -87,15 +87,12 @@ def test_a_sample_without_a_measurement_is_no_evidence():
     assert not any(estimate.diagnostics.jump > 0.0 for estimate in found)
 
 
-@pytest.mark.parametrize(
-    ("law", "after"), [(filter_alone(jumps=Jumps(settle=20)), 0.24), (lp.AutoLaw(), 0.2)]
-)
-def test_samples_without_a_measurement_are_taken_again_with_those_since_the_jump(
-    law: Any, after: float
-):
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
+def test_samples_without_a_measurement_are_taken_again_with_those_since_the_jump(refit: Any):
     """Their number counts all of them, back to the first measurement after it."""
     nothing = np.full(len(POINTS), np.nan)
-    stream = samples(lambda t: 0.3 if t < 10.0 else after, 220, 0)
+    stream = samples(lambda t: 0.3 if t < 10.0 else 0.24, 220, 0)
+    law = filter_alone(jumps=Jumps(settle=20), refit=refit)
     found = run(law, [(t, z if k % 2 else nothing) for k, (t, z) in enumerate(stream)])
     alarms = [k for k, one in enumerate(found) if one.diagnostics.jump > 0.0 and k > 199]
     assert alarms[0] - found[alarms[0]].diagnostics.jump_samples + 1 == 201
@@ -156,7 +153,7 @@ def test_settings_that_cannot_be_meant_are_refused(options: Any):
 @pytest.mark.long
 @pytest.mark.parametrize("guess", [1e-3, 1e-1, 1.0])
 def test_the_noise_is_found_from_any_first_guess(guess: float):
-    law = lp.SensitivityLaw(noise="auto", replay=lp.Replay(first=16), shadows=None)
+    law = lp.SensitivityLaw(noise="auto", shadows=None)
     found = run(law, samples(lambda t: 0.3, 250, 0), guess)
     assert found[-1].diagnostics.noise_level * guess == pytest.approx(NOISE, rel=0.2)
     value, std = found[-1].parameters["a"]

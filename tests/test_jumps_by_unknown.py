@@ -50,9 +50,9 @@ def samples() -> list[tuple[float, Any]]:
 
 
 @cache
-def run(jumps: lp.Jumps, replay: Any = None) -> Any:
+def run(jumps: lp.Jumps, refit: Any = None) -> Any:
     """Return the estimates, the samples of alarms, and the usual size of the innovations."""
-    law = lp.SensitivityLaw(jumps=jumps, replay=replay)
+    law = lp.SensitivityLaw(jumps=jumps, refit=refit)
     identifier = lp.Identifier(rod(16), lp.Points(POINTS, noise=NOISE), law, u0=0.0)
     found, usual = [], []
     for t, z in samples():
@@ -73,10 +73,10 @@ def test_two_large_jumps_do_not_hide_a_third_one():
         assert any(at <= k < at + 15 for k in alarms)
 
 
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
 @pytest.mark.long
-def test_what_does_not_jump_keeps_what_is_known_of_it(replay: Any):
-    found, alarms, _ = run(FLUX, replay)
+def test_what_does_not_jump_keeps_what_is_known_of_it(refit: Any):
+    found, alarms, _ = run(FLUX, refit)
     # One value beyond the gate may be a fault of its sensor: the next one makes it a jump.
     late = {alarm - jump for alarm, jump in zip(alarms, JUMPS, strict=True)}
     assert late <= {0, 1}

@@ -265,7 +265,7 @@ def square(cells=12):
             lp.Subdomain(lambda x: x[0] < 0.6),
         ),
         (
-            lp.SensitivityLaw(modes=4, noise=1e-3, start_window=1, shadows=None),
+            lp.SensitivityLaw(modes=4, noise=1e-3, refit=lp.laws.Refit(start=1), shadows=None),
             lp.Points([(0.3, 0.4), (0.7, 0.6)]),
         ),
     ],

@@ -43,7 +43,7 @@ UNKNOWNS = [
 ]
 
 
-SHORT = {"start_window": 4, "shadows": None}
+SHORT = {"refit": lp.laws.Refit(start=4), "shadows": None}
 # Each law once, and each unknown with one of them.
 PAIRS = [
     (UNKNOWNS[0], lp.SensitivityLaw()),
@@ -54,9 +54,7 @@ PAIRS = [
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("unknown", "law"), [*PAIRS, (UNKNOWNS[3], lp.SensitivityLaw(replay=lp.Replay(), **SHORT))]
-)
+@pytest.mark.parametrize(("unknown", "law"), [*PAIRS, (UNKNOWNS[3], lp.SensitivityLaw(**SHORT))])
 def test_an_estimate_that_is_read_later_is_the_same(unknown, law):
     """What `step` returns does not change while the identifier goes on."""
     one, other = rod(unknown, law), rod(unknown, law)

@@ -21,7 +21,7 @@ from livepde.fem import Inputs, Moment, linear
 
 COUNT = 60
 # The reference has neither safeguards nor an iterated start.
-LAW = lp.SensitivityLaw(guards=None, start_window=0, shadows=None)
+LAW = lp.SensitivityLaw(guards=None, refit=None, shadows=None)
 
 
 def moment(sample):

@@ -206,7 +206,7 @@ def test_members_without_a_reading_step_with_the_others(monkeypatch: pytest.Monk
 
     monkeypatch.setattr("livepde.laws.sensitivity.step_alone", counted)
     model = rod({"left": 1.0, "right": 0.0})
-    law = lp.SensitivityLaw(start_window=0)  # its iterations are made by each member alone
+    law = lp.SensitivityLaw(refit=None)  # its iterations are made by each member alone
     fleet = lp.Fleet(model, lp.Points([0.3, 0.6], noise=5.0), law, 2)
     for k in range(5):
         fleet.step(0.1 * (k + 1), [[0.5, 0.3], [np.nan, np.nan]])
@@ -256,7 +256,7 @@ def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.slow
 def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), guards=lp.laws.Guards(past=8))
+    law = lp.SensitivityLaw(guards=lp.laws.Guards(past=8))
     model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law, u0=0.0)
     for k in range(8):
@@ -268,7 +268,7 @@ def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
 
 
 def test_each_member_has_its_own_noise_level_and_is_finite_by_itself():
-    law = lp.SensitivityLaw(start_window=0, shadows=None, verdict=False)
+    law = lp.SensitivityLaw(refit=None, shadows=None, verdict=False)
     fleet = lp.Fleet(rod({"left": 0.0}), lp.Points([0.5], noise=0.1), law, 2)
     for k in range(1, 4):
         fleet.step(0.1 * k, [[0.2]] * 2)

@@ -1,4 +1,4 @@
-"""Moving and transformed unknowns: the Kalman filter, replays, checkpoints, the theory."""
+"""Moving and transformed unknowns: the Kalman filter, refits, checkpoints, the theory."""
 
 from __future__ import annotations
 
@@ -20,8 +20,6 @@ from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
 from livepde.fem.evolution import CONSTANT
-from livepde.laws import replay_slices
-from livepde.laws.replay import FIXED
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
 from livepde.streams import AbsoluteNoise, Twin
@@ -129,36 +127,36 @@ class Dense:
         return V @ self.x[self.n :], np.sqrt(variance)
 
 
-REPLAYS = {
-    "none": None,
-    "never": lp.Replay(FIXED, FIXED),  # one reference that stays, as in a preview
-    "all": lp.Replay(first=4),
-    "window": lp.Replay(first=4, window=11),
+class Still(lp.SensitivityLaw):
+    """The law with one reference that stays, as in a preview."""
+
+    relinearises = False
+
+
+LAWS = {
+    "plain": lambda **options: lp.SensitivityLaw(refit=None, **options),
+    "still": lambda **options: Still(refit=None, **options),
+    "refit": lp.SensitivityLaw,
+    "window": lambda **options: lp.SensitivityLaw(refit=lp.Refit(start=4, window=11), **options),
 }
-# What moves at random is not replayed.
-PAIRS = [
-    pair
-    for pair in itertools.product(EVOLUTIONS, REPLAYS)
-    if pair[0] in ("constant", "periodic") or pair[1] in ("none", "never")
-]
 
 
-def replayed(name: str, replay: lp.Replay | None) -> lp.Model:
-    """Return the linear model for a law, with offsets that stay where they are replayed."""
-    stays = replay is not None and replay.first < FIXED
+def fitted(name: str, law: str) -> lp.Model:
+    """Return the linear model for a law, with offsets that stay where samples are fitted."""
+    stays = law in ("refit", "window")
     return linear_model(EVOLUTIONS[name], CONSTANT if stays else REVERTING)
 
 
-# Each evolution with each replay, and each of both with one substep and with several.
+# Each evolution with each law, and each of both with one substep and with several.
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "replay", "substeps"),
-    [(*pair, (1, 4)[k % 2]) for k, pair in enumerate(PAIRS)],
+    ("name", "kind", "substeps"),
+    [(*pair, (1, 4)[k % 2]) for k, pair in enumerate(itertools.product(EVOLUTIONS, LAWS))],
 )
-def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, substeps: int):
-    model = replayed(name, REPLAYS[replay])
+def test_a_linear_problem_gives_the_kalman_filter(name: str, kind: str, substeps: int):
+    model = fitted(name, kind)
     # Unknowns that stay do not explain these data: a gate would refuse some of them.
-    law = lp.SensitivityLaw(modes=7, rank=30, replay=REPLAYS[replay], gate=np.inf, shadows=None)
+    law = LAWS[kind](modes=7, rank=30, gate=np.inf, shadows=None)
     # Samples at equal distances: dt_max then divides each step alike.
     stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
     scheme = lp.ImplicitEuler()  # as in the dense filter
@@ -180,45 +178,37 @@ def test_a_linear_problem_gives_the_kalman_filter(name: str, replay: str, subste
 
 
 MOVING = {
-    "evolution": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.RandomWalk(0.4)), 0.0),
+    "walk": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.RandomWalk(0.4)), 0.0),
     "reverting": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.MeanReverting(0.4)), 0.0),
+    "periodic": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.fem.Periodic(2.0)), 0.0),
     "drift": (lp.Normal(1.0, 0.5), 0.1),
 }
 
 
 @pytest.mark.parametrize("name", MOVING)
-def test_unknowns_that_move_at_random_are_not_replayed(name: str):
+def test_unknowns_that_move_are_not_fitted(name: str):
     unknown, drift = MOVING[name]
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
         {"k": unknown},
         A=lambda q, u, v, x: q.k * u * v,
     )
-    law = lp.SensitivityLaw(drift=drift, replay=lp.Replay())
-    with pytest.raises(lp.errors.LawError, match=r"'k' moves at random by .*leave out `replay`\."):
-        lp.Identifier(model, sensors_of_state(), law)
-    # The law that tunes itself replays those of its members whose unknowns stay.
-    auto = lp.Identifier(model, sensors_of_state(), lp.AutoLaw())
-    assert auto.step(0.1, [0.0]).status.ok
-
-
-def sensors_of_state() -> lp.Points:
-    return lp.Points([0.5], noise=NOISE)
+    points = lp.Points([0.5], noise=NOISE)
+    identifier = lp.Identifier(model, points, lp.SensitivityLaw(drift=drift), u0=1.0)
+    stream = [(t, [np.exp(-t)]) for t in 0.1 * np.arange(1, 6)]
+    result = identifier.run(stream)
+    assert result.last.fit is None
+    assert abs(result.last.parameters["k"][0] - 1.0) < 2.0 * result.last.parameters["k"][1]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "replay"),
-    [
-        ("walk", None),
-        ("reverting", None),
-        ("constant", lp.Replay(first=3, window=9)),
-        ("periodic", lp.Replay(first=3, window=9)),
-    ],
+    ("name", "kind"),
+    [("walk", "refit"), ("reverting", "plain"), ("constant", "window"), ("periodic", "window")],
 )
-def test_the_law_keeps_its_contract_while_unknowns_move(name: str, replay: Any):
-    model = replayed(name, replay)
-    law = lp.SensitivityLaw(modes=3, replay=replay, gate=4.0, start_window=4, shadows=None)
+def test_the_law_keeps_its_contract_while_unknowns_move(name: str, kind: str):
+    model = fitted(name, kind)
+    law = LAWS[kind](modes=3, gate=4.0, shadows=None)
     stream = samples(8, missing=False)
     check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
@@ -232,7 +222,7 @@ def test_a_checkpoint_of_other_modes_is_refused_whatever_its_width(tmp_path: Pat
     for t, z in samples(4):
         first.step(t, z)
     first.save(tmp_path / "state.bin")
-    with pytest.raises(lp.errors.RunError, match="saved with another option of the law"):
+    with pytest.raises(lp.errors.RunError, match="another option of the law"):
         other.load(tmp_path / "state.bin")
 
 
@@ -252,9 +242,9 @@ def test_an_initial_state_may_read_channels():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("replay", "first"), [(None, True), (lp.Replay(first=2), True), (lp.Replay(first=2), False)]
+    ("refit", "first"), [(None, True), (lp.Refit(), True), (lp.Refit(), False)]
 )
-def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
+def test_a_nonlinear_initial_state_is_linearised_anew(refit: Any, first: bool):
     unknown = lp.LogNormal(1.0, 1.0)
     model = lp.Model(
         lp.Field(mesh, ElementLineP1()),
@@ -264,7 +254,7 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
     )
     truth = model.initial_parameter({"u0": 5.0})
     forward, u = ForwardStage(model), model.initial_state(truth)
-    law = lp.SensitivityLaw(replay=replay)
+    law = lp.SensitivityLaw(refit=refit)
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law)
     if first:
         identifier.step(0.0, identifier.observed.G @ u)
@@ -276,7 +266,7 @@ def test_a_nonlinear_initial_state_is_linearised_anew(replay: Any, first: bool):
 
 
 @pytest.mark.long
-def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
+def test_a_periodic_unknown_is_found_with_its_phase():
     def a(t: float) -> float:
         return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
 
@@ -285,7 +275,7 @@ def test_replays_begin_with_the_phase_that_leads_to_the_estimate():
 
     model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
     points = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(model, points, law)
     errors = []
     for t, z in readings(rod(lp.Normal(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
@@ -424,27 +414,8 @@ def test_the_preview_tells_of_the_end_and_of_errors_that_are_not_seen(
     assert not preview(prepared, stream[:60]).last
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["constant", "periodic"])
-def test_replays_stop_once_reference_and_estimate_agree(name: str, monkeypatch: Any):
-    placed, count = replay_slices.placed, []
-
-    def counted(*arguments: Any) -> Any:
-        count.append(1)
-        return placed(*arguments)
-
-    monkeypatch.setattr(replay_slices, "placed", counted)
-    law = lp.SensitivityLaw(
-        modes=7, replay=lp.Replay(first=4, iterations=50, slice=64), shadows=None
-    )
-    identifier = lp.Identifier(replayed(name, law.replay), sensors(), law)
-    for t, z in samples():
-        assert identifier.step(t, z).status.ok
-    assert 3 <= len(count) <= 15  # three doublings
-
-
 @pytest.mark.slow
-def test_replays_find_the_most_probable_parameter():
+def test_a_run_finds_the_most_probable_parameter():
     left = lambda x, t: np.sin(3 * t) + 0 * x[0]  # noqa: E731
     state = lp.Field(mesh, ElementLineP1(), dirichlet={"left": left})
     model = lp.Model(
@@ -457,7 +428,7 @@ def test_replays_find_the_most_probable_parameter():
         A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
         initial=lambda q, v, x: q.w * np.sin(np.pi * x[0]) * v,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     identifier = lp.Identifier(model, sensors(), law, halvings=0)
     latent, forward, times = model.latent, ForwardStage(model), 0.02 * np.arange(64)
 
@@ -471,8 +442,7 @@ def test_replays_find_the_most_probable_parameter():
     truth = {"a": 0.1, "w": 1.6, "off": [0.05, -0.08]}
     rng, exact = np.random.default_rng(1), seen(model.initial_parameter(truth))
     data = exact + NOISE * rng.standard_normal(exact.shape)
-    for t, z in zip(times, data, strict=True):
-        estimate = identifier.step(t, z)
+    estimate = identifier.run(zip(times, data, strict=True)).last
 
     def residual(x: Array) -> Array:
         misfit = (data - seen(latent.prior + latent.deviations * x)) / NOISE
@@ -527,7 +497,7 @@ def test_what_sensors_see_is_linear_about_the_reference_as_the_state_is():
             seed=seed,
             scheme=lp.SensitivityLaw.scheme,
         )
-        law = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None)
+        law = lp.SensitivityLaw(shadows=None)
         identifier = lp.Identifier(model, points, law, u0=0.0)
         estimate = identifier.run(twin).last
         assert identifier._state.now.innovations.inflation < 1.3

@@ -52,10 +52,10 @@ def same(one: lp.Estimate, other: lp.Estimate) -> bool:
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
-SHORT = {"start_window": 4, "shadows": None}
+SHORT = {"refit": lp.laws.Refit(start=4), "shadows": None}
 LAWS = [
     lp.SensitivityLaw(),
-    lp.SensitivityLaw(replay=lp.Replay(window=64), **SHORT),
+    lp.SensitivityLaw(**SHORT),
     lp.SensitivityLaw(jumps=lp.Jumps(settle=5), **SHORT),
     lp.SensitivityLaw(noise="auto", **SHORT),
     lp.SensitivityLaw(drift=0.1, **SHORT),
@@ -182,7 +182,7 @@ def test_a_withheld_reading_may_have_noise_and_is_scored_all_the_same():
 @pytest.mark.slow
 def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
     """Of those that an iterated start or a replay takes again."""
-    for law in (lp.SensitivityLaw(), lp.SensitivityLaw(replay=lp.Replay())):
+    for law in (lp.SensitivityLaw(), lp.SensitivityLaw()):
         one, two = identifier(law), identifier(law)
         for k, (t, z, std) in enumerate(stream()):
             if k == 11:

@@ -194,7 +194,7 @@ def test_burgers_from_a_published_field(data_dir, noise, share, bound):
     start = lp.Field(mesh, ElementLineHermite(), inner="H1", prior=lp.Normal(std=1.0))
     model = burgers(mesh, lp.LogNormal(0.3, 0.3), lp.Normal(0.5, 0.5), start)
     sensors = lp.Points(list(np.arange(-8.0, 8.0, 0.125)), noise=max(0.1814 * noise, 2e-4))
-    law = lp.SensitivityLaw(modes=40, replay=lp.Replay(first=25))
+    law = lp.SensitivityLaw(modes=40)
     identifier = lp.Identifier(model, sensors, law, scheme=Alexander2(), dt_max=0.05)
     found = identifier.run(zip(t[:51], z[:51], strict=True)).last.parameters
     assert abs(found["nu"][0] / 0.1 - 1) < bound

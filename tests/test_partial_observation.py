@@ -78,7 +78,7 @@ def together(several: list[Found], low: float, high: float) -> tuple[float, floa
 
 @pytest.mark.long
 def test_a_field_is_found_as_far_as_the_dynamics_carry_and_its_interval_tells_how_far():
-    law = lp.SensitivityLaw(replay=lp.Replay(), shadows=None)
+    law = lp.SensitivityLaw(shadows=None)
     several = [found(seed, law) for seed in range(5)]
     seen, hit, narrow = together(several, 0.5, 0.9)
     assert seen < 0.25
@@ -95,7 +95,7 @@ def test_a_field_is_found_as_far_as_the_dynamics_carry_and_its_interval_tells_ho
 
 @pytest.mark.long
 def test_modes_that_are_too_few_mislead_where_nothing_is_seen():
-    laws = (lp.SensitivityLaw(modes=m, replay=lp.Replay(), shadows=None) for m in (6, "auto"))
+    laws = (lp.SensitivityLaw(modes=m, shadows=None) for m in (6, "auto"))
     few, enough = (together([found(seed, law) for seed in (0, 1)], 0, 0.3) for law in laws)
     assert few[0] > 1.5 * enough[0]
     assert few[1] < enough[1]

@@ -124,7 +124,7 @@ def test_the_speed_of_a_wave_is_found():
     truth = [
         (t, [np.sin(2 * np.pi * (x - t)) for x in (0.2, 0.5)]) for t in np.arange(0.0, 1.51, 0.02)
     ]
-    law = lp.SensitivityLaw(replay=lp.Replay(first=10))
+    law = lp.SensitivityLaw()
     start = lambda x: np.sin(2 * np.pi * x[0])  # noqa: E731
     ident = lp.Identifier(model, sensors, law, u0=start, scheme=Alexander2())
     for t, z in truth:

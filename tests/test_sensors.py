@@ -352,7 +352,7 @@ def identified(model, sensors, truth, noise, inputs=None, steps=120, check=None)
         noise=AbsoluteNoise(noise),
         inputs=inputs,
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=8))
+    law = lp.SensitivityLaw()
     identifier = lp.Identifier(model, sensors, law)
     result = identifier.run(twin)
     assert result.last.status.ok

@@ -238,9 +238,9 @@ def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
-def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> None:
-    law, rows = lp.SensitivityLaw(replay=replay), samples()[:90]
+@pytest.mark.parametrize("refit", [None, lp.Refit()])
+def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, refit: Any) -> None:
+    law, rows = lp.SensitivityLaw(refit=refit), samples()[:90]
     whole = identifier(8, law)
     ran(whole, rows[:50])
     whole.save(tmp_path / "state.bin")
@@ -252,24 +252,24 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, replay: Any) -> No
 
 
 @pytest.mark.slow
-def test_a_replay_restarts_its_shadows() -> None:
+def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
-    plain = ran(identifier(8, scheme=ImplicitEuler()), samples())
-    law = lp.SensitivityLaw(replay=lp.Replay())
-    replayed = ran(identifier(8, law, scheme=ImplicitEuler()), samples())
+    law = lp.SensitivityLaw(refit=None)
+    plain = ran(identifier(8, law, scheme=ImplicitEuler()), samples())
+    fitted = identifier(8, scheme=ImplicitEuler())
+    ran(fitted, samples())
+    refitted = fitted.refit()
     for kind in ("step", "mesh"):
-        one, other = shifts(plain, kind), shifts(replayed, kind)
+        one, other = shifts(plain, kind), shifts(refitted, kind)
         assert np.abs(one - other).max() < 0.3 * np.abs(one).max()
 
 
 @pytest.mark.slow
-def test_holds_with_gaps_and_for_the_bank() -> None:
+def test_holds_with_gaps() -> None:
     rows = samples()
     gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
     estimate = ran(identifier(8), gappy)
     assert abs(estimate.diagnostics.shifts.by("mesh")["k"]) > 0.0
-    bank = ran(identifier(8, lp.AutoLaw()), rows[:60])
-    assert bank.diagnostics.shifts.largest > 0.0
 
 
 @pytest.mark.slow
@@ -304,7 +304,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
 
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:
     """Neither gate nor verdict take its part, and no number of the filter moves."""
-    law = lp.SensitivityLaw(start_window=0)
+    law = lp.SensitivityLaw(refit=None)
     spoiled, whole = identifier(8, law), identifier(8, law)
     ran(spoiled, samples()[:15]), ran(whole, samples()[:15])
     now = spoiled._state.now

@@ -46,7 +46,7 @@ def test_standard_deviations_are_those_of_the_exact_filter(kind: str, decay: flo
     for h in (0.05 * 3.0, 0.5 * 3.0, 2.0 * 3.0):
         for share in (0.01, 0.2):
             exact = exact_of(kind, decay, share)
-            who, count = identifier(exact, start_window=0), 12
+            who, count = identifier(exact, refit=None), 12
             _, P = exact.filtered(h, np.zeros(count))
             for k in range(count):
                 who.step(k * h, {"a": 0.0})
@@ -70,7 +70,7 @@ def test_empty_rows_between_samples_change_nothing(kind: str, decay: float):
     exact, h = exact_of(kind, decay, 0.1), 2.0
     rng = np.random.default_rng(0)
     z = exact.read(exact.drawn(h, 8, rng), rng)
-    plain, filled = identifier(exact, start_window=0), identifier(exact, start_window=0)
+    plain, filled = identifier(exact, refit=None), identifier(exact, refit=None)
     for k, value in enumerate(z):
         for j in range(1, 12) if k else ():
             filled.step((k - 1 + j / 12) * h, {})
@@ -89,7 +89,7 @@ def test_coverage(kind: str, decay: float, h: float):
     for seed in range(12):
         rng = np.random.default_rng([seed, 7])
         path = exact.drawn(h, 100, rng)
-        who = identifier(exact, start_window=0)
+        who = identifier(exact, refit=None)
         for k, value in enumerate(exact.read(path, rng)):
             mean = float(who.step(k * h, {"a": value})["s"].mean)
             inside.append(abs(mean - path[k, 1]) <= 1.96 * spread(who, exact))
@@ -101,7 +101,7 @@ def test_the_smoother_is_the_exact_one(kind: str):
     exact, h = exact_of(kind, 0.0, 0.1), 2.0
     rng = np.random.default_rng(1)
     z = exact.read(exact.drawn(h, 15, rng), rng)
-    who = identifier(exact, start_window=0)
+    who = identifier(exact, refit=None)
     result = who.run([(k * h, {"a": value}) for k, value in enumerate(z)])
     mean, P = exact.smoothed(h, z)
     smoothed, std = result.smoothed(), np.sqrt(P[:, 1, 1])

@@ -168,7 +168,7 @@ def probe() -> lp.observation.Observation:
 
 
 GUARDED = lp.SensitivityLaw(guards=lp.laws.Guards(), jumps=lp.Jumps(settle=4))
-REPLAYING = lp.SensitivityLaw(replay=lp.Replay(first=4))
+REPLAYING = lp.SensitivityLaw()
 
 CASES = {
     "gradient": Case(lp.GradientLaw(gain=10.0), rod, inner),

@@ -93,7 +93,7 @@ def found(
 ) -> lp.Estimate:
     """Return the last estimate from noisy data of the model itself."""
     rng = np.random.default_rng(0)
-    filtering = lp.SensitivityLaw(replay=lp.Replay(first=8), shadows=None, verdict=False, **law)
+    filtering = lp.SensitivityLaw(shadows=None, verdict=False, **law)
     identifier = lp.Identifier(model, sensors, filtering)
     exact = model.initial_parameter(truth)
     physical, forward = model.latent.value(exact), ForwardStage(model)

@@ -229,7 +229,7 @@ def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)
     samples = data(lambda t: 0.05, times)
     model = rod({"a": lp.LogNormal(1.0, 1.0)})
-    found = estimates(model, lp.SensitivityLaw(replay=lp.Replay(first=8)), samples)
+    found = estimates(model, lp.SensitivityLaw(), samples)
     values = [estimate.parameters["a"][0] for estimate in found]
     assert min(values) > 0.0
     value, std = found[-1].parameters["a"]
@@ -337,7 +337,7 @@ def test_an_unknown_initial_state_is_found_with_the_diffusivity():
     forward, rng = ForwardStage(model), np.random.default_rng(0)
     u = model.initial_state(truth)
     assert np.abs(u - np.sin(np.pi * mesh.p[0])).max() < 0.01
-    law = lp.SensitivityLaw(modes=8, replay=lp.Replay(first=8), shadows=None)
+    law = lp.SensitivityLaw(modes=8, shadows=None)
     identifier = lp.Identifier(model, lp.Points(SENSORS, noise=NOISE), law)
     G, times = identifier.observed.G, np.arange(0.0, 4.0, 0.02)
     identifier.step(0.0, G @ u + NOISE * rng.standard_normal(3))
@@ -431,9 +431,9 @@ def test_a_first_sample_at_the_start_says_what_is_unknown_there():
         lambda q, u, v, x: 0.1 * u * v + 0.0 * q.u0 * v,
         initial=lambda q, v, x: q.u0 * v,
     )
-    for replay in (None, lp.Replay(first=2)):
+    for refit in (None, lp.Refit()):
         sensors = lp.Points(SENSORS, noise=NOISE)
-        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(replay=replay))
+        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=refit))
         start = model.initial_state(np.array([2.0]))
         first = identifier.step(0.0, identifier.observed.G @ start)
         np.testing.assert_allclose(first.innovation, 1.0, atol=0.1)

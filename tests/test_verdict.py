@@ -288,7 +288,7 @@ def test_directions_move_the_estimate_by_what_they_say():
             B=lambda u, v, x: 0.1 * lp.dot(lp.grad(u), lp.grad(v)),
         )
         sensors = lp.Points(PLACES, noise=NOISE)
-        law = lp.SensitivityLaw(start_window=0)
+        law = lp.SensitivityLaw(refit=None)
         identifier = lp.Identifier(model, sensors, law, u0=0.0)
         for k, t in enumerate(TIMES[1:71].tolist()):
             estimate = identifier.step(t, errors()[k] + np.array([0.0, offset, 0.0]))

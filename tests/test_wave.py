@@ -81,7 +81,7 @@ def test_speed_and_damping_from_two_points():
         scheme=Alexander2(),
         noise=AbsoluteNoise(0.01),
     )
-    law = lp.SensitivityLaw(replay=lp.Replay(first=10))
+    law = lp.SensitivityLaw()
     ident = lp.Identifier(model, sensors, law, u0={"w": pluck}, scheme=Alexander2())
     (c2, c2_std), (d, d_std) = ident.run(twin).last.parameters.values()
     assert c2 == pytest.approx(1.0, abs=0.01)
@@ -105,7 +105,7 @@ def test_the_speed_as_a_field():
         scheme=Alexander2(),
         noise=AbsoluteNoise(0.005),
     )
-    law = lp.SensitivityLaw(modes=8, replay=lp.Replay(first=10))
+    law = lp.SensitivityLaw(modes=8)
     ident = lp.Identifier(model, sensors, law, u0={"w": pluck}, scheme=Alexander2())
     result = ident.run(twin)
     assert twin.error(result.last.q) < 0.25 * twin.baseline()

@@ -62,7 +62,7 @@ class Peer:
 
 
 def _filter_alone(data: Data) -> Score | None:
-    law = SensitivityLaw(modes=data.modes, start_window=0, shadows=None, verdict=False)
+    law = SensitivityLaw(modes=data.modes, refit=None, shadows=None, verdict=False)
     return accuracy.run_law(data, data.observation, law)
 
 

@@ -14,14 +14,13 @@ from benchmarks.refit.objective import Objective
 from benchmarks.refit.problem import Priors, Problem
 from benchmarks.refit.unknowns import Belief
 from livepde.errors import LivepdeError
-from livepde.laws import Refit
 from livepde.result import Result
 from livepde.stepping import StepFailed
 
 __all__ = ["Fit", "livepde_fit", "plain_seconds"]
 
 Array = NDArray[Any]
-PLAIN = {"start_window": 0}
+PLAIN = {"refit": None}
 """Options of a filter that takes no sample twice."""
 
 
@@ -56,11 +55,11 @@ class Fit:
 
 
 def livepde_fit(problem: Problem, priors: Priors, z: Array) -> Fit:
-    """Return livepde's fit of readings z, shape (samples, sensors), with its refit."""
+    """Return livepde's fit of readings z, shape (samples, sensors), with its defaults."""
     objective = Objective(problem, priors, z)
     begun = process_time()
     try:
-        result = problem.identifier(priors, refit=Refit()).run(problem.stream(z))
+        result = problem.identifier(priors).run(problem.stream(z))
     except (LivepdeError, StepFailed, ArithmeticError, np.linalg.LinAlgError) as error:
         lost = np.full(objective.coordinates.size, np.nan)
         text = f"{type(error).__name__}: {error}"

@@ -215,7 +215,7 @@ def jump_trials(seed: int) -> list[JumpTrial]:
 def _run(process: Jumping, jumps: lp.Jumps, z: Array) -> tuple[int, Array, Array]:
     """Return how many jumps are found, and estimates of the constant with standard deviations."""
     sensors = lp.Points(list(process.points), noise=process.noise)
-    law = lp.SensitivityLaw(jumps=jumps, refit=lp.laws.Refit())
+    law = lp.SensitivityLaw(jumps=jumps)
     identifier = lp.Identifier(process.model(), sensors, law, u0=process.u0)
     if identifier.inputs:
         identifier.step(0.0, np.full(len(process.points), np.nan), process.inputs(0.0))

@@ -90,7 +90,7 @@ def _refused(evolution: Any, drift: float = 0.0) -> bool:
     model = lp.Model(
         lp.Field(mesh, lp.fem.linear(mesh)), {"k": unknown}, A=lambda q, u, v, x: q.k * u * v
     )
-    law = lp.SensitivityLaw(drift=drift, replay=lp.Replay())
+    law = lp.SensitivityLaw(drift=drift)
     try:
         lp.Identifier(model, lp.Points([0.5], noise=0.1), law)
     except lp.errors.LawError as error:

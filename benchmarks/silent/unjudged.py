@@ -166,7 +166,7 @@ def checks() -> list[Check]:
         for part in (False, True)
         for seed in range(2 if noise == NOISES[-1] else 1)
     ]
-    bare = lp.SensitivityLaw(verdict=False, shadows=None, start_window=0)
+    bare = lp.SensitivityLaw(verdict=False, shadows=None, refit=None)
     untested = {"a law of one's own": Own(), "verdict = False": bare}
     return [
         *(

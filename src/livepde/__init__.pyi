@@ -44,7 +44,7 @@ from .fem import (
 )
 from .fleet import Fleet
 from .identifier import Identifier
-from .laws import AutoLaw, GradientLaw, Jumps, Replay, SensitivityLaw
+from .laws import GradientLaw, Jumps, Refit, SensitivityLaw
 from .model import Model
 from .observation import Averages, Combined, Full, Points, Subdomain
 from .result import Estimate, Result
@@ -56,7 +56,6 @@ __version__: str
 __all__ = [
     "Advance",
     "Alexander2",
-    "AutoLaw",
     "Averages",
     "Channel",
     "Combined",
@@ -78,7 +77,7 @@ __all__ = [
     "Piecewise",
     "Points",
     "RandomWalk",
-    "Replay",
+    "Refit",
     "Result",
     "Sample",
     "Scalar",

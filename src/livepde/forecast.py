@@ -70,7 +70,7 @@ def ahead(
     """
     names = tuple(name for each in sensors for name in each.names)
     z, std = np.full((2, len(intervals), len(names)), np.nan)
-    status, state = Status(), law.suspended(work, state)
+    status = Status()
     for k, interval in enumerate(intervals):
         if interval.t1 > interval.t0:
             state, report = law.step(work, state, interval.silent)

@@ -505,10 +505,9 @@ class Identifier:
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
     def settled(self, estimate: Estimate) -> Estimate:
-        """Return the last estimate after the work that the law leaves to the end of a run.
+        """Return the last estimate after a fit of all stored samples, for the end of a run.
 
-        Such work is a replay in slices, or a fit of all stored samples (`refit`). The identifier
-        does not change: the next sample finds it as it was.
+        The identifier does not change: the next sample finds it as it was. See `refit`.
         """
         state = self.law.settled(self._work, self._state)
         if state is self._state:
@@ -524,8 +523,8 @@ class Identifier:
     def refit(self) -> Estimate:
         """Fit all stored samples again, continue from there, and return the estimate.
 
-        The most probable unknowns given these samples: see `livepde.laws.Refit`. For a law without
-        refits the estimate is as it was.
+        The most probable unknowns given these samples: see `livepde.laws.Refit`. For a law that
+        stores no samples the estimate is as it was.
 
         Raises
         ------
@@ -665,7 +664,7 @@ class Identifier:
                 "taken none."
             )
         if why := self.unsmoothed:
-            raise LawError(f"smoothed: {why}; take SensitivityLaw or AutoLaw.")
+            raise LawError(f"smoothed: {why}; use SensitivityLaw.")
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)

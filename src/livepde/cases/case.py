@@ -29,10 +29,10 @@ from livepde.cases.equations import resolve
 from livepde.cases.laws import law_of
 from livepde.cases.process import conditioned, drive_notes, model_of, process_notes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
-from livepde.errors import DataError, LawError
+from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import AnyLaw, GradientLaw, SensitivityLaw
+from livepde.laws import AnyLaw, GradientLaw
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
@@ -221,9 +221,6 @@ class Case(CaseContent):
         _ = self.mesh, self.options, self.model, self.observation, self.withheld, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
         _ = input_noise_of(self)
-        if isinstance(self.law, SensitivityLaw):
-            with self.located("law.replay", LawError):
-                self.law.check_replay(self.model)
         self._check_names()
 
     def _check_names(self) -> None:

@@ -6,18 +6,16 @@ from typing import TypeVar
 
 from livepde.cases.case_channels import noise_of, unknowns_of
 from livepde.cases.case_content import CaseContent
-from livepde.cases.schema import AutoSpec, GradientSpec, SensitivitySpec
+from livepde.cases.schema import GradientSpec, SensitivitySpec
 from livepde.errors import LawError
 from livepde.laws import (
     AnyLaw,
-    AutoLaw,
     ConstantDamping,
     Damping,
     GradientLaw,
     Guards,
     Jumps,
     Refit,
-    Replay,
     ResidualDamping,
     SensitivityLaw,
     Shadows,
@@ -34,7 +32,7 @@ def law_of(case: CaseContent) -> AnyLaw:
     with case.located("law", LawError):
         if isinstance(spec, GradientSpec):
             return _gradient(spec)
-        return _auto(case, spec) if isinstance(spec, AutoSpec) else _sensitivity(case, spec)
+        return _sensitivity(case, spec)
 
 
 def _gradient(spec: GradientSpec) -> GradientLaw:
@@ -44,22 +42,16 @@ def _gradient(spec: GradientSpec) -> GradientLaw:
     return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
 
-def _auto(case: CaseContent, spec: AutoSpec) -> AutoLaw:
-    noise = None if spec.noise is None else _level(case, spec.noise)
-    shadows = _chosen(Shadows, spec.shadows)
-    return AutoLaw(spec.modes, noise, gate=spec.gate, shadows=shadows)
-
-
 def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
     time = case.equation.time_unit
     memory = case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
     drift = case.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
     return SensitivityLaw(
-        spec.modes,
-        _noise(case, spec),
-        drift,
-        memory,
-        _chosen(Replay, spec.replay),
+        modes=spec.modes,
+        noise=_noise(case, spec),
+        drift=drift,
+        memory=memory,
+        refit=_chosen(Refit, spec.refit),
         gate=spec.gate,
         jumps=_jumps(case, spec),
         guards=_chosen(Guards, spec.guards),

@@ -91,8 +91,7 @@ T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 
 [law]
 kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-replay = true                  # constant unknowns; for drifting ones drift = "0.1 1/h" instead;
-                               # kind = "auto" finds out, and needs no noise either
+# drift = "0.1 1/h"            # if the unknowns change slowly
 
 [steps]
 scheme = "alexander2"          # second order; or "implicit-euler"

@@ -15,9 +15,8 @@ from livepde.diagnostics.identifiability import FLAT, identifiability
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
-from livepde.laws import AnyLaw, AutoLaw, Belief, Replay, SensitivityLaw, Shadows
+from livepde.laws import AnyLaw, Belief, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
-from livepde.laws.replay import FIXED
 from livepde.laws.sensitivity_state import SensitivityWork
 from livepde.linalg import Array
 from livepde.model import Model
@@ -90,25 +89,28 @@ class Preview:
 class StatedNoise(SensitivityLaw):
     """The sensitivity law with the covariance of its filter, as if model and noise were right.
 
-    The covariance is not inflated by innovations.
+    The covariance is not inflated by innovations, and the filter stays linear about the prior.
     """
+
+    relinearises = False
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         return x.U, x.C
 
 
 def linearised(law: AnyLaw) -> SensitivityLaw | None:
-    """Return the law as a filter linearised at the prior; None for a law without covariance.
-
-    Of a bank it is the member with constant unknowns.
-    """
-    if isinstance(law, AutoLaw):
-        law = law.member
+    """Return the law as a filter linearised at the prior; None for a law without covariance."""
     if not isinstance(law, SensitivityLaw):
         return None
-    # A replay that never comes keeps the reference, an infinite gate every reading.
-    replay = Replay(FIXED, FIXED)
-    return StatedNoise(law.modes, law.noise, law.drift, replay=replay, gate=np.inf, shadows=None)
+    return StatedNoise(
+        modes=law.modes,
+        noise=law.noise,
+        drift=law.drift,
+        refit=None,
+        guards=None,
+        gate=np.inf,
+        shadows=None,
+    )
 
 
 def preview(prepared: Prepared, samples: Iterable[Sample]) -> Preview:

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from livepde.fem import Scalar
-from livepde.laws import GradientLaw, Guards, Jumps, Refit, Replay, SensitivityLaw, Shadows
+from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
 from livepde.runs.live_loop import Backlog, Retention
 from livepde.runs.outcome import Bound, Sense
@@ -28,7 +28,6 @@ from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
 
 __all__ = [
-    "AutoSpec",
     "BoundarySpec",
     "CaseSpec",
     "ChannelSpec",
@@ -496,24 +495,17 @@ class ChannelSpec(Spec):
         return self.columns or (str(self.column),)
 
 
-class FilterSpec(Spec):
-    """Keys of the laws with a covariance."""
+class SensitivitySpec(Spec):
+    """The law for sparse, noisy sensors."""
 
-    kind: str
+    kind: Literal["sensitivity"]
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     gate: PositiveFloat = SensitivityLaw.gate
     shadows: StrictBool | Annotated[Shadows, _options(Shadows)] = True
-
-
-class SensitivitySpec(FilterSpec):
-    """The law for sparse, noisy sensors."""
-
-    kind: Literal["sensitivity"]
     drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
-    replay: StrictBool | Annotated[Replay, _options(Replay)] = False
-    refit: StrictBool | Annotated[Refit, _options(Refit)] = False
+    refit: StrictBool | Annotated[Refit, _options(Refit)] = True
     jumps: (
         StrictBool
         | Annotated[tuple[Name, ...], Field(min_length=1)]
@@ -521,12 +513,6 @@ class SensitivitySpec(FilterSpec):
     ) = False
     guards: StrictBool | Annotated[Guards, _options(Guards)] = True
     verdict: StrictBool | Literal["cheap"] = True
-
-
-class AutoSpec(FilterSpec):
-    """The law for sparse, noisy sensors that tunes itself."""
-
-    kind: Literal["auto"]
 
 
 class TikhonovSpec(Spec):
@@ -604,7 +590,7 @@ def _kind(value: Any) -> Any:
 
 
 Law: TypeAlias = Annotated[
-    Annotated[AutoSpec | SensitivitySpec | GradientSpec, Field(discriminator="kind")],
+    Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")],
     BeforeValidator(_kind),
 ]
 

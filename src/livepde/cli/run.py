@@ -367,8 +367,8 @@ def _with_smoothed(
 def _traded(loaded: Case, identifier: Identifier) -> list[str]:
     """Return sentences on the identifiability of the unknowns by the whole run."""
     from livepde.diagnostics import identifiability
-    from livepde.laws import AutoLaw, SensitivityLaw
+    from livepde.laws import SensitivityLaw
 
-    if not isinstance(loaded.law, AutoLaw | SensitivityLaw):
+    if not isinstance(loaded.law, SensitivityLaw):
         return []
     return identifiability(loaded.model, identifier.latent_belief()).sentences

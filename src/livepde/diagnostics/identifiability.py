@@ -149,7 +149,7 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     prior, posterior = belief.prior_factor, belief.q_factor
     if prior is None or posterior is None:
         raise ConfigurationError(
-            "identifiability needs a belief with a covariance: run SensitivityLaw or AutoLaw."
+            "identifiability needs a belief with a covariance: use SensitivityLaw."
         )
     latent, space = model.latent, model.parameter_space
     labels = list(space.labels)

@@ -53,7 +53,7 @@ class OwnStates:
 class JoinedStates:
     """States of members that step as blocks: arrays over members, written in place.
 
-    A leaf that is equal for all members (of a replay that does not take place, say) is stored
+    A leaf that is equal for all members (such as a fit before the first one) is stored
     once. Of the log each member has rows of its own.
     """
 

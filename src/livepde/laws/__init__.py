@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
-from livepde.laws.auto import AutoLaw
 from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
 from livepde.laws.damping_bounds import (
     Constants,
@@ -33,14 +32,12 @@ from livepde.laws.law import (
 )
 from livepde.laws.refit_options import Refit
 from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
-from livepde.laws.replay import Replay
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows
 from livepde.laws.step_diagnostics import Diagnostics
 
 __all__ = [
     "AnyLaw",
-    "AutoLaw",
     "BaumeisterLaw",
     "Belief",
     "ConstantDamping",
@@ -62,7 +59,6 @@ __all__ = [
     "Norms",
     "Problem",
     "Refit",
-    "Replay",
     "Report",
     "Residual",
     "ResidualDamping",

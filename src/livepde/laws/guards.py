@@ -19,10 +19,9 @@ class Guards:
     *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
     standard deviations, and by more than half a posterior standard deviation, is assimilated by
     Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
-    reference and estimate agree within half a posterior standard deviation (a law with a `Replay`
-    does so anyway). Where the steps do not converge, the sample is taken again with ten times its
-    noise, and so on; after `temperings` such attempts it is not used. Notes: "iterated",
-    "tempered", "held".
+    reference and estimate agree within half a posterior standard deviation. Where the steps do not
+    converge, the sample is taken again with ten times its noise, and so on; after `temperings` such
+    attempts it is not used. Notes: "iterated", "tempered", "held".
 
     *Runaway.* A step fails, or a prediction misses the data by more than `runaway` times the
     largest range that any sensor has ever shown (each in units of its noise). The law then goes

@@ -102,10 +102,10 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
             state = changed(state, now=work.filter.relinearised(_without_past(found)))
         stays = shares[-1] < HALF and not work.filter.moves
         if stays and count >= ENOUGH and moved <= holds:
-            return changed(state, start_due=np.array([NEVER])), moved
-    if count >= work.start_window:
+            return changed(state, due=np.array([NEVER])), moved
+    if count >= work.window:
         return new_window(work, state.now, state), moved
-    return changed(state, start_due=2 * state.assimilated), moved
+    return changed(state, due=2 * state.assimilated), moved
 
 
 def iterated_smoother(samples: _Samples) -> _Pass | None:

@@ -171,8 +171,8 @@ class Fit:
         Half the sum of squares of the residuals in use, in units of their noise, and of the
         unknowns, in prior standard deviations about the prior.
     passes
-        Passes over these samples that all fits so far needed; a pass of the state alone counts as
-        its share.
+        Passes over these samples that all fits of the run so far have taken; a pass of the state
+        alone counts as its share.
     refused
         Readings that were left out.
     converged
@@ -420,10 +420,7 @@ class Law(ABC, Generic[Work, State]):
         """Return the state at the end of the interval; the old one if the step failed."""
 
     def settled(self, work: Work, state: State) -> State:
-        """Return the state after the work that `step` has spread over samples; here the same state.
-
-        For the estimate at the end of a run; the run itself goes on from the state that it had.
-        """
+        """Return the state after a fit of all stored samples; here the same state."""
         return state
 
     def fit(self, work: Work, state: State) -> Fit | None:
@@ -433,13 +430,6 @@ class Law(ABC, Generic[Work, State]):
     def weighs_readings(self) -> bool:
         """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
         return False
-
-    def suspended(self, work: Work, state: State) -> State:
-        """Return the state without work that `step` spreads over samples; here the same state.
-
-        For a forecast, which goes on from the current estimate, as the next step does.
-        """
-        return state
 
     def unsmoothed(self, work: Work) -> str:
         """Return why the law smooths nothing, empty if it has `smoothed`."""

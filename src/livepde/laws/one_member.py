@@ -81,17 +81,12 @@ def _assimilated(
         return state, report
     span = work.filter.span(interval)
     one = np.ones(1, dtype=bool)
-    if not state.replays[0]:
-        if (guards := work.guards) is not None:
-            x, done = _iterated(work, guards, state, interval, x)
-            if done is not None:
-                report = report.updated(x.innovations.diagnostics.member(0).updated(done))
-        state = stored(work, state, work.filter.relinearised(x), span, one)
-        return state, report
-    state = stored(work, state, x, span, one)
-    if state.log.shape[1] - state.window[0] > work.most and not state.replay.active[0]:
-        state = new_window(work, work.filter.relinearised(state.now), state)
-    return state, report
+    if (guards := work.guards) is not None:
+        x, done = _iterated(work, guards, state, interval, x)
+        if done is not None:
+            report = report.updated(x.innovations.diagnostics.member(0).updated(done))
+    x = work.filter.relinearised(x) if work.relinearises else x
+    return stored(work, state, x, span, one), report
 
 
 def _iterated(
@@ -103,7 +98,7 @@ def _iterated(
 ) -> tuple[FilterState, Diagnostics[float] | None]:
     """Return the filter after a sample that may have moved it too far, and what was done, or None.
 
-    The cure of an excessive move is a replay of this one sample from the start of its interval.
+    The cure of an excessive move is to take this one sample again, from the start of its interval.
     """
     before = state.now
     if guards.within_reach(x.da - before.da)[0]:  # cheaper to see than how far it is

@@ -22,8 +22,8 @@ class Refit:
     over while they are few. Later fits take longer than a live run may wait: they are made at the
     end of a run (`Identifier.run`, `livepde run`) and by `Identifier.refit`.
 
-    Unknowns that move, noisy inputs and a fading memory have no such fit: there `start_window`
-    applies.
+    Unknowns that move, noisy inputs and a fading memory have no such fit: there the samples of the
+    start are smoothed again, as `livepde.laws.iterated_smoother` does.
 
     Parameters
     ----------

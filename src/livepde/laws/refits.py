@@ -5,41 +5,46 @@ from __future__ import annotations
 import numpy as np
 
 from livepde.laws.filter_state import FilterState
-from livepde.laws.iterated_smoother import HOLDS, apart, usual
+from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
 from livepde.laws.member_arrays import changed, put, take
 from livepde.laws.refit import Found, refitted
 from livepde.laws.refit_options import Refit
 from livepde.laws.sensitivity_state import FitState, SensitivityState, SensitivityWork, new_window
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import StoredSamples
-from livepde.linalg import Mask, nonfinite_allowed
+from livepde.linalg import Array, Mask, nonfinite_allowed
 
 __all__ = ["refit_due", "settle"]
 
 
-def refit_due(work: SensitivityWork, state: SensitivityState, due: Mask) -> SensitivityState:
-    """Return all members after the refits that are due."""
-    options = work.refit
-    if options is None:
-        return state
+def refit_due(
+    work: SensitivityWork, state: SensitivityState, due: Mask
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
+    """Return all members after the refits that are due, and diagnostics if there was one."""
+    if not work.fits:
+        return iterate_starts(work, state, due)
+    if (options := work.refit) is None:
+        return state, None
     for k in np.flatnonzero(due).tolist():
         one = take(state, k)
         count = int(one.assimilated[0])
         if max(count, one.log.shape[1] - 1 - int(one.window[0])) >= options.window:
             one = new_window(work, one.now, one)
         else:
+            # A window but the first begins with what is known: it has nothing to search for.
             if count <= options.start:
                 one = _refitted(work, options, one, last=False)
             later = 2 * count if 2 * count <= options.start else options.window
-            one = changed(one, start_due=np.array([later]))
+            one = changed(one, due=np.array([later]))
         state = put(state, k, one)
-    return state
+    return state, None
 
 
 @nonfinite_allowed()  # such a trajectory is refused
 def settle(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
     """Return all members after a last refit, for the end of a run."""
     options = work.refit
-    if options is None:
+    if options is None or not work.fits:
         return state
     for k in range(len(state)):
         one = take(state, k)

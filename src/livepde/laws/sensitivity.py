@@ -26,7 +26,6 @@ from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
-from livepde.laws.iterated_smoother import iterate_starts
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put, take, where
@@ -35,8 +34,6 @@ from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
 from livepde.laws.refit_options import Refit
 from livepde.laws.refits import refit_due, settle
-from livepde.laws.replay import FIXED, Replay, ReplayState
-from livepde.laws.replay_slices import finish_replays, replay_slice
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,
@@ -54,7 +51,6 @@ from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.verdict import judge_of, judged, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
-from livepde.model import Model
 from livepde.stepping import (
     Alexander2,
     BandedStage,
@@ -108,10 +104,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         closer its variance is to that of the prior, so that no variance winds up without data.
     memory
         Time constant with which the cross-covariance of state and parameters decays.
-    replay
-        Iterate about one reference trajectory; for states with a long memory. Not together with
-        `memory`, nor with unknowns that move at random (`RandomWalk`, `MeanReverting`, `drift`):
-        samples of the past belong to other values of them.
+    refit
+        Fit the stored samples again whenever their number has doubled; None: never.
     rank
         Columns of the factor while unknowns move; default the number of coordinates and five times
         that of those that move.
@@ -123,15 +117,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         aside: see `livepde.laws.gate`.
     jumps
         Test for sudden changes; an alarm is noted as "jump" and lets the unknowns move.
-    start_window
-        While the unknowns are learned the last samples, up to this many, are assimilated again
-        whenever their number has doubled, about the most probable trajectory of the unknowns, until
-        the linearisation holds: see `livepde.laws.iterated_smoother`. 0: never. With a `Replay`,
-        which iterates as well, it has no effect.
-    refit
-        Fit the stored samples again at the start, at the end of a run, and on demand: see `Refit`.
-        Experimental: it will take the place of `replay` and `start_window`. Not together with
-        `replay`.
     guards
         Safeguards against an overconfident linearisation and a runaway estimate; None: none.
     shadows
@@ -145,13 +130,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     noise: float | str | None = None
     drift: float = 0.0
     memory: float = np.inf
-    replay: Replay | None = None
+    refit: Refit | None = field(default_factory=Refit)
     rank: int | None = None
     gate: float = GATE
     gate_patience: int = 10
     jumps: Jumps | None = None
-    start_window: int = 64
-    refit: Refit | None = None
     guards: Guards | None = field(default_factory=Guards)
     shadows: Shadows | None = field(default_factory=Shadows)
     # A run may be judged that was not judged before: fleets are not.
@@ -159,16 +142,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     scheme: ClassVar[Scheme] = Alexander2()  # no interval holds the error of a first-order scheme
     graded_start: ClassVar[bool] = True
+    relinearises: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         stated = isinstance(self.noise, int | float) and np.isfinite(self.noise) and self.noise > 0
-        kinds = (
-            ("replay", Replay),
-            ("jumps", Jumps),
-            ("guards", Guards),
-            ("shadows", Shadows),
-            ("refit", Refit),
-        )
+        kinds = (("refit", Refit), ("jumps", Jumps), ("guards", Guards), ("shadows", Shadows))
         parts = [(getattr(self, name), name, kind) for name, kind in kinds]
         for holds, name, rule in (
             (np.isfinite(self.drift) and self.drift >= 0, "drift", "a number >= 0"),
@@ -179,7 +157,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 for part, name, kind in parts
             ),
             (self.gate > 0, "gate", "positive"),
-            (self.start_window >= 0, "start_window", ">= 0"),
             (self.gate_patience >= 1, "gate_patience", ">= 1"),
             (self.verdict in (True, False, "cheap"), "verdict", "True, 'cheap' or False"),
         ):
@@ -187,10 +164,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 raise LawError(
                     f"SensitivityLaw: {name} must be {rule}; got {getattr(self, name)!r}."
                 )
-        if self.replay is not None and self.fades:
-            raise LawError(
-                "SensitivityLaw: replay keeps all of the past, memory fades it; choose one."
-            )
 
         if self.replay is not None and self.refit is not None:
             raise LawError("SensitivityLaw: replay and refit do the same work; choose one.")
@@ -213,7 +186,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 "SensitivityLaw needs the noise level of the sensors: give noise= to the "
                 "observation (one number, or one for each sensor) or to the law."
             )
-        self.check_replay(model)
         reduction = Reduction.of(problem, self.modes)
         # Constant unknowns never need more rows than coordinates. Moving ones and noisy inputs add
         # rows at each step, and a compression needs room for the state's own uncertainty.
@@ -255,36 +227,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # Unknowns that move, or that may jump, follow a change of the process themselves.
         anchors = not (filter_.moves or self.jumps is not None)
         gate = Gate(self.gate, self.gate_patience, anchors)
-        options = UpdateOptions(gate, self.noise == "auto")
-        # A replay iterates the same linearisation: both would do the same work twice.
-        iterated = 0 if self.replay else self.start_window
-        # Samples determine constant unknowns alone: there they are fitted, else smoothed.
-        fits = not (self.fades or filter_.moves or problem.input_noise)
-        refit = self.refit if fits else None
         return SensitivityWork(
             filter=filter_,
-            options=options,
-            replay=self.replay,
+            options=UpdateOptions(gate, self.noise == "auto"),
+            refit=self.refit,
             guards=self.guards,
             jumps=self.jumps,
-            start_window=iterated if refit is None else refit.window,
-            refit=refit,
+            fades=self.fades,
+            relinearises=self.relinearises,
         )
-
-    def check_replay(self, model: Model) -> None:
-        """Refuse a replay of unknowns that move at random; raises `LawError`."""
-        # A reference that is never moved, as in a preview, stays right: only replays go wrong.
-        if self.replay is None or self.replay.first == FIXED:
-            return
-        latent = model.latent
-        still = [name for name, part in latent.parts.items() if not part.evolution.moves]
-        moving = [(name, "its `evolution`") for name in latent.random]
-        moving += [(name, "`drift`") for name in still if self.drift]
-        for name, cause in moving:
-            raise LawError(
-                "SensitivityLaw: replay requires unknowns that are constant or follow harmonics, "
-                f"but '{name}' moves at random by {cause}: leave out `replay`."
-            )
 
     def init(self, work: SensitivityWork, q0: Array, u0: Array) -> SensitivityState:
         return self._init(work, q0, u0, None)
@@ -324,15 +275,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         no = np.zeros(1, dtype=bool)
         return SensitivityState(
             now=x,
-            start=(start := work.kept_start(x)),
+            start=work.kept_start(x),
             window=zero,
             opening=no,
             initial=no,
-            reference=x.q,
             assimilated=zero,
-            due=np.array([self.replay.first if self.replay else NEVER]),
-            replay=ReplayState.none(start),
-            start_due=np.array([1 if work.start_window else NEVER]),
+            due=np.array([1 if work.window else NEVER]),
             fit=FitState.none(),
             older=x,
             newer=x,
@@ -368,12 +316,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not filter_.sensors.observe(x, span.end)[1].any():
             return state
-        problem, replays = filter_.problem, bool(state.replays[0])
+        problem = filter_.problem
         form = problem.model.form_initial
         # The safeguards of a step never see a sample at the initial time: where this is not linear
         # in the unknowns, it has to be iterated here.
         iterates = form is not None and not form.linear_in_parameter
-        if self.guards is not None and not replays:
+        if self.guards is not None:
             iterates = iterates or not problem.observed.linear
         for _ in range(FIRST):
             now, _ = absorb(filter_, x, span, work.options)
@@ -394,18 +342,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             # The noise level is that before the sample, which would count in each iteration else.
             level, samples = state.now.level, state.now.samples
             x = changed(x, level=level, samples=samples, kept=state.now.kept)
-        state = changed(state, reference=x.q)
-        state = changed(state, opening=np.ones(1, dtype=bool))
-        if not replays:
-            now = filter_.relinearised(now)
-            return changed(state, now=now, older=now, newer=now)
-        return changed(
-            state,
-            now=now,
-            older=now,
-            newer=now,
-            assimilated=state.assimilated + span.present,
-        )
+        now = filter_.relinearised(now) if self.relinearises else now
+        opening = np.ones(1, dtype=bool)
+        return changed(state, now=now, older=now, newer=now, opening=opening)
 
     def stepped_alone(self, work: SensitivityWork) -> str:
         if type(self) is not SensitivityLaw:  # a subclass may step in a way of its own
@@ -434,7 +373,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def step_members(
         self, work: SensitivityWork, state: SensitivityState, span: Span
     ) -> tuple[SensitivityState, MemberReports]:
-        """Return state and reports of all members after a sample of each, replays and starts.
+        """Return state and reports of all members after a sample of each, and refits that are due.
 
         They step as arrays; whoever meets something out of the ordinary, a safeguard, an alarm, a
         failure, or is late, steps alone.
@@ -449,19 +388,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             usual = np.array([status.ok for status in reports.statuses])
             if not usual.any():
                 return (new if len(state) > 1 else state), reports
-        if work.replay is not None:
-            new, replayed = replay_slice(work, new)
-            if replayed is not None:
-                reports = reports.updated(replayed)
-        due = new.assimilated >= new.start_due
-        if work.refit is not None:  # samples without a reading need room, too
-            new = refit_due(work, new, due | (new.log.shape[1] - new.window > work.refit.window))
-        elif np.count_nonzero(due):
-            new, started = iterate_starts(work, new, due)
-            if started is not None:
+        due = new.assimilated >= new.due
+        if work.fits and work.window:  # samples without a reading need room, too
+            due = due | (new.log.shape[1] - new.window > work.window)
+        if np.count_nonzero(due):
+            new, moved = refit_due(work, new, due)
+            if moved is not None:
                 taken = usual
                 reports = reports.updated(
-                    started.each(lambda number: np.where(taken, number, np.nan))
+                    moved.each(lambda number: np.where(taken, number, np.nan))
                 )
         return shortened(work, new), reports
 
@@ -476,18 +411,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             return state, told, usual
         if len(span.t0) > 1:
             usual = usual & span.together
-        replays: Mask | None = None
-        if work.replay is not None:
-            # A full store begins a new window, which relinearises: such a member steps alone.
-            full = state.log.shape[1] + 1 - state.window > work.most
-            replays = state.replays
-            usual = usual & ~(replays & full & ~state.replay.active)
         parts: dict[str, Any] = {}
         if (guards := self.guards) is not None:
             far = np.abs(x.da - before.da) > guards.reach
             if np.count_nonzero(far):
-                near = ~far.any(axis=1)
-                usual = usual & (near if replays is None else replays | near)
+                usual = usual & ~far.any(axis=1)
             scale = state.scale.add(span.z1, span.z1 - told.predicted)
             parts["scale"] = scale.without_refused(state.scale, x.screened.refused)
             # Ranges are at least as large as the noise, so that smaller innovations cannot run
@@ -501,8 +429,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)
-        if replays is None or not replays.all():
-            x = filter_.relinearised(x, replays)
+        if self.relinearises:
+            x = filter_.relinearised(x)
         if np.count_nonzero(usual) < usual.size:
             if not usual.any():
                 return state, told, usual
@@ -536,17 +464,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             new = join(*parts) if len(parts) > 1 else parts[0]
         return new, reports.with_members(alone)
 
-    def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-        return finish_replays(work, state) if work.refit is None else settle(work, state)
-
     def fit(self, work: SensitivityWork, state: SensitivityState) -> Fit | None:
         return state.fit.member(0)
 
-    def suspended(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-        if work.replay is None:
-            return state
-        due = np.full_like(state.due, NEVER - 1)  # a replay is known as such, and none begins
-        return changed(state, replay=ReplayState.none(state.start), due=due)
+    def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+        return settle(work, state)
 
     def finite(self, work: SensitivityWork, state: SensitivityState) -> bool:
         x = state.now
@@ -573,8 +495,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now = without_factors(state.now)
-        alone, judge = without_ledger(now), judged(work.filter, now, 0)
-        judge = with_fit(judge, state.fit.member(0))
+        alone, fit = without_ledger(now), state.fit.member(0)
+        judge = with_fit(judged(work.filter, now, 0), fit)
         return Deferred(lambda: self.member_belief(work, alone, 0), judge)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
@@ -600,4 +522,4 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
     """Return one member at the start with another filter."""
     start = work.kept_start(x)
-    return changed(state, start=start, now=x, older=x, newer=x, replay=ReplayState.none(start))
+    return changed(state, start=start, now=x, older=x, newer=x)

@@ -19,7 +19,6 @@ from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, where, zeros
 from livepde.laws.refit_options import Refit
-from livepde.laws.replay import Replay, ReplayState
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import refusal
@@ -42,7 +41,7 @@ __all__ = [
 ]
 
 LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
-NEVER = np.iinfo(np.int64).max  # number of samples at which a filter without replay is replayed
+NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,17 +52,17 @@ class SensitivityWork:
     ----------
     filter, options
         The filter, and how it takes a sample.
-    replay, guards, jumps, start_window, refit
-        Those of the law; `refit` only where it applies.
+    refit, guards, jumps, fades, relinearises
+        Those of the law.
     """
 
     filter: Filter
     options: UpdateOptions
-    replay: Replay | None
+    refit: Refit | None
     guards: Guards | None
     jumps: Jumps | None
-    start_window: int
-    refit: Refit | None = None
+    fades: bool
+    relinearises: bool
 
     def made_of(self, readings: Mapping[str, InitialReading], initial: Any) -> SensitivityWork:
         """Return the same for a member whose initial state was given so, and made of readings."""
@@ -83,11 +82,11 @@ class SensitivityWork:
     @cached_property
     def keeps_log(self) -> bool:
         """True if the law ever goes back to earlier samples."""
-        return bool(self.back or self.replay or self.start_window)
+        return bool(self.back or self.window)
 
     def kept_start(self, x: FilterState) -> FilterState:
         """Return the filter where a window begins; zeros for a law that never goes back there."""
-        return x if self.replay or self.start_window else zeros(x)
+        return x if self.window else zeros(x)
 
     @cached_property
     def jumping(self) -> Mask:
@@ -96,9 +95,16 @@ class SensitivityWork:
         return self.filter.reduction.named(names, "Jumps: unknowns")
 
     @cached_property
-    def most(self) -> int:
-        """Largest number of samples in a window of a replay."""
-        return self.replay.window if self.replay is not None else 0
+    def fits(self) -> bool:
+        """True if the stored samples determine constant unknowns alone, so that they are fitted."""
+        return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
+
+    @cached_property
+    def window(self) -> int:
+        """Largest number of samples that are taken again together; 0: none are."""
+        if self.refit is None:
+            return 0
+        return self.refit.window if self.fits else self.refit.start
 
     @cached_property
     def back(self) -> int:
@@ -115,17 +121,12 @@ class SensitivityState:
     ----------
     now
         The filter now.
-    start, window, opening, initial, reference
-        Where the window of a replay, or of an iterated start, begins: the filter, the row of the
-        log, whether that row holds a sample that the filter has not seen, whether it is the initial
-        state that the model says (`Model.initial`), and the latent parameter from which the
-        reference of `now` comes.
+    start, window, opening, initial
+        Where the window of a refit, or of an iterated start, begins: the filter, the row of the
+        log, whether that row holds a sample that the filter has not seen, and whether it is the
+        initial state of the model (`Model.initial`).
     assimilated, due
-        Samples used since, and at how many the next replay is due: `NEVER` without replay.
-    replay
-        The replay that is under way.
-    start_due
-        Samples in the window at which it is iterated or fitted next; `NEVER` where a law does not.
+        Samples used since, and at how many they are taken again; `NEVER`: they never are.
     fit
         The last refit.
     older, newer, since_older, since_newer
@@ -143,11 +144,8 @@ class SensitivityState:
     window: IntArray
     opening: Mask
     initial: Mask
-    reference: Array
     assimilated: IntArray
     due: IntArray
-    replay: ReplayState
-    start_due: IntArray
     fit: FitState
     older: FilterState
     newer: FilterState
@@ -165,11 +163,47 @@ class SensitivityState:
         """The same without ledger and discretisation errors, as the filter of a search has it."""
         return changed(self, start=unaccompanied(self.start), now=unaccompanied(self.now))
 
-    @property
-    def replays(self) -> Mask:
-        """Members that keep one reference and replay, shape (members,)."""
-        replays: Mask = self.due != NEVER
-        return replays
+
+@dataclass(frozen=True, eq=False)
+class FitState:
+    """The last refit of each member.
+
+    Attributes
+    ----------
+    samples
+        How many samples it took, 0 before the first one, shape (members,).
+    cost, refused
+        Half the sum of squares of residuals in use and of the unknowns, in standard deviations, and
+        readings that were not used; shape (members,).
+    work
+        Samples that all refits of the window have taken, one with derivatives counting 1.
+    converged
+        1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
+    """
+
+    samples: IntArray
+    cost: Array
+    refused: Array
+    work: Array
+    converged: Array
+
+    @classmethod
+    def none(cls, members: int = 1) -> FitState:
+        """Return the value before any refit."""
+        zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
+        return cls(samples=nothing, cost=zero, refused=zero, work=zero, converged=zero)
+
+    def member(self, k: int) -> Fit | None:
+        """Return the last refit of one member, None before it."""
+        if not self.samples[k]:
+            return None
+        return Fit(
+            samples=int(self.samples[k]),
+            cost=float(self.cost[k]),
+            passes=float(self.work[k]) / int(self.samples[k]),
+            refused=int(self.refused[k]),
+            converged=bool(self.converged[k]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,12 +332,12 @@ def stored(
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken)
     # A sensor that is set aside brings no measurements, from the first one that misfitted on.
-    if work.refit is not None and (aside := now.screened.aside & taken[:, None]).any():
+    if (aside := now.screened.aside & taken[:, None]).any():
         log = withdrawn(log, aside, now.screened.since)
     parts["log"] = log
-    if work.replay or work.start_window:
+    if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
-    if work.refit is not None and anchored is not None and (anchored & taken).any():
+    if work.window and anchored is not None and (anchored & taken).any():
         parts |= _windows_from(state, now, log.shape[1] - 1, anchored & taken)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
@@ -334,7 +368,7 @@ def _windows_from(
         "opening": state.opening & ~begun,
         "initial": state.initial & ~begun,
         "assimilated": np.where(begun, zero, state.assimilated),
-        "start_due": np.where(begun, zero + 1, state.start_due),
+        "due": np.where(begun, zero + 1, state.due),
         "fit": where(begun, FitState.none(len(begun)), state.fit),
     }
 
@@ -348,17 +382,12 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
     older = state.since_older if work.back else np.full(len(state), rows - 1)
     if older.min() < least:
         return state
-    stays = state.replays | (state.start_due != NEVER)
+    stays = state.due != NEVER
     first = int(np.where(stays, np.minimum(older, state.window), older).min())
     if first < least:
         return state
-    replay = state.replay
-    if replay.active.any():
-        row, until = (np.where(replay.active, r - first, -1) for r in (replay.row, replay.until))
-        replay = changed(replay, row=row, until=until)
     return changed(
         state,
-        replay=replay,
         log=trimmed(state.log, first),
         window=np.maximum(state.window - first, 0),
         since_older=state.since_older - first,
@@ -430,21 +459,17 @@ def new_window(
     """
     log = state.log if row is None else state.log[:, : row + 1]
     zero = np.zeros(1, dtype=np.int64)
-    first = work.replay.first if work.replay is not None and state.replays[0] else NEVER
-    no, kept = np.zeros(1, dtype=bool), work.kept_start(start)
+    no = np.zeros(1, dtype=bool)
     return changed(
         state,
         now=start,
-        start=kept,
+        start=work.kept_start(start),
         log=log,
         window=zero + log.shape[1] - 1,
         opening=no,
         initial=no,
-        reference=start.q,
         assimilated=zero,
-        due=zero + first,
-        replay=ReplayState.none(kept),
-        start_due=zero + (1 if work.start_window and first == NEVER else NEVER),
+        due=zero + (1 if work.window else NEVER),
         fit=FitState.none(),
     )
 

@@ -47,13 +47,8 @@ class Diagnostics(Generic[Number]):
     smoother_moved
         Distance by which the iterated smoother of the start has moved the unknowns, in standard
         deviations.
-    replay_left, replay_failed
-        When a replay ends: distance between the last two trajectories, and 1 if it has failed.
     jump, jump_samples
         1 if the test for sudden changes has raised an alarm, and samples since the change.
-    drift, drifting, prior_scale, awake
-        Means over the members of `AutoLaw`: drift of the unknowns per unit of time, share of
-        those that drift, factor of the prior; and the number of members that step.
     residual
         Norm of r in X for `GradientLaw` and its relatives.
     alpha, misfit
@@ -81,14 +76,8 @@ class Diagnostics(Generic[Number]):
     restarted: Number = NOT_KNOWN
     runaway: Number = NOT_KNOWN
     smoother_moved: Number = NOT_KNOWN
-    replay_left: Number = NOT_KNOWN
-    replay_failed: Number = NOT_KNOWN
     jump: Number = NOT_KNOWN
     jump_samples: Number = NOT_KNOWN
-    drift: Number = NOT_KNOWN
-    drifting: Number = NOT_KNOWN
-    prior_scale: Number = NOT_KNOWN
-    awake: Number = NOT_KNOWN
     residual: Number = NOT_KNOWN
     alpha: Number = NOT_KNOWN
     misfit: Number = NOT_KNOWN

@@ -48,9 +48,6 @@ __all__ = [
 ]
 
 MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
-LEFT = 1.0  # standard deviations between estimate and reference after the last replay
-BELIEVED = 0.5  # weight of the members of a bank that drift
-DRIFTING = 0.03  # share of the samples in which they are believed
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
@@ -70,15 +67,13 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
 
     A finding is: an unknown that ends at a bound, or keeps more than 0.9 of its prior standard
     deviation, so that the data were not informative; a gate that refused more than 2 % of the
-    readings; a last replay whose estimate and reference are more than one standard deviation apart;
-    guards that gave up samples, restarted, or held unknowns that nothing excited; with a fixed
-    gain, an estimate that scatters in the last half of a run by more than 0.3 of its change since
-    the first sample; a bank that favours drifting unknowns in more than 3 % of the
-    samples; latent values held at the limits of their prior; a field of whose mean variance more
-    than a quarter is that of modes that the law leaves out; time step, mesh and linear
-    interpolation of inputs that together shifted an unknown by more than two standard deviations;
-    a jump; and, if no law has judged the innovations, a mean square of the last 500 of more than
-    four times its expected value.
+    readings; guards that gave up samples, restarted, or held unknowns that nothing excited; with a
+    fixed gain, an estimate that scatters in the last half of a run by more than 0.3 of its change
+    since the first sample; latent values held at the limits of their prior; a field of whose mean
+    variance more than a quarter is that of modes that the law leaves out; time step, mesh and
+    linear interpolation of inputs that together shifted an unknown by more than two standard
+    deviations; a jump; and, if no law has judged the innovations, a mean square of the last 500 of
+    more than four times its expected value.
 
     Parameters
     ----------
@@ -89,14 +84,12 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
     own = [] if judged else [*_model_error(data), *_said("refused", "caution", _refused(data))]
     return [
         *own,
-        *_said("replay", "do not trust", _replays(data)),
         *_unknowns(data),
         *_said("held", "do not trust", _held(data)),
         *_said("left out", "note", _left_out(data)),
         *_discretised(data),
         *_rests(data),
         *_said("guards", "caution", [] if gradient else _guards(data)),
-        *_said("drift", "caution", _drifts(data)),
         *_said("gain", "caution", _gain(data)),
         *_said("jump", "caution", _jumps(data)),
     ]
@@ -155,17 +148,6 @@ def _model_error(data: xr.Dataset) -> list[Finding]:
         "trusted."
     )
     return [Finding("misfit", "do not trust", text, evidence=ratio)]
-
-
-def _replays(data: xr.Dataset) -> list[str]:
-    left = _last_known(data, "replay_left")
-    if not left > LEFT:
-        return []
-    return [
-        f"The last replay has not converged: estimate and reference are {left:.1f} standard "
-        "deviations apart, so that the intervals do not hold. Give law.replay more iterations, let "
-        "it begin later (first), or start from a better prior."
-    ]
 
 
 def _refused(data: xr.Dataset) -> list[str]:
@@ -298,19 +280,6 @@ def _rests(data: xr.Dataset) -> list[Finding]:
     text = f"Nothing but noise excited the unknowns from {since} on: they were held"
     before = f", as {len(begin) - 1} times before" if len(begin) > 1 else ""
     return [replace(found, text=f"{text}{before}.")]
-
-
-def _drifts(data: xr.Dataset) -> list[str]:
-    """Return whether the members of a bank with drifting unknowns had most weight for long."""
-    at = _times(data, "drifting", BELIEVED)
-    if not len(at) > DRIFTING * data.sizes["time"]:
-        return []
-    return [
-        f"In {len(at)} samples, last at {when(data, at[-1])}, the data spoke for unknowns that "
-        "drift, which also a model with errors looks like. If they cannot, do not trust these "
-        "estimates: take kind = 'sensitivity' with replay = true, or mend the model; if they "
-        "can, give them an evolution."
-    ]
 
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
