@@ -3,8 +3,8 @@
 The gradient law is timed from the first sample on, in turns with steps of the same model and the
 same scheme with a known parameter, the matrix factorised once: the median is that of usual steps,
 the mean also holds the first ones and those that factorise. A run of the sensitivity law, without
-its iterated start, is timed in stretches of steps, one right after the other, so that a slow moment
-of the machine hits both.
+refits, is timed in stretches of steps, one right after the other, so that a slow moment of the
+machine hits both.
 Times are those of the processor: what else runs on the machine is not counted.
 """
 
