@@ -183,8 +183,8 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
     note = (
         "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
         f"the factor kept. Gradient law: the first {FIRST} samples, each step over the median "
-        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no iterated "
-        "start, with and without its shadows of the discretisation error and its verdict; more: "
+        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no "
+        "refits, with and without its shadows of the discretisation error and its verdict; more: "
         "what these add to the step without both, by the medians. A forward step is one of the "
         "law's own scheme."
     )
