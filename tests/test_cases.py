@@ -1153,7 +1153,7 @@ def test_keys_are_taken_away(rod):
 @pytest.mark.parametrize(
     ("key", "value", "named"),
     [
-        ("law.refti", None, "there is no key 'law.refti' to take away; did you mean 'refit'?"),
+        ("law.kidn", None, "there is no key 'law.kidn' to take away; did you mean 'kind'?"),
         ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
         ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
