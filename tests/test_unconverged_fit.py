@@ -12,7 +12,7 @@ TIMES = np.arange(0.0, 4.05, 0.1)
 
 
 def run(passes: int) -> lp.Estimate:
-    """Return the last estimate of a run from a prior that is almost three times too high; log a is 0.3."""
+    """Return the last estimate of a run: log a is 0.3, and the prior far too high."""
     model = driven_rod({"a": lp.LogNormal(3.6, 3.6)}, lambda t: np.sin(3 * t), line(12))
     sensors = lp.Points([0.3, 0.6], noise=0.01)
     law = lp.SensitivityLaw(refit=lp.Refit(start=0, passes=passes), guards=None, shadows=None)
