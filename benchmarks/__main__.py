@@ -129,17 +129,6 @@ def shard(
     return benchmark(members, kills)
 
 
-@program.command(quick="Fewer samples.")
-def replay(samples: Annotated[int, Count(8000, 2000, "Samples of the run.", least=100)]) -> Outcome:
-    """Time the longest call while stored samples are assimilated again.
-
-    Example:  python -m benchmarks replay --samples 2000
-    """
-    from benchmarks.replay import replay as benchmark
-
-    return benchmark(samples)
-
-
 @program.command(
     quick="One seed, the rod alone, and of the moving horizon the first setting on the reduced "
     "model, in 0.6 of the time: a horizon that is not tuned, and the worst of one seed, say less."

@@ -24,7 +24,7 @@ from livepde.cases import load
 from livepde.errors import LivepdeError
 from livepde.fem import Field, LogNormal, Normal, Piecewise, dot, grad, interval, linear
 from livepde.identifier import Identifier
-from livepde.laws import Jumps, Replay, SensitivityLaw
+from livepde.laws import Jumps, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import burgers
@@ -145,13 +145,20 @@ def _driven(x: Any, t: float) -> Any:
     return np.sin(3.0 * t) + 0.0 * x[0]
 
 
-def _heat(law: SensitivityLaw, title: str) -> Process:
+@cache
+def _heat() -> Process:
     model = Model(
         Field(MESH, linear(MESH), dirichlet={"left": _driven, "right": 0.0}),
         {"a": LogNormal(0.3, 0.1)},
         A=lambda q, u, v, x: q.a * dot(grad(u), grad(v)),
     )
-    return Process(title, model, Points(POINTS), 0.0, lambda rng: rng.uniform(0.2, 0.4, 1), law)
+    return Process(
+        "diffusivity, three points",
+        model,
+        Points(POINTS),
+        0.0,
+        lambda rng: rng.uniform(0.2, 0.4, 1),
+    )
 
 
 def _reaction(unknown: Any, title: str, observation: Observation, **options: Any) -> Process:
@@ -207,10 +214,7 @@ def _burgers() -> Process:
 
 
 PROCESSES: Mapping[str, Callable[[], Process]] = {
-    "heat": cache(lambda: _heat(SensitivityLaw(jumps=Jumps()), "diffusivity, three points")),
-    "heat, replayed": cache(
-        lambda: _heat(SensitivityLaw(jumps=Jumps()), "diffusivity, three points")
-    ),
+    "heat": _heat,
     "reaction": _reaction_number,
     "reaction field": _reaction_field,
     "burgers": _burgers,
@@ -358,8 +362,7 @@ def warned(suspect: Suspect, seed: int) -> tuple[bool, bool]:
     data = _seen(suspect.right, Points(POINTS), states, times, q, rng)
     told = []
     for model in (suspect.right, suspect.wrong):
-        law = SensitivityLaw()
-        identifier = Identifier(model, data.observation, law, u0=0.0)
+        identifier = Identifier(model, data.observation, SensitivityLaw(), u0=0.0)
         run = identifier.run(zip(times[1:], data.z[1:], strict=True))
         told.append(unexplained(run.to_xarray()))
     return told[0], told[1]

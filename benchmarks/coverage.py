@@ -33,7 +33,7 @@ from livepde.fem import (
 )
 from livepde.fem import interval as line
 from livepde.identifier import Identifier
-from livepde.laws import Belief, Diagnostics, Replay, SensitivityLaw
+from livepde.laws import Belief, Diagnostics, SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
@@ -77,7 +77,7 @@ class Problem:
 
     title: str
     unknowns: Mapping[str, Any]
-    law: SensitivityLaw = field(default_factory=lambda: SensitivityLaw())
+    law: SensitivityLaw = field(default_factory=SensitivityLaw)
     sensors: Sequence[float] = (0.25, 0.5, 0.75)
     loss: Callable[[np.random.Generator], float] | None = None
     contrast: Callable[[np.random.Generator], float] | None = None

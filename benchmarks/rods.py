@@ -1,9 +1,9 @@
-"""Cost of one sample of the filter laws on rods, in forward steps, beside a lean reference.
+"""Cost of one sample of the filter law on rods, in forward steps, beside a lean reference.
 
 A run takes the first samples of a stream, each timed by itself, and then as many forward steps of
 the same model with a known parameter; runs of all candidates are made in turns. The median of a run
-is that of usual samples, the mean has the first sample and replays in it. Both are divided by the
-median forward step, and the median over the runs is shown.
+is that of usual samples, the mean has the first sample and the refits of the start in it. Both are
+divided by the median forward step, and the median over the runs is shown.
 
 What is promised is promised in forward steps of an earlier version, so that a faster forward step
 does not make the promise harder. That version's forward step is known in forward steps of the lean
@@ -27,7 +27,7 @@ from benchmarks.layered import ENDS, POINTS, STEP, ends_at, plate, rod
 from livepde.fem import Inputs, Moment
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, AutoLaw, SensitivityLaw
+from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
@@ -42,22 +42,18 @@ FIRST = 100  # samples of a run, the first one included
 RUNS = 5
 NOISE = 0.01
 COMMIT = "51ef98c"
-SENSITIVITY, AUTO, LEAN = "SensitivityLaw", "AutoLaw", "lean reference"
-AWAKE = 6  # members of the bank that are at work in these samples
+SENSITIVITY, LEAN = "SensitivityLaw", "lean reference"
 
-BOUNDS: dict[tuple[str, int, int], float] = {
-    (SENSITIVITY, 31, 2): 5.0,
-    (SENSITIVITY, 200, 2): 4.0,
-    (SENSITIVITY, 1_000, 2): 4.5,
-    (SENSITIVITY, 31, 10): 6.0,
-    (SENSITIVITY, 200, 10): 6.0,
-    (SENSITIVITY, 1_000, 10): 9.0,
-    (AUTO, 31, 2): 15.0,
-    (AUTO, 200, 2): 20.0,
-    (AUTO, 1_000, 2): 42.0,
-    (SENSITIVITY, SQUARE, 4): 5.0,
+BOUNDS: dict[tuple[int, int], float] = {
+    (31, 2): 5.0,
+    (200, 2): 4.0,
+    (1_000, 2): 4.5,
+    (31, 10): 6.0,
+    (200, 10): 6.0,
+    (1_000, 10): 9.0,
+    (SQUARE, 4): 5.0,
 }
-"""Law, nodes, unknowns -> forward steps of the earlier version that a sample may cost."""
+"""Nodes, unknowns -> forward steps of the earlier version that a sample may cost."""
 
 EARLIER: dict[tuple[int, str], float] = {
     (31, "source"): 3.83,
@@ -143,17 +139,16 @@ RODS: tuple[Rod, ...] = (
 # --- candidates: each is a function that returns the times of the samples of a run, in s ---------
 
 
-def _law(given: Rod, law: AnyLaw, samples: Sequence[Any]) -> tuple[list[float], float]:
-    """Time a law, and return how many members of a bank are awake at the end."""
-    identifier = Identifier(given.model, given.sensors, law, u0=0.0)
+def _law(given: Rod, samples: Sequence[Any]) -> list[float]:
+    """Time the law."""
+    identifier = Identifier(given.model, given.sensors, SensitivityLaw(), u0=0.0)
     identifier.step(*samples[0])
-    spent, awake = [], np.nan
+    spent = []
     for sample in samples[1:]:
         begun = process_time()
-        estimate = identifier.step(*sample)
+        identifier.step(*sample)
         spent.append(process_time() - begun)
-        awake = estimate.diagnostics.awake
-    return spent, awake
+    return spent
 
 
 def _forward(given: Rod, count: int) -> list[float]:
@@ -209,10 +204,8 @@ def _stepper(given: Rod) -> tuple[Callable[[Array], Array], Any]:
 # --- tables --------------------------------------------------------------------------------------
 
 
-def rods(
-    only: Iterable[Rod] = RODS, *, runs: int = RUNS, first: int = FIRST, auto: bool = True
-) -> Outcome:
-    """Time the filter laws and the lean reference in forward steps.
+def rods(only: Iterable[Rod] = RODS, *, runs: int = RUNS, first: int = FIRST) -> Outcome:
+    """Time the filter law and the lean reference in forward steps.
 
     Parameters
     ----------
@@ -220,14 +213,12 @@ def rods(
         The processes to take.
     runs, first
         How often each is run, and how many samples a run has.
-    auto
-        Whether `AutoLaw` is timed, too; on a square, where a run takes minutes, it is not.
     """
     rows: list[Row] = []
     checks: list[Check] = []
     for given in only:
         large = given.nodes >= SQUARE
-        for row, check in _timed(given, min(runs, 2) if large else runs, first, auto and not large):
+        for row, check in _timed(given, min(runs, 2) if large else runs, first):
             rows.append(row)
             checks += [check] if check is not None else []
     if not rows:
@@ -237,16 +228,13 @@ def rods(
     return Outcome(tables=[Table(title, columns, rows)], checks=checks, notes=NOTES)
 
 
-def _timed(given: Rod, runs: int, first: int, auto: bool) -> Iterator[tuple[Row, Check | None]]:
+def _timed(given: Rod, runs: int, first: int) -> Iterator[tuple[Row, Check | None]]:
     """Yield a row and its check for each candidate."""
     samples, large = given.samples(first), given.nodes >= SQUARE
-    laws: dict[str, AnyLaw] = {SENSITIVITY: SensitivityLaw()} | ({AUTO: AutoLaw()} if auto else {})
-    spent: dict[str, list[list[float]]] = {name: [] for name in (*laws, LEAN)}
-    units, lean_units, awake = [], [], np.nan
+    spent: dict[str, list[list[float]]] = {SENSITIVITY: [], LEAN: []}
+    units, lean_units = [], []
     for _ in range(runs):
-        for name, law in laws.items():
-            found, awake = _law(given, law, samples)
-            spent[name].append(found)
+        spent[SENSITIVITY].append(_law(given, samples))
         if not large:  # where a factorisation costs more than a correction it is no reference
             spent[LEAN].append(_lean(given, samples))
         units.append(float(np.median(_forward(given, first))))
@@ -262,9 +250,10 @@ def _timed(given: Rod, runs: int, first: int, auto: bool) -> Iterator[tuple[Row,
         over = np.nan
         if earlier is not None:
             over = float(np.median(kind / (earlier * np.array(lean_units))))
-        bound = BOUNDS.get((name, given.nodes, given.unknowns)) if given.ends == ENDS[0] else None
-        label = f"{name}, {awake:g} awake" if name == AUTO else name
-        cells = (given.nodes, given.unknowns, given.ends, label, median, mean)
+        bound = None
+        if name == SENSITIVITY and given.ends == ENDS[0]:
+            bound = BOUNDS.get((given.nodes, given.unknowns))
+        cells = (given.nodes, given.unknowns, given.ends, name, median, mean)
         check = None
         if bound is not None:
             what = "mean" if large else "median"

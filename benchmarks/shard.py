@@ -38,7 +38,7 @@ BATCHES, MORE, EVERY = 60, 20, 7  # of such a shard, for each kill, and from one
 ASSETS = 10_000  # of the promises
 GIGABYTES, CORE, FASTER = 0.5, 1.0, 1.5  # the promises: at most, at most, at least
 PATIENCE = 600.0  # seconds for a worker
-STARTED = 10  # members whose iterated start is timed
+STARTED = 10  # members whose first samples are timed
 LAWS = {
     "without shadows": SensitivityLaw(refit=None, shadows=None),
     "usual": SensitivityLaw(refit=None),
@@ -58,7 +58,7 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
         How often one of two workers is killed at a random moment.
     """
     lean, usual = (_in_process(_cost, members, name) for name in LAWS)
-    start = _in_process(_started, STARTED, "iterated start")
+    start = _in_process(_started, STARTED, "start with refits")
     alone = _in_process(_alone, STARTED, "usual")
     one, two = (_throughput(workers) for workers in (1, 2))
     different, missing, taken, done = _killed(kills)
@@ -77,7 +77,7 @@ def shard(members: int = ASSETS, kills: int = 20) -> Outcome:
     more = [
         ("samples a second of one worker", one),
         ("samples a second of two workers", two),
-        ("iterated start of a member, seconds in all", start),
+        ("start of a member with refits, seconds in all", start),
         ("sample at a time of its own, µs", 1e6 * alone),
     ]
     return Outcome(
@@ -303,7 +303,7 @@ def _rod() -> Model:
 
 
 def _shard(model: Model, members: int, law: str = "usual") -> Shard:
-    chosen = {**LAWS, "iterated start": SensitivityLaw()}[law]
+    chosen = {**LAWS, "start with refits": SensitivityLaw()}[law]
     return Shard(model, Points(SENSORS, noise=NOISE), chosen, members, u0=0.0)
 
 

@@ -3,8 +3,8 @@
 The gradient law is timed from the first sample on, in turns with steps of the same model and the
 same scheme with a known parameter, the matrix factorised once: the median is that of usual steps,
 the mean also holds the first ones and those that factorise. A run of the sensitivity law, without
-its iterated start, is timed in stretches of steps, one right after the other, so that a slow moment
-of the machine hits both.
+refits, is timed in stretches of steps, one right after the other, so that a slow moment of the
+machine hits both.
 Times are those of the processor: what else runs on the machine is not counted.
 """
 
@@ -183,8 +183,8 @@ def step(sizes: Sequence[int] = SIZES, modes: Sequence[int] = MODES) -> Outcome:
     note = (
         "Ratios of processor times taken in one process; the forward step is livepde.simulate with "
         f"the factor kept. Gradient law: the first {FIRST} samples, each step over the median "
-        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no iterated "
-        "start, with and without its shadows of the discretisation error and its verdict; more: "
+        f"forward step; sensitivity law: stretches of steps after the first {SETTLED}, no "
+        "refits, with and without its shadows of the discretisation error and its verdict; more: "
         "what these add to the step without both, by the medians. A forward step is one of the "
         "law's own scheme."
     )

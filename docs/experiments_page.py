@@ -33,7 +33,6 @@ KEPT = PAGE.with_suffix("")
 WIDEST, COLOURS = 1100, 48  # pixels and colours of a figure
 LONGEST = 45  # lines of what a script prints that are shown
 OPTIONS = {
-    "auto_bank": ["--quick"],
     "control": ["--only", "rod", "--only", "battery", "--seeds", "1"],
 }  # that spare hours
 
@@ -107,10 +106,6 @@ SKETCHES = {
         rf"^(?P<label>\S.+?)  +(?P<k>{NUMBER}) ± (?P<k_std>{NUMBER}) .* "
         rf"(?P<k_after_10_h>{NUMBER}) ± (?P<k_after_10_h_std>{NUMBER})  ",
         scale="linear",
-    ),
-    "auto_bank": Sketch(
-        rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +\S+ +{NUMBER} +{NUMBER} "
-        rf"+(?P<best_of_grid>{NUMBER})"
     ),
     "auto_gain": Sketch(
         rf"^(?P<label>\S+ +\d+%) +(?P<auto>{NUMBER}) +(?P<best_of_grid>{NUMBER}) ", last=True

@@ -27,7 +27,7 @@ DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "performance"
 PROJECT = DOCS.parent
 SUITE = "benchmarks.suite.costs"
-BENCHES = ("step", "memory", "scale", "petsc", "fleet", "replay", "import")
+BENCHES = ("step", "memory", "scale", "petsc", "fleet", "import")
 SIZED = ("step", "scale")  # take --size
 MEMORY_SIZES = (10_000, 40_000)
 LAWS = ("gradient", "sensitivity")
@@ -63,7 +63,7 @@ one of the same model, by the law's own scheme, with a known parameter, its matr
 
 On rods, and on a square of 10 000 nodes, `python -m benchmarks step` times the laws for a few
 numbers from the first sample on: medians, and beside them means, which have the first sample and
-replays in them. Rows with `source` have constant ends and a constant source, as a forward step of
+refits in them. Rows with `source` have constant ends and a constant source, as a forward step of
 little work; rows with `channels` read the temperatures of both ends from the stream, as the rod of
 the README. The *lean reference* is the same filter in thirty lines of NumPy and LAPACK
 (`benchmarks/lean.py`), without safeguards, missing samples, bounds or substeps: it has the same

@@ -77,7 +77,7 @@ def main() -> None:
     rows: dict[str, tuple[Any, lp.fem.Unknown]] = {
         "constant": (S(), constant),
         "constant, memory 2": (S(memory=2.0), constant),
-        "constant, replay": (S(), constant),
+        "constant, no refit": (S(refit=None), constant),
         **{f"random walk {rate:g}": (S(), unknown) for rate, unknown in walk.items()},
         "random walk 0.02, memory 2": (S(memory=2.0), walk[0.02]),
         "random walk 0.02, narrow factor": (S(rank=1), walk[0.02]),

@@ -28,7 +28,7 @@ import numpy as np
 from experiments.failed_steps import FailedSteps
 from livepde.fem import Field, LogNormal, Normal, Sobolev, dot, grad, interval, linear
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, Replay, SensitivityLaw
+from livepde.laws import AnyLaw, Belief, GradientLaw, Problem, SensitivityLaw
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityWork
@@ -176,6 +176,7 @@ def run(data: Data, law: AnyLaw, noisy: bool = True) -> Identifier:
     identifier = Identifier(data.model, seen, law, u0=0.0, scheme=Alexander2())
     for t, z in zip(TIMES, data.z if noisy else data.exact, strict=True):
         STEPS.seen(identifier.step(float(t), z))
+    identifier.refit()
     return identifier
 
 
@@ -202,7 +203,7 @@ def judge(data: Data, identifier: Identifier) -> Score:
 
 def rows(data: Data) -> dict[str, Score]:
     """Return what each law reaches on one truth."""
-    model, replay = data.model, Replay()
+    model = data.model
     prior = model.latent.value(model.latent.prior)
     nothing = np.full(len(data.x), np.nan)
     found = {"prior": Score(data.error(_shown(model, prior)), nothing, nothing)}
@@ -210,14 +211,14 @@ def rows(data: Data) -> dict[str, Score]:
         gradient = GradientLaw(gain="auto")
         found["gradient, auto, no noise"] = judge(data, run(data, gradient, noisy=False))
         found["gradient, auto"] = judge(data, run(data, gradient))
-    whole = run(data, SensitivityLaw(modes=CELLS + 1, replay=replay))
+    whole = run(data, SensitivityLaw(modes=CELLS + 1))
     for count in (6, 12):
-        law = SensitivityLaw(modes=count, replay=replay)
+        law = SensitivityLaw(modes=count)
         found[f"sensitivity, {count} modes"] = judge(data, run(data, law))
         directions = informed(whole.latent_belief(), model, count)
-        law = Informed(replay=replay, directions=directions)
+        law = Informed(directions=directions)
         found[f"sensitivity, {count} informed"] = judge(data, run(data, law))
-    auto = SensitivityLaw(modes="auto", replay=replay)
+    auto = SensitivityLaw(modes="auto")
     found["sensitivity, auto"] = judge(data, run(data, auto))
     found["sensitivity, all modes"] = judge(data, whole)
     return found

@@ -215,13 +215,11 @@ def readings(
     return found
 
 
-def short_rod(folder: Path, samples: int = 61, replay: bool = False) -> Path:
-    """Write the case of `livepde init` with its first samples, and without the replays."""
+def short_rod(folder: Path, samples: int = 61) -> Path:
+    """Write the case of `livepde init` with its first samples."""
     case, data = write_template(folder)
     rows = data.read_text().splitlines()[: samples + 1]
     data.write_text("\n".join(rows) + "\n")
-    if not replay:
-        case.write_text(case.read_text().replace("replay = true", "replay = false"))
     return case
 
 

@@ -30,9 +30,7 @@ def identifier(*, verdict: bool = True) -> lp.Identifier:
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.01)
-    law = lp.SensitivityLaw(
-        refit=lp.laws.Refit(start=4), shadows=None, verdict=verdict
-    )
+    law = lp.SensitivityLaw(refit=lp.laws.Refit(start=4), shadows=None, verdict=verdict)
     return lp.Identifier(model, sensors, law)
 
 

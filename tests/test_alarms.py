@@ -52,7 +52,7 @@ def rod(folder: Path, change: float = CHANGE, jumps: str = "true") -> Path:
     case, data = write_template(folder)
     data.write_text(rows(change))
     text = case.read_text().split("[expect]")[0]
-    case.write_text(text.replace("replay = true", f"jumps = {jumps}\nreplay = true"))
+    case.write_text(text.replace("[law]", f"[law]\njumps = {jumps}"))
     return case
 
 

@@ -76,7 +76,7 @@ def test_every_row_is_scored(data):
     outcome = suite.accuracy(seeds=1, levels=[0.01], problems={"rod": ROD})
     rows = {row[1]: row for row in outcome.tables[0].rows}
     # The gradient law is not meant for points.
-    ours = ["sensitivity", "sensitivity, replay", "sensitivity, auto"]
+    ours = ["sensitivity", "sensitivity, no refit"]
     assert list(rows) == ["prior", *ours, suite.ALL_DATA, suite.EACH_SAMPLE]
     assert rows["sensitivity"][2] < rows["prior"][2]
     assert rows[suite.ALL_DATA][5] == rows[suite.EACH_SAMPLE][5] == 1.0

@@ -12,7 +12,6 @@ from commands import bench
 from typer.main import get_command
 
 from benchmarks.__main__ import app
-from benchmarks.replay import replay
 from livepde.runs import Outcome
 
 pytestmark = pytest.mark.study
@@ -56,14 +55,6 @@ def test_a_fleet_is_held_against_separate_runs(costs, monkeypatch):
     found = suite.setup_cache()
     assert suite.track_step(found) > 0.0
     assert suite.track_command(found) > 0.0
-
-
-def test_replays_are_timed_call_by_call():
-    found = replay(300)
-    (table,) = found.tables
-    for _, median, *_, longest in table.rows:
-        assert 0.0 < median <= longest
-    assert found.checks[0].value == table.rows[0][-1]
 
 
 # --- commands ------------------------------------------------------------------------------------

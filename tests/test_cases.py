@@ -28,7 +28,7 @@ SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 @pytest.fixture
 def rod(tmp_path):
     """Return (edit the template's text) -> path of a case."""
-    case = short_rod(tmp_path / "rod", 91, replay=True)
+    case = short_rod(tmp_path / "rod", 91)
 
     def edited(*changes: tuple[str, str]) -> Path:
         text = case.read_text()
@@ -172,7 +172,7 @@ def test_units_of_columns(rod, tmp_path):
 LAYERS = ("bounds = [", 'regions = { a = [0, "20 cm"], b = ["20 cm", "40 cm"] }\nbounds = [')
 FIELD = ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'field = true\nlength = "20 cm"')
 GRADIENT = ('kind = "sensitivity" ', 'kind = "gradient"\ngain = 1e-12\n#')
-NO_REPLAY = ("replay = true ", "#")
+DRIFT = '# drift = "0.1 1/h"'  # a comment of the template, to be replaced by an option of the law
 
 
 @pytest.mark.slow
@@ -187,9 +187,7 @@ def test_layers_with_priors_of_their_own(rod):
     own = """{ over = ["20 cm", "40 cm"], prior = 0.8, std = "3e-5 m^2/s",
         evolution = { kind = "mean-reverting", time = "1 h" } }"""
     layers = (LAYERS[0], LAYERS[1].replace('["20 cm", "40 cm"]', " ".join(own.split())))
-    case = cases.load(
-        rod(layers, ('prior = "5e-5 m^2/s"', 'prior = 0.5\nunit = "cm^2/s"'), NO_REPLAY)
-    )
+    case = cases.load(rod(layers, ('prior = "5e-5 m^2/s"', 'prior = 0.5\nunit = "cm^2/s"')))
     space = case.model.parameter_space
     a, b = (space.unknown_of(f"alpha[{name}]") for name in "ab")
     assert (a.prior.centre, b.prior.centre) == pytest.approx((5e-5, 8e-5))
@@ -251,7 +249,7 @@ def test_field(rod):
 
 @pytest.mark.slow
 def test_gradient_law_on_averages(rod):
-    path = rod(GRADIENT, NO_REPLAY,
+    path = rod(GRADIENT,
                ('at = "10 cm", noise = "0.05 K"', 'over = ["8 cm", "12 cm"]'),
                ('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"]'))  # fmt: skip
     prepared, data = result_of(path)
@@ -307,7 +305,7 @@ left = {{ role = "boundary", column = "left", at = "left" }}
 )
 def test_tikhonov_from_a_case(rod, keys, expected):
     kind = ('kind = "sensitivity" ', f'kind = "gradient"\ngain = 1e-12\ntikhonov = {keys}\n#')
-    prepared = cases.load(rod(kind, NO_REPLAY)).prepare()
+    prepared = cases.load(rod(kind)).prepare()
     assert prepared.identifier.observed.observation.reconstruction == expected
     assert prepared.identifier.withheld.observation.reconstruction == lp.observation.Pseudoinverse()
     for sample in list(prepared.stream)[:4]:
@@ -319,11 +317,11 @@ def test_tikhonov_from_a_case(rod, keys, expected):
 def test_tikhonov_by_discrepancy_needs_the_noise(rod):
     kind = ('kind = "sensitivity" ', 'kind = "gradient"\ntikhonov = true\n#')
     with pytest.raises(lp.errors.CaseError, match="noise of every sensor"):
-        cases.load(rod(kind, NO_REPLAY, (', noise = "0.05 K"', ""))).prepare()
+        cases.load(rod(kind, (', noise = "0.05 K"', ""))).prepare()
 
 
 def test_gradient_law_on_points_gets_a_note(rod):
-    case = cases.load(rod(GRADIENT, NO_REPLAY))
+    case = cases.load(rod(GRADIENT))
     assert "point sensors mislead" in case.notes[0]
     assert isinstance(
         cases.load(rod(("gain = 1e-12", "mu = 2"))).law.damping, lp.laws.ConstantDamping
@@ -332,21 +330,21 @@ def test_gradient_law_on_points_gets_a_note(rod):
 
 def test_two_damping_rules(rod):
     with pytest.raises(lp.errors.CaseError, match="c1 and mu are two damping rules"):
-        cases.load(rod(GRADIENT, NO_REPLAY, ("gain = 1e-12", "c1 = 1\nmu = 1")))
+        cases.load(rod(GRADIENT, ("gain = 1e-12", "c1 = 1\nmu = 1")))
 
 
 def test_sensitivity_options(rod):
-    law = cases.load(
-        rod(("replay = true ", 'drift = "0.1 1/h"\nmemory = "1 h"\nnoise = "0.1 K"\n#'))
-    ).law
-    assert (law.modes, law.noise, law.memory, law.replay) == ("auto", 0.1, 3600.0, None)
+    law = cases.load(rod((DRIFT, 'drift = "0.1 1/h"\nmemory = "1 h"\nnoise = "0.1 K"\n#'))).law
+    assert (law.modes, law.noise, law.memory) == ("auto", 0.1, 3600.0)
     assert law.drift == pytest.approx(0.1 / 3600)
-    replay = cases.load(rod(('drift = "0.1 1/h"', "replay = {first = 16}"), ('memory = "1 h"', "")))
-    assert replay.law.replay == lp.Replay(first=16)
+    assert law.refit == lp.Refit()
+    some = cases.load(rod(('drift = "0.1 1/h"', "refit = {start = 16}"), ('memory = "1 h"', "")))
+    assert some.law.refit == lp.Refit(start=16)
+    assert cases.load(rod(("{start = 16}", "false"))).law.refit is None
 
 
 def test_guards(rod):
-    assert cases.load(rod(("replay = true", "guards = true"))).law.guards == lp.laws.Guards()
+    assert cases.load(rod((DRIFT, "guards = true"))).law.guards == lp.laws.Guards()
     assert cases.load(rod(("guards = true", "guards = false"))).law.guards is None
     some = cases.load(rod(("guards = false", "guards = { reach = 2 }")))
     assert some.law.guards == lp.laws.Guards(reach=2.0)
@@ -355,7 +353,7 @@ def test_guards(rod):
 @pytest.mark.slow
 def test_the_level_of_the_noise_is_found(rod):
     path = rod(
-        ("replay = true", 'noise = "auto"'),
+        (DRIFT, 'noise = "auto"'),
         ('kind = "sensitivity"', 'kind = "sensitivity"\ngate = 9'),
     )
     case = cases.load(path)
@@ -541,19 +539,19 @@ REFUSED = [
     ('time_unit = "s"', 'encoding = "utf-9"', "expected the name of an encoding, as 'utf-8'"),
     ('time_unit = "s"', 'time_format = "%H:%M"', "data.time_format: got '%H:%M'; expected year"),
     ('time_unit = "s"', 'time_format = "%d.%m.%Y %"', "expected year, month, day and time"),
-    ("replay = true", "guards = { reech = 1 }", "no key 'law.guards.reech'; did you mean 'reach'?"),
-    ("replay = true", "guards = { reach = 0 }", "law.guards: reach must be a positive number; got"),
-    ("replay = true", "shadows = { mesh = 1 }", "law.shadows: mesh must be true or false; got 1"),
-    ("replay = true", "shadows = { largest = 0 }", "law.shadows: largest must be at least 1; got"),
-    ("replay = true", "shadows = { largest = true }", "law.shadows: largest must be a number; got"),
-    ("replay = true", "replay = { first = true }", "law.replay: first must be a number; got True"),
-    ("replay = true", "guards = { reach = true }", "law.guards: reach must be a number; got True"),
-    ("replay = true", "jumps = { size = true }", "law.jumps: size must be a number; got True"),
-    ("replay = true", "gate = true", "law.gate: got True; expected a number"),
-    ("replay = true", "modes = true", "law.modes: got True; expected a number"),
-    ("replay = true", "replay = { window = -3 }", "needs 1 <= first <= window; got first = 8"),
-    ("replay = true", 'jumps = { unknowns = "k" }', "law.jumps.unknowns: got 'k'; expected a list"),
-    ("replay = true", "jumps = { unknowns = { a = 1 } }", "got {'a': 1}; expected a list."),
+    (DRIFT, "guards = { reech = 1 }", "no key 'law.guards.reech'; did you mean 'reach'?"),
+    (DRIFT, "guards = { reach = 0 }", "law.guards: reach must be a positive number; got"),
+    (DRIFT, "shadows = { mesh = 1 }", "law.shadows: mesh must be true or false; got 1"),
+    (DRIFT, "shadows = { largest = 0 }", "law.shadows: largest must be at least 1; got"),
+    (DRIFT, "shadows = { largest = true }", "law.shadows: largest must be a number; got"),
+    (DRIFT, "refit = { start = true }", "law.refit: start must be a number; got True"),
+    (DRIFT, "guards = { reach = true }", "law.guards: reach must be a number; got True"),
+    (DRIFT, "jumps = { size = true }", "law.jumps: size must be a number; got True"),
+    (DRIFT, "gate = true", "law.gate: got True; expected a number"),
+    (DRIFT, "modes = true", "law.modes: got True; expected a number"),
+    (DRIFT, "refit = { window = -3 }", "law.refit: window must be at least 2; got -3"),
+    (DRIFT, 'jumps = { unknowns = "k" }', "law.jumps.unknowns: got 'k'; expected a list"),
+    (DRIFT, "jumps = { unknowns = { a = 1 } }", "got {'a': 1}; expected a list."),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', "bounds = [3]", "bounds: got [3]; expected more ent"),
     ('std = "3e-5 m^2/s"', "std = 0.0", "unknowns.alpha.std: got 0.0; expected more than 0"),
     ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field takes no regions"),
@@ -566,13 +564,11 @@ REFUSED = [
     ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
     ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; leave it out"),
     ('kind = "sensitivity"', 'kind = "sensitive"', "law.kind: got 'sensitive'; did you mean"),
-    ("replay = true", "replya = true", "no key 'law.replya'; did you mean 'replay'?"),
-    ("replay = true", "replay = {frist = 3}", "did you mean 'first'?"),
-    ("replay = true", 'replay = true\nmemory = "1 h"', "law: SensitivityLaw: replay"),
-    ("replay = true", 'replay = true\ndrift = "0.1 1/h"', "moves at random by `drift`: leave out"),
-    ('std = "3e-5 m^2/s"', 'std = 3e-5\nevolution = { kind = "mean-reverting", time = "1 h" }',
-     "law.replay: SensitivityLaw: replay requires unknowns that are constant"),
-    ("replay = true", "noise = -1", "law.noise: got -1"),
+    (DRIFT, "refti = true", "no key 'law.refti'; did you mean 'refit'?"),
+    (DRIFT, "refit = {strat = 3}", "did you mean 'start'?"),
+    (DRIFT, "replay = true", "no key 'law.replay'"),
+    ('kind = "sensitivity"', 'kind = "auto"', "law.kind: got 'auto'"),
+    (DRIFT, "noise = -1", "law.noise: got -1"),
     ('kind = "sensitivity"', 'kind = "gradient"\nc1 = 1\nmu = 1\n[more]', "no key 'more'"),
     ('scheme = "alexander2"', 'scheme = "rk4"', "steps.scheme: got 'rk4'"),
     ('dt_max = "20 s"', 'dt_max = "-20 s"', "steps.dt_max: got '-20 s'"),
@@ -800,7 +796,7 @@ def test_regions_of_a_rectangle(tmp_path, regions, named):
     ],
 )
 def test_unknowns_that_move(rod, evolution, expected):
-    path = rod((NO_REPLAY[0], "#"), ("bounds = [", f"evolution = {{ {evolution} }} #"))
+    path = rod(("bounds = [", f"evolution = {{ {evolution} }} #"))
     unknown = cases.load(path).model.parameter_space.unknowns["alpha"]
     assert type(unknown.evolution) is type(expected)
     assert vars(unknown.evolution) == pytest.approx(vars(expected))
@@ -839,7 +835,7 @@ def test_evolutions_that_are_refused(rod, text, named):
 
 
 def test_gate(rod):
-    assert cases.load(rod(("replay = true ", "gate = 5 #"))).law.gate == 5.0
+    assert cases.load(rod((DRIFT, "gate = 5"))).law.gate == 5.0
 
 
 def test_the_initial_state_is_said_once(rod):
@@ -947,7 +943,7 @@ def test_unknowns_of_sensors_share_a_prior(rod):
 def test_an_unknown_offset_is_found(rod):
     import pandas as pd
 
-    path = rod(OFFSET, NO_REPLAY)
+    path = rod(OFFSET)
     frame = pd.read_csv(path.parent / "rod.csv")
     frame["T_10"] += 0.4
     frame.to_csv(path.parent / "rod.csv", index=False)
@@ -1130,7 +1126,7 @@ def test_text_for_a_bare_function(rod):
 
 def test_settings(rod):
     path = rod()
-    given = parse(["law.noise=0.2 K", "law.replay=false", "law.memory='1 h'",
+    given = parse(["law.noise=0.2 K", "law.refit=false", "law.memory='1 h'",
                    "unknowns.alpha.prior=6e-5", "title=A rod", "channels.T_20.role=sensor",
                    "channels.T_20.noise='1 K'"])  # fmt: skip
     case = cases.load(path, settings=given)
@@ -1145,9 +1141,9 @@ def test_settings(rod):
 
 
 def test_tables_are_set_key_by_key(rod):
-    case = cases.load(rod(), settings={"steps": {"dt_max": "5 s"}, 'law."replay".first': 16})
+    case = cases.load(rod(), settings={"steps": {"dt_max": "5 s"}, 'law."refit".start': 16})
     assert (case.dt_max, case.spec.steps.scheme) == (5.0, "alexander2")
-    assert case.law.replay == lp.Replay(first=16)
+    assert case.law.refit == lp.Refit(start=16)
 
 
 def test_keys_are_taken_away(rod):
@@ -1161,7 +1157,7 @@ def test_keys_are_taken_away(rod):
 @pytest.mark.parametrize(
     ("key", "value", "named"),
     [
-        ("law.reply", None, "there is no key 'law.reply' to take away; did you mean 'replay'?"),
+        ("law.kidn", None, "there is no key 'law.kidn' to take away; did you mean 'kind'?"),
         ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
         ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),

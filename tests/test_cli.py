@@ -226,8 +226,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
 @pytest.mark.slow
 def test_check_shows_notes_and_failures(rod, monkeypatch):
     path = Path(rod)
-    path.write_text(path.read_text().replace('kind = "sensitivity"', 'kind = "gradient"')
-                    .replace("replay = false", "#"))  # fmt: skip
+    path.write_text(path.read_text().replace('kind = "sensitivity"', 'kind = "gradient"'))
     code, output = call("check", rod)
     assert code == 0
     assert "Note: The gradient law" in output
@@ -300,8 +299,6 @@ def test_ctrl_c_keeps_what_there_is(rod, here):
 
 @pytest.mark.long
 def test_resume_goes_on_where_a_run_was_killed(rod, here):
-    path = Path(rod)
-    path.write_text(path.read_text().replace("replay = false", "replay = true"))
     assert call("run", rod, "--out", "whole")[0] == 0
     whole = runs.open("whole").dataset
     cut("whole", "cut", 20)

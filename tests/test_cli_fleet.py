@@ -41,8 +41,6 @@ def here(tmp_path, monkeypatch):
     """A case, a second data file, and a table of four members of which two cannot run."""
     monkeypatch.chdir(tmp_path)
     write_template(tmp_path / "rod")
-    case = Path("rod/case.toml")
-    case.write_text(case.read_text().replace("replay = true", "replay = false"))
     rows = Path("rod/rod.csv").read_text().splitlines()[:40]
     Path("rod/rod.csv").write_text("\n".join(rows) + "\n")
     Path("rod/warm.csv").write_text("\n".join(rows[:30]) + "\n")
@@ -280,7 +278,7 @@ def workers(parent: int) -> list[int]:
 def longer(alike):
     """Data that take a while: of eight times as many samples."""
     case = Path("rod/case.toml")
-    case.write_text(case.read_text().replace("replay = false", "replay = false\nshadows = false"))
+    case.write_text(case.read_text().replace("[law]\n", "[law]\nshadows = false\n"))
     for path in (Path("rod/rod.csv"), Path("rod/other.csv"), Path("rod/third.csv")):
         table = pd.read_csv(path)
         table = pd.concat([table] * 8, ignore_index=True)
@@ -537,9 +535,9 @@ def test_what_is_finished_is_not_run_again(alike, monkeypatch):
 
 def test_says_why_members_are_run_separately(alike):
     Path("rods.csv").write_text(
-        "name,data,initial,law.noise,law.replay\n"
+        "name,data,initial,law.noise,law.refit\n"
         "a,,,,\nb,rod/other.csv,,,\nshort,rod/warm.csv,,,\nnoisy,,,0.2 K,\n"
-        "p,,,,true\nq,rod/other.csv,,,true\nlost,rod/gap.csv,,,\n"
+        "p,,,,false\nq,rod/other.csv,,,false\nlost,rod/gap.csv,,,\n"
     )
     rows = Path("rod/rod.csv").read_text().splitlines()
     time, _, *others = rows[1].split(",")

@@ -66,7 +66,7 @@ def other():
 @pytest.fixture(scope="module")
 def rod(tmp_path_factory):
     """The case of `livepde init`: a rod with two sensors, 61 samples."""
-    return short_rod(tmp_path_factory.mktemp("rod"), replay=True)
+    return short_rod(tmp_path_factory.mktemp("rod"))
 
 
 @pytest.fixture(scope="module", params=[2, 3])

@@ -15,7 +15,6 @@ from livepde.laws import numerical
 from livepde.models import heat
 
 LAWS = {
-    "auto": lp.AutoLaw(),
     "sensitivity": lp.SensitivityLaw(),
     "gradient": lp.GradientLaw(),
 }

@@ -17,9 +17,7 @@ HIDDEN = lp.Points({"c": 0.8})
 LAWS = {
     "gradient": lp.GradientLaw(gain=10.0, damping=lp.laws.ResidualDamping(c1=1.0)),
     "sensitivity": lp.SensitivityLaw(drift=0.01, jumps=lp.Jumps()),
-    # At once: a replay under way would go on with samples in which nothing is measured.
-    "replay": lp.SensitivityLaw(),
-    "auto": lp.AutoLaw(),
+    "refit": lp.SensitivityLaw(),
 }
 
 
@@ -66,7 +64,7 @@ def same(one, other):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
-@pytest.mark.parametrize("law", ["sensitivity", "replay"])
+@pytest.mark.parametrize("law", ["sensitivity", "refit"])
 @pytest.mark.slow
 def test_a_forecast_is_what_the_next_step_expects(law):
     identifier = rod(LAWS[law])

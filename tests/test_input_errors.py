@@ -161,14 +161,9 @@ def rest() -> None:
     DATA.write_text("\n".join([header, *rows]))
 
 
-def gradient() -> None:
-    case('kind = "sensitivity"', 'kind = "gradient"')()
-    case("replay = true", "")()
-
-
 NOTED = {
     "nothing to learn": rest,
-    "the law": gradient,
+    "the law": case('kind = "sensitivity"', 'kind = "gradient"'),
     "a coarse mesh": case("cells = 40  ", "cells = 1  "),
 }
 

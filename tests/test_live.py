@@ -42,7 +42,7 @@ def closed():
 
 @pytest.mark.long
 def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
-    write(tmp_path, 60)  # no replay is under way at the end, which only the result would settle
+    write(tmp_path, 60)
     run = live(tmp_path)
     run.run()
     result = identifier().run(

@@ -371,7 +371,7 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert "| `cells` | a whole number or [a whole number, a whole number] |  |" in keys
     assert "## `[unknowns.NAME.evolution]`" in keys
     assert '## `[law]`, `kind = "gradient"`' in keys
-    assert "| `replay` | true or false or a table | `false` |" in keys
+    assert "| `refit` | true or false or a table | `true` |" in keys
     assert "## `[[variants]]`" in keys
 
 

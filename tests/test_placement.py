@@ -31,7 +31,7 @@ SENSOR = "channels.T_20"  # withheld in the template: now a third sensor, somewh
 
 @pytest.fixture
 def rod(tmp_path: Path) -> Path:
-    return short_rod(tmp_path / "rod", 91, replay=True)
+    return short_rod(tmp_path / "rod", 91)
 
 
 def prepared(path: Path, *settings: dict[str, Any]) -> cases.Prepared:
@@ -74,7 +74,6 @@ def test_a_field_counts_with_its_mean_over_the_domain(rod: Path):
 
 WALK = {
     "unknowns.alpha.evolution": {"kind": "random-walk", "rate": "1e-6 m^2/s/s^0.5"},
-    "law.replay": False,
 }
 
 
@@ -103,7 +102,7 @@ def test_of_unknowns_that_move_hardly_another_vertex_is_better(rod: Path):
 
 
 def test_what_it_cannot_say(rod: Path):
-    rod.write_text(rod.read_text().replace('"sensitivity"', '"gradient"').replace("replay =", "# "))
+    rod.write_text(rod.read_text().replace('"sensitivity"', '"gradient"'))
     with pytest.raises(lp.errors.ConfigurationError, match="needs a law with a covariance"):
         advice(rod)
 

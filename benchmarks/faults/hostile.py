@@ -72,8 +72,8 @@ HOSTILE: Mapping[str, tuple[str, str]] = {
         _PRIOR,
         _PRIOR + '\nevolution = { period = "1 d", harmonics = 1_000_000_000 }',
     ),
-    "1e9 modes": ("replay = true", "replay = true\nmodes = 1_000_000_000"),
-    "window 1e9": ("replay = true", "replay = { window = 1_000_000_000 }"),
+    "1e9 modes": ('noise = "0.2 K"', 'noise = "0.2 K"\nmodes = 1_000_000_000'),
+    "window 1e9": ('noise = "0.2 K"', 'noise = "0.2 K"\nrefit = { window = 1_000_000_000 }'),
     "%d twice": ('time = "time"', 'time = "time"\ntime_format = "%d.%d.%Y %H:%M"'),
     "time_format of 1e5 letters": (
         'time = "time"',

@@ -50,7 +50,6 @@ right = "20 degC"
 [law]
 kind = "sensitivity"
 noise = "0.2 K"
-replay = true
 
 [output]
 fields_every = 20

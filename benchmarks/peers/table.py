@@ -67,7 +67,7 @@ def _filter_alone(data: Data) -> Score | None:
 
 
 PEERS: dict[str, Peer] = {
-    # Does as much as the filters below it: no verdict, no iterated start, no discretisation errors.
+    # Does as much as the filters below it: no verdict, no refit, no discretisation errors.
     "sensitivity, filter alone": Peer((), _filter_alone),
     **{
         f"EnKF as arrays, {members} members": Peer((), partial(arrays.ensemble, members))
@@ -91,8 +91,6 @@ PEERS: dict[str, Peer] = {
 OURS = (
     "prior",
     "sensitivity",
-    "sensitivity, replay",
-    "sensitivity, auto",
     "gradient, auto",
     accuracy.ALL_DATA,
     accuracy.EACH_SAMPLE,

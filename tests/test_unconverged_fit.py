@@ -1,0 +1,36 @@
+"""A refit that ends without a minimum: the verdict reports it, and the estimate is kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from factories import driven_rod, line, readings
+
+import livepde as lp
+
+TIMES = np.arange(0.0, 4.05, 0.1)
+
+
+def run(passes: int) -> lp.Estimate:
+    """Return the last estimate of a run: log a is 0.3, and the prior far too high."""
+    model = driven_rod({"a": lp.LogNormal(3.6, 3.6)}, lambda t: np.sin(3 * t), line(12))
+    sensors = lp.Points([0.3, 0.6], noise=0.01)
+    law = lp.SensitivityLaw(refit=lp.Refit(start=0, passes=passes), guards=None, shadows=None)
+    stream = readings(model, sensors, lambda t: 0.3, TIMES, 0.01)
+    last = lp.Identifier(model, sensors, law, u0=0.0).run(stream).last
+    assert last is not None
+    return last
+
+
+@pytest.mark.slow
+def test_a_fit_that_did_not_converge_is_not_trusted():
+    one, whole = run(1), run(40)
+    assert one.fit is not None
+    assert not one.fit.converged
+    assert one.verdict.level == "do not trust"
+    (found,) = [item for item in one.verdict.findings if item.what == "fit"]
+    assert "did not converge" in found.text
+    assert whole.fit is not None
+    assert whole.fit.converged
+    assert not [item for item in whole.verdict.findings if item.what == "fit"]
+    assert whole["a"].median == pytest.approx(np.exp(0.3), rel=0.05)
