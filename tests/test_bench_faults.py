@@ -178,7 +178,8 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_soak_in_small(monkeypatch):
-    law = partial(lp.SensitivityLaw, refit=lp.laws.Refit(start=4))  # an iterated start takes most of the time
+    # Refits of the start take most of the time.
+    law = partial(lp.SensitivityLaw, refit=lp.laws.Refit(start=4))
     law.scheme = lp.SensitivityLaw.scheme
     monkeypatch.setattr(soak, "SensitivityLaw", law)
     monkeypatch.setattr(soak, "WARM", 200)

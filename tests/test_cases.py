@@ -921,11 +921,7 @@ OFFSET = ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm", noise = "0.05 K", off
 
 def test_unknowns_of_sensors_share_a_prior(rod):
     more = ', offset = "0.5 K", gain = 0.05, correlated = { time = "1 h", std = "0.1 K" }'
-    # A replay is refused beside an error that moves at random.
     path = rod((OFFSET[0], f'at = "10 cm", noise = "0.05 K"{more}'))
-    with pytest.raises(lp.errors.CaseError, match=r"law\.replay: .*'correlated' moves at random"):
-        cases.load(path)
-    path = rod(NO_REPLAY)
     with pytest.raises(lp.errors.CaseError, match=r"T_30.offset: differs from that of 'T_10'"):
         cases.load(rod(('at = "30 cm", noise', 'at = "30 cm", offset = "0.4 K", noise')))
     model = cases.load(rod(('offset = "0.4 K", noise', "noise"))).model

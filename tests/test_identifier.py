@@ -221,7 +221,7 @@ def test_halvings_that_cannot_be_meant(halvings):
     [
         lp.GradientLaw(gain=100.0),
         lp.SensitivityLaw(modes=5, noise=0.01),
-        lp.SensitivityLaw(modes=5, noise=0.01),
+        lp.SensitivityLaw(modes=5, noise=0.01, refit=None),
     ],
 )
 def test_a_continued_run_is_bit_identical(law, tmp_path):
@@ -319,7 +319,7 @@ def test_a_result_has_named_axes_and_units(tmp_path):
 
 @pytest.mark.long
 def test_a_table_of_a_result():
-    law = lp.SensitivityLaw(start_window=4, gate=np.inf)  # of the readings that are used
+    law = lp.SensitivityLaw(gate=np.inf)  # of the readings that are used
     result = lp.Identifier(rod(), SENSORS, law, withheld=HIDDEN).run(stream())
     table = result.table()
     assert table["k"]["value"] == pytest.approx(float(result.last.q[0]))

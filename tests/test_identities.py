@@ -48,13 +48,12 @@ class Options:
     halvings: int
     late: bool  # no sample at t0
     spin_up: bool  # the first readings are not assimilated
-    replay: bool
     jumps: bool
     gate: float
     guards: bool
     shadows: bool
     verdict: bool
-    start_window: int
+    refit: int  # samples up to which a run is fitted at each doubling; 0: never
 
     @property
     def linear(self) -> bool:
@@ -92,21 +91,15 @@ def options(**fixed: Any) -> st.SearchStrategy[Options]:
         "halvings": st.sampled_from([0, 8]),
         "late": st.booleans(),
         "spin_up": st.booleans(),
-        "replay": st.booleans(),
         "jumps": st.booleans(),
         "gate": st.sampled_from([np.inf, 4.0]),
         "guards": st.booleans(),
         "shadows": st.booleans(),
         "verdict": st.booleans(),
-        "start_window": st.sampled_from([0, 0, 3, 64]),
+        "refit": st.sampled_from([0, 0, 3, 64]),
     }
     drawn |= {name: st.just(value) for name, value in fixed.items()}
-    return st.builds(Options, **drawn).map(possible)
-
-
-def possible(o: Options) -> Options:
-    # A replay keeps one reference of all samples, which an unknown that moves does not have.
-    return replace(o, replay=o.replay and o.motion == "stays")
+    return st.builds(Options, **drawn)
 
 
 def check(strategy: st.SearchStrategy[Any], examples: int, function: Callable[..., None]) -> None:
@@ -180,14 +173,13 @@ def observation(calibrated: str, frame: Frame) -> lp.Observation:
 
 def law(o: Options, kind: type[lp.SensitivityLaw] = lp.SensitivityLaw) -> lp.SensitivityLaw:
     return kind(
-         if o.replay else None,
+        refit=lp.laws.Refit(start=o.refit) if o.refit else None,
         jumps=lp.Jumps(settle=3) if o.jumps else None,
         gate=o.gate,
         gate_patience=2,
         guards=lp.laws.Guards() if o.guards else None,
         shadows=lp.laws.Shadows() if o.shadows else None,
         verdict=o.verdict,
-        start_window=o.start_window,
         rank=40,
     )
 
@@ -337,8 +329,6 @@ def test_a_run_that_is_restored_continues_to_the_bit(examples):
 @drawn(40)
 def test_a_forecast_is_the_next_prediction(examples):
     def same(o: Options) -> None:
-        # A replay predicts readings linear about its reference, a forecast by the sensors.
-        assume(not (o.replay and o.calibrated == "curve"))
         who, taken, last, bounded = identifier(o), samples(o), {}, False
         for one in taken:
             last = last | one.inputs

@@ -188,11 +188,6 @@ def test_a_settled_run_iterates_no_more():
     assert not any(moved[32:])
 
 
-def test_a_window_that_is_negative_is_refused():
-    with pytest.raises(lp.errors.LawError, match="start_window"):
-        lp.SensitivityLaw(start_window=-1)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
@@ -222,11 +217,11 @@ def test_a_direction_that_is_not_told_keeps_the_start_open():
     identifier = lp.Identifier(model, SENSORS, law, u0=0.0)
     for t in TIMES[1:]:
         identifier.step(t, np.full(3, np.nan) if t < 2.0 else np.zeros(3))
-    assert identifier._state.start_due[0] == iterated_smoother.NEVER
+    assert identifier._state.due[0] == iterated_smoother.NEVER
     silent = lp.Identifier(model, lp.Points([0.5], noise=1e3), law, u0=0.0)
     for t in TIMES[1:]:
         silent.step(t, np.zeros(1))
-    assert silent._state.start_due[0] < iterated_smoother.NEVER
+    assert silent._state.due[0] < iterated_smoother.NEVER
 
 
 @pytest.mark.slow

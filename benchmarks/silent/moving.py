@@ -36,8 +36,8 @@ KINDS = {
 REPORTED, REPORTED_SPACINGS = Exact(decay=0.0, std=2.0, noise=0.05, rate=0.3), (0.1, 0.5, 2.0)
 MEMBERS, SAMPLES = 100, 32
 EMPTY, FEW = 11, 10  # rows between two samples, and members that have them
-# The filter alone: safeguards, gate and iterated start do nothing here but cost time.
-LAW = lp.SensitivityLaw(shadows=None, guards=None, gate=np.inf, start_window=0, verdict=False)
+# The filter alone: safeguards, gate and refits do nothing here but cost time.
+LAW = lp.SensitivityLaw(shadows=None, guards=None, gate=np.inf, refit=None, verdict=False)
 
 
 def checks() -> list[Check]:

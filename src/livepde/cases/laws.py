@@ -57,7 +57,6 @@ def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
         guards=_chosen(Guards, spec.guards),
         shadows=_chosen(Shadows, spec.shadows),
         verdict=spec.verdict,
-        refit=_chosen(Refit, spec.refit),
     )
 
 

@@ -229,9 +229,7 @@ def absorb(
     if shadows is not None and off is not None:
         learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
-    corrected: Mask | None = None
     if anchored is not None and anchored.any():
-        corrected = np.asarray(anchored.any(axis=1))
         new = filter_.anchor.corrected(new, innovations, anchored, at)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
     # square overflows would leave statistics that are not finite. The squares of all members tell

@@ -46,7 +46,7 @@ GRAVE = 0.3  # the same, from which the estimate is not to be trusted
 POWER = 2  # of the number of a sample, that weighs it
 UNTESTED = (
     "the mesh and the time step: their errors are not followed",
-    "a replay: there is none",
+    "a fit of all samples again: there is none",
     "intervals: the law has no covariance",
     "correlation of the noise in time",
 )

@@ -165,9 +165,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                     f"SensitivityLaw: {name} must be {rule}; got {getattr(self, name)!r}."
                 )
 
-        if self.replay is not None and self.refit is not None:
-            raise LawError("SensitivityLaw: replay and refit do the same work; choose one.")
-
     @property
     def fades(self) -> bool:
         """True if the cross-covariance of state and unknowns decays (`memory`)."""

@@ -1,4 +1,4 @@
-"""State of the sensitivity law: filter, log of samples, replay and guards of each member."""
+"""State of the sensitivity law: filter, log of samples, refits and guards of each member."""
 
 from __future__ import annotations
 
@@ -177,48 +177,6 @@ class FitState:
         readings that were not used; shape (members,).
     work
         Samples that all refits of the window have taken, one with derivatives counting 1.
-    converged
-        1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
-    """
-
-    samples: IntArray
-    cost: Array
-    refused: Array
-    work: Array
-    converged: Array
-
-    @classmethod
-    def none(cls, members: int = 1) -> FitState:
-        """Return the value before any refit."""
-        zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
-        return cls(samples=nothing, cost=zero, refused=zero, work=zero, converged=zero)
-
-    def member(self, k: int) -> Fit | None:
-        """Return the last refit of one member, None before it."""
-        if not self.samples[k]:
-            return None
-        return Fit(
-            samples=int(self.samples[k]),
-            cost=float(self.cost[k]),
-            passes=float(self.work[k]) / int(self.samples[k]),
-            refused=int(self.refused[k]),
-            converged=bool(self.converged[k]),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class FitState:
-    """The last refit of each member.
-
-    Attributes
-    ----------
-    samples
-        How many samples it used, 0 before the first one, shape (members,).
-    cost, refused
-        Half the sum of squares of residuals in use and of the unknowns, in standard deviations, and
-        readings that were not used; shape (members,).
-    work
-        Samples that all refits of the window have used, one with derivatives counting 1.
     converged
         1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
     """
