@@ -95,11 +95,11 @@ def samples(sensors: lp.observation.Observation, noise: float) -> list[tuple[flo
     return found
 
 
-@pytest.mark.parametrize("replay", [None, lp.Replay()])
+@pytest.mark.parametrize("refit", [None, lp.laws.Refit()])
 @pytest.mark.parametrize("of", ["phi", "c and phi"])
 @pytest.mark.slow
-def test_both_unknowns_are_identified_from_the_potential(replay: Any, of: str):
-    law = lp.SensitivityLaw(replay=replay, shadows=None)
+def test_both_unknowns_are_identified_from_the_potential(refit: Any, of: str):
+    law = lp.SensitivityLaw(refit=refit, shadows=None)
     noise = 0.01
     potential = lp.Points({"phi_2": 0.2, "phi_6": 0.6}, of="phi", noise=noise)
     concentration = lp.Points({"c_5": 0.5}, of="c", noise=noise)

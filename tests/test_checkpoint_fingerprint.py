@@ -28,7 +28,7 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "place": ({"place": 0.51}, "another sensor"),
     "noise": ({"noise": 0.02}, "another sensor"),
     "gate": ({"law": lp.SensitivityLaw(gate=4.0)}, "another option of the law"),
-    "replay": ({"law": lp.SensitivityLaw()}, "another option of the law"),
+    "refit": ({"law": lp.SensitivityLaw(refit=None)}, "another option of the law"),
     "dt_max": ({"dt_max": 0.1}, "another scheme, dt_max"),
     "scheme": ({"scheme": lp.ImplicitEuler()}, "another scheme, dt_max"),
     "hold": ({"hold": True}, "another scheme, dt_max"),

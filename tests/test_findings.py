@@ -200,16 +200,6 @@ def jumped(change: float) -> list[str]:
 
 
 @cache
-def banked(*, moves: bool) -> list[str]:
-    """Return the findings of a bank on an unknown that goes to and fro, or stays."""
-    stream = jumping.samples(lambda t: 0.3 + 0.15 * moves * np.sin(0.5 * t), 300, 0)
-    points = lp.Points(jumping.POINTS, noise=jumping.NOISE)
-    return of_data(
-        lp.Identifier(jumping.rod(), points, lp.AutoLaw(), u0=0.0).run(stream).to_xarray()
-    )
-
-
-@cache
 def fitted(**options: int) -> list[str]:
     """Return the findings on a column that a refit finds, unless it may take few passes."""
     refit = lp.laws.Refit(**options)
@@ -271,16 +261,11 @@ RUNS = {
     "run_verdict: refused": Pair(
         partial(unjudged_readings, spoiled=True), partial(unjudged_readings, spoiled=False)
     ),
-    "run_verdict: replay": Pair(
-        partial(warned_of, FAR),
-        partial(warned_of, ONE),
-    ),
     "run_verdict: held": Pair(partial(decayed, 0.01), partial(decayed, 0.5)),
     "run_verdict: left out": Pair(
         lambda: of_data(modes.ran(4).to_xarray()), lambda: of_data(modes.ran(41).to_xarray())
     ),
     "run_verdict: guards": Pair(partial(exploded, spoiled=True), partial(exploded, spoiled=False)),
-    "run_verdict: drift": Pair(partial(banked, moves=True), partial(banked, moves=False)),
     "run_verdict: gain": Pair(partial(filled, gain=1e4), filled),
     "run_verdict: jump": Pair(partial(jumped, 0.7), partial(jumped, 1.0)),
     "equation_tests: rest": Pair(partial(filled, rests=True, gain=100.0), filled),

@@ -104,7 +104,6 @@ LAWS = {
     "rank": law(rank=8),
     "plain": law(),
     "gate, noise": law(gate=3.0, noise="auto"),
-    "replay": law(),
     "jumps": law(jumps=lp.Jumps(settle=5)),
     "no guards, memory": law(guards=None, memory=2.0),
 }
@@ -183,7 +182,7 @@ def compare(model, law, stream=samples, members=4, sensors=SENSORS, **options):
 
 
 # One model with every law, every model with one, and the pairs that go the farthest ways.
-FARTHEST = (("walks", "gate, noise"), ("layers", "replay"))
+FARTHEST = (("walks", "gate, noise"), ("layers", "usual"))
 PAIRS = [
     (model, law)
     for model in MODELS
@@ -306,7 +305,6 @@ def test_inputs_that_give_no_finite_start_are_refused(law):
 @pytest.mark.parametrize(
     ("law", "why"),
     [
-        (lp.AutoLaw(), "AutoLaw"),
         (lp.GradientLaw(), "GradientLaw"),
     ],
 )

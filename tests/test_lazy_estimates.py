@@ -48,7 +48,6 @@ SHORT = {"refit": lp.laws.Refit(start=4), "shadows": None}
 PAIRS = [
     (UNKNOWNS[0], lp.SensitivityLaw()),
     *((unknown, lp.SensitivityLaw(**SHORT)) for unknown in UNKNOWNS[1:]),
-    (UNKNOWNS[0], lp.AutoLaw()),
     (UNKNOWNS[2], lp.GradientLaw()),
 ]
 

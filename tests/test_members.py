@@ -158,34 +158,6 @@ def test_members_are_taken_put_and_joined_and_square_roots_widened():
     assert changed(whole, value=np.zeros(3)).inner is whole.inner
 
 
-@pytest.mark.long
-def test_a_bank_goes_on_where_the_step_of_a_member_fails():
-    """All step alone then: logs of members stay in line, and the others have their sample."""
-    model = lp.Model(
-        lp.Field(MESH, ElementLineP1(), dirichlet={"left": 1.0, "right": 0.0}),
-        {"a": lp.Normal(0.2, 0.1)},
-        A=lambda q, u, v, x: q.a * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), lp.AutoLaw(), u0=0.0)
-    stage, calls = identifier._work.work.filter.stage, []
-    advance = stage.advance
-
-    def fails(columns: Array, *rest: Any) -> Any:
-        calls.append(columns.shape[1])
-        if columns.shape[1] == 6 and len(calls) == 30:
-            raise lp.StepFailed("not_converged", "no luck")
-        return advance(columns, *rest)
-
-    object.__setattr__(stage, "advance", fails)
-    rng = np.random.default_rng(0)
-    for k in range(60):
-        estimate = identifier.step(0.05 * (k + 1), [0.5, 0.3] + 0.01 * rng.standard_normal(2))
-        assert estimate.status.ok
-    times = identifier._state.members.log[:, :, 0]
-    assert np.isfinite(times).all()
-    assert (np.diff(times, axis=1) > 0.0).all()
-
-
 @pytest.mark.slow
 def test_a_fleet_whose_withheld_sensors_read_channels_of_their_own():
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
@@ -238,24 +210,7 @@ def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
 
 
 @pytest.mark.slow
-def test_a_bank_that_learns_of_no_noise_waits_anew(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("livepde.laws.auto.SILENCE", 30)
-    model = rod({"left": 1.0, "right": 0.0})
-    identifier = lp.Identifier(model, lp.Points([0.3, 0.6]), lp.AutoLaw(), u0=0.0)
-    for k in range(100):
-        identifier.step(0.1 * (k + 1), [np.nan, np.nan])
-        waiting = identifier._state.waiting[0, :, 0]
-        assert len(waiting) <= 31
-        assert identifier._state.members.log.shape[1] < 110
-    rng = np.random.default_rng(0)
-    for k in range(100, 130):
-        estimate = identifier.step(0.1 * (k + 1), [0.7, 0.4] + 0.01 * rng.standard_normal(2))
-    assert estimate.status.ok
-    assert identifier._state.known
-
-
-@pytest.mark.slow
-def test_what_a_replay_leaves_is_what_the_law_goes_back_to():
+def test_what_a_refit_leaves_is_what_the_law_goes_back_to():
     law = lp.SensitivityLaw(guards=lp.laws.Guards(past=8))
     model, rng = rod({"left": 1.0, "right": 0.0}), np.random.default_rng(0)
     identifier = lp.Identifier(model, lp.Points([0.3, 0.6], noise=0.01), law, u0=0.0)

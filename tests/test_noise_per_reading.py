@@ -59,14 +59,13 @@ LAWS = [
     lp.SensitivityLaw(jumps=lp.Jumps(settle=5), **SHORT),
     lp.SensitivityLaw(noise="auto", **SHORT),
     lp.SensitivityLaw(drift=0.1, **SHORT),
-    lp.AutoLaw(),
 ]
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", LAWS)
 def test_a_reading_counts_with_its_own_noise_as_with_that_of_its_sensor(law):
-    """Also in iterated starts, replays and members of a bank, which take readings again."""
+    """Also in iterated starts and refits, which take readings again."""
     stated, own = identifier(law, noise=[0.02, 0.1]), identifier(law, noise=[5.0, 0.1])
     for t, z, _ in stream():
         one = stated.step(t, z)
@@ -181,7 +180,7 @@ def test_a_withheld_reading_may_have_noise_and_is_scored_all_the_same():
 
 @pytest.mark.slow
 def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
-    """Of those that an iterated start or a replay takes again."""
+    """Of those that an iterated start or a refit takes again."""
     for law in (lp.SensitivityLaw(), lp.SensitivityLaw()):
         one, two = identifier(law), identifier(law)
         for k, (t, z, std) in enumerate(stream()):

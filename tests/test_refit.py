@@ -243,8 +243,6 @@ def test_options_are_checked():
         lp.laws.Refit(passes=0)
     with pytest.raises(lp.errors.LawError, match="start must be at least 0"):
         lp.laws.Refit(start=-1)
-    with pytest.raises(lp.errors.LawError, match="choose one"):
-        lp.SensitivityLaw(replay=lp.Replay(), refit=lp.laws.Refit())
 
 
 def test_unknowns_that_move_are_not_fitted():

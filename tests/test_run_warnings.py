@@ -107,22 +107,6 @@ def test_few_samples_are_not_judged_and_none_neither():
         assert verdict(result.to_xarray()).level == result.verdict.level == "not judged"
 
 
-@pytest.mark.slow
-def test_a_replay_that_did_not_converge_is_said():
-    far = rod(lp.LogNormal(3.0, 3.0))
-    once = lp.Replay(first=75, iterations=1)
-    found = doubts(run(far, rod(lp.Normal(0.2)), replay=once))
-    assert any("The last replay has not converged" in sentence for sentence in found)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("count", "said"), [(1, False), (13, True)])
-def test_a_bank_that_believes_in_drift_is_said(count: int, said: bool):
-    data = right().copy()
-    data["drifting"] = ("time", np.where(np.arange(data.sizes["time"]) < count, 0.9, 0.1))
-    assert any("unknowns that drift" in note for note in doubts(data)) == said
-
-
 def reaction(cells: int) -> lp.Model:
     """Return u_t - u_xx + q u = f with a field q."""
     mesh = lp.interval(0.0, 1.0, cells)

@@ -67,8 +67,7 @@ def run(one, pieces):
 PAIRS = [
     ("walks", "plain"),
     ("rod", "usual"),
-    ("rod", "replay"),
-    ("rod", "auto"),
+    ("rod", "gradient"),
     ("layers", "gate, noise"),
     ("logarithm", "jumps"),
     ("sources", "no guards, memory"),
@@ -78,10 +77,10 @@ PAIRS = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "rule"), PAIRS)
 def test_equals_separate_identifiers(model, rule):
-    built, chosen = MODELS[model](), lp.AutoLaw() if rule == "auto" else LAWS[rule]
+    built, chosen = MODELS[model](), lp.GradientLaw() if rule == "gradient" else LAWS[rule]
     items = stream(built, 10)
     one = shard(built, chosen)
-    assert bool(one.note) == (rule == "auto")
+    assert bool(one.note) == (rule == "gradient")
     q, q_std, innovation, status = run(one, batches(items))
     wanted = separately(built, items, chosen)
     assert status == [estimate.status.code for estimate in wanted]
@@ -91,10 +90,10 @@ def test_equals_separate_identifiers(model, rule):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", ["plain", "replay", "auto"])
+@pytest.mark.parametrize("rule", ["plain", "usual", "gradient"])
 def test_goes_on_from_a_dump_at_any_batch(rule):
     """With identical numbers, and at its offset."""
-    model, chosen = rod(), lp.AutoLaw() if rule == "auto" else LAWS[rule]
+    model, chosen = rod(), lp.GradientLaw() if rule == "gradient" else LAWS[rule]
     pieces = batches(stream(model, 9))
     whole, others = shard(model, chosen), [shard(model, chosen) for _ in range(2)]
     dumps, found = [], []
@@ -214,7 +213,7 @@ def test_dumps_of_others_are_refused():
     with pytest.raises(lp.errors.RunError, match="another members"):
         shard(model, members=["a", "b"]).load(content)
     with pytest.raises(lp.errors.RunError, match="another law"):
-        shard(model, lp.AutoLaw()).load(content)
+        shard(model, lp.GradientLaw()).load(content)
     with pytest.raises(lp.errors.RunError, match="damaged"):
         shard(model).load(content[:-1] + bytes([content[-1] ^ 1]))
     with pytest.raises(lp.errors.RunError, match="another shard"):

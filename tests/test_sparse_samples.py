@@ -58,7 +58,7 @@ def test_standard_deviations_are_those_of_the_exact_filter(kind: str, decay: flo
 @pytest.mark.parametrize("decay", [300.0, 1e4, 1e5])
 def test_states_that_follow_at_once_have_exact_deviations(kind: str, decay: float):
     exact, h, count = exact_of(kind, decay, 0.01), 6.0, 6
-    who, (_, P) = identifier(exact, start_window=0), exact.filtered(h, np.zeros(count))
+    who, (_, P) = identifier(exact, refit=None), exact.filtered(h, np.zeros(count))
     for k in range(count):
         who.step(k * h, {"a": 0.0})
         assert spread(who, exact) == pytest.approx(np.sqrt(P[k, 1, 1]), rel=0.01)

@@ -168,7 +168,6 @@ def probe() -> lp.observation.Observation:
 
 
 GUARDED = lp.SensitivityLaw(guards=lp.laws.Guards(), jumps=lp.Jumps(settle=4))
-REPLAYING = lp.SensitivityLaw()
 
 CASES = {
     "gradient": Case(lp.GradientLaw(gain=10.0), rod, inner),
@@ -197,9 +196,7 @@ CASES = {
     "sensitivity, large square": Case(
         lp.SensitivityLaw(modes=3), large_square, averages, samples=2
     ),
-    "replay": Case(REPLAYING, powered_rod, missing=0.1, samples=6),
     "guards and jumps": Case(GUARDED, powered_rod, samples=6),
-    "bank": Case(lp.AutoLaw(), powered_rod),
 }
 
 
@@ -321,9 +318,7 @@ COPIED = (
     "Kuegler",
     "sensitivity, inputs",
     "sensitivity, square",
-    "replay",
     "guards and jumps",
-    "bank",
 )
 
 

@@ -426,14 +426,6 @@ def test_few_samples_are_too_few():
     assert "there are 1 samples, 20 are needed" in estimate.verdict.sentences[0]
 
 
-@pytest.mark.long
-def test_a_bank_judges_by_its_leader():
-    z = shown() + errors()
-    z[:, 1] += 0.1
-    found = run(z, law=lp.AutoLaw())[1].verdict
-    assert found.level != "trusted"
-
-
 @pytest.mark.slow
 def test_what_is_left_out_is_said():
     found = run(shown() + errors(), law=lp.SensitivityLaw(verdict="cheap"))[1].verdict
