@@ -11,6 +11,8 @@ from livepde.models import heat
 
 SENSORS = lp.Points([0.2, 0.5, 0.8], noise=0.02)
 TIMES = 0.1 * np.arange(41)
+# Constant unknowns have a fit of their own, unless a memory fades, however little.
+FADING = {"memory": 1e9}
 
 
 def sourced(evolution=None):
@@ -55,8 +57,8 @@ def ends(model, law, samples, u0=0.0):
 def test_nothing_changes_where_all_is_linear(evolution):
     model = sourced(evolution)
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(refit=None, shadows=None), samples)
-    iterated = ends(model, lp.SensitivityLaw(shadows=None), samples)
+    plain = ends(model, lp.SensitivityLaw(**FADING, refit=None, shadows=None), samples)
+    iterated = ends(model, lp.SensitivityLaw(**FADING, shadows=None), samples)
     assert any(not np.isnan(estimate.diagnostics.smoother_moved) for estimate in iterated)
     for one, other in zip(plain, iterated, strict=True):
         np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
@@ -120,7 +122,7 @@ def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, exp
     samples = list(readings(model, [1.5]))
     if not explained:  # a bias of ten standard deviations, which no source makes
         samples = [(t, z + np.array([0.2, -0.2, 0.2])) for t, z in samples]
-    ends(model, lp.SensitivityLaw(shadows=None, gate=np.inf), samples)
+    ends(model, lp.SensitivityLaw(**FADING, shadows=None, gate=np.inf), samples)
     assert begun
     assert max(begun) == 1 if explained else max(begun) == 3
 
@@ -173,8 +175,8 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
     monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda samples: None)
     model = sourced()
     samples = list(readings(model, [1.5]))
-    plain = ends(model, lp.SensitivityLaw(refit=None), samples)[-1]
-    found = ends(model, lp.SensitivityLaw(), samples)
+    plain = ends(model, lp.SensitivityLaw(**FADING, refit=None), samples)[-1]
+    found = ends(model, lp.SensitivityLaw(**FADING), samples)
     assert found[0].diagnostics.smoother_moved == np.inf
     np.testing.assert_array_equal(found[-1].q, plain.q)
 
@@ -182,7 +184,9 @@ def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatc
 @pytest.mark.slow
 def test_a_settled_run_iterates_no_more():
     model = sourced()
-    found = ends(model, lp.SensitivityLaw(refit=lp.laws.Refit(start=8)), readings(model, [1.5]))
+    found = ends(
+        model, lp.SensitivityLaw(**FADING, refit=lp.laws.Refit(start=8)), readings(model, [1.5])
+    )
     moved = [not np.isnan(estimate.diagnostics.smoother_moved) for estimate in found]
     assert any(moved[:16])
     assert not any(moved[32:])
@@ -203,7 +207,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
         A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
         f=10.0,
     )
-    found = ends(model, lp.SensitivityLaw(), readings(model, [1.2, 0.8], seed=seed))
+    found = ends(model, lp.SensitivityLaw(**FADING), readings(model, [1.2, 0.8], seed=seed))
     moved = [np.nan_to_num(estimate.diagnostics.smoother_moved) for estimate in found]
     assert max(moved[:16]) > 0.0
     assert not any(moved[32:])
@@ -213,7 +217,7 @@ def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
 @pytest.mark.slow
 def test_a_direction_that_is_not_told_keeps_the_start_open():
     model = sourced()
-    law = lp.SensitivityLaw(refit=lp.laws.Refit(start=16))
+    law = lp.SensitivityLaw(**FADING, refit=lp.laws.Refit(start=16))
     identifier = lp.Identifier(model, SENSORS, law, u0=0.0)
     for t in TIMES[1:]:
         identifier.step(t, np.full(3, np.nan) if t < 2.0 else np.zeros(3))
@@ -231,9 +235,9 @@ def test_a_search_that_hardly_moves_the_unknowns_corrects_the_state():
     start = lambda x: 1.0 + np.cos(np.pi * x[0])  # noqa: E731
     samples = list(readings(model, [0.12], start))[:24]
     bare = {"shadows": None, "verdict": False}
-    whole = ends(model, lp.SensitivityLaw(), samples, start)
-    alone = ends(model, lp.SensitivityLaw(**bare), samples, start)
-    plain = ends(model, lp.SensitivityLaw(refit=None, **bare), samples, start)
+    whole = ends(model, lp.SensitivityLaw(**FADING), samples, start)
+    alone = ends(model, lp.SensitivityLaw(**FADING, **bare), samples, start)
+    plain = ends(model, lp.SensitivityLaw(**FADING, refit=None, **bare), samples, start)
     moved = [one.diagnostics.smoother_moved for one in whole]
     assert 0.0 < np.nanmax(moved) <= iterated_smoother.HOLDS
     for one, other in zip(whole, alone, strict=True):
