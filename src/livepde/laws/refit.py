@@ -147,8 +147,9 @@ class _Search:
         """Return by how much the quadratic model of the cost falls to its minimum."""
         H, g = self._model(one)
         free = self._free(one, g)
-        along = free.T @ g
-        return 0.5 * float(along @ np.linalg.solve(free.T @ H @ free, along))
+        sizes, axes = np.linalg.eigh(free.T @ H @ free)
+        along = axes.T @ (free.T @ g)
+        return 0.5 * float((along**2 / sizes).sum())
 
     def _free(self, one: Passed, g: Array) -> Array:
         """Return a basis of the directions in which no bound is in the way, (r, free)."""

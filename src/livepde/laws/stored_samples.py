@@ -184,9 +184,10 @@ class StoredSamples:
             slopes.append(Y[0].T / self.noise[number][:, None])
         if x is None or len(residuals) < len(self.spans):
             return None
-        J = np.array(slopes)
-        finite = np.isfinite(J).all() and np.isfinite(x.u).all() and np.isfinite(x.U).all()
-        return Passed(xi=xi, residuals=np.array(residuals), slopes=J, end=x) if finite else None
+        J, r = np.array(slopes), np.array(residuals)
+        # Of squares: what overflows there has neither a cost nor a direction.
+        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum() + np.nansum(r**2)
+        return Passed(xi=xi, residuals=r, slopes=J, end=x) if np.isfinite(squares) else None
 
     def costs(self, points: Array, used: Mask, limit: float = np.inf) -> tuple[Array, float]:
         """Return the costs of trajectories, and how much of a pass they took.
