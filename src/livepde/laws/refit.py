@@ -1,8 +1,9 @@
 """The refit: the most probable constant unknowns given the stored samples, from any honest prior.
 
 Levenberg-Marquardt steps within a trust region in prior standard deviations (More 1978, Conn, Gould
-and Toint 2000). Where the end does not explain the samples, the search begins again at the best of
-some screened points. The gate acts once a search has ended, and may take back readings.
+and Toint 2000), with a second-order part that follows curved valleys (Transtrum and Sethna 2012).
+Where the end does not explain the samples, the search begins again at the best of some screened
+points. The gate acts once a search has ended, and may take back readings.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ ENDS = 0.1  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
 ACCEPTED = 1e-4  # least ratio of actual and predicted decrease of the cost
 POOR, GOOD = 0.25, 0.75  # ratios below and above which the trust region changes
+SHORTER = 0.5  # radius of the next trial over that of the one before
+CLOSE = 0.1  # part of a step over which its second derivative is taken
+CURVED = 0.75  # largest second-order part of a step over its first-order part (Transtrum 2012)
 SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
 LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
 UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
@@ -173,26 +177,51 @@ class _Search:
         free, cost = self._free(one, g), one.cost(self.used)
         sizes, axes = np.linalg.eigh(free.T @ H @ free)
         axes = free @ axes
+        along, bend = axes.T @ g, None
+        several = 1  # one trial, and where it fails shorter ones at once
         while self.passes < budget:
-            step = axes @ _within(sizes, axes.T @ g, delta)
-            xi = self.samples.within_bounds(one.xi + step)
-            step = xi - one.xi
-            predicted = float(g @ step - 0.5 * step @ H @ step)
-            length = float(np.linalg.norm(step))
-            if length < SHORTEST or predicted < LEAST * cost:
+            steps, predicted = [], []
+            for radius in delta * SHORTER ** np.arange(several):
+                shift = _shift(sizes, along, radius)
+                step = axes @ (along / (sizes + shift))
+                gain = float(g @ step - 0.5 * step @ H @ step)
+                if np.linalg.norm(step) < SHORTEST or gain < LEAST * cost:
+                    break
+                if bend is None:
+                    bend = self._bend(one, step)
+                curved = axes @ ((axes.T @ (bend * (step @ step))) / (sizes + shift))
+                if np.linalg.norm(curved) < CURVED * np.linalg.norm(step):
+                    step = step + 0.5 * curved
+                steps.append(self.samples.within_bounds(one.xi + step) - one.xi)
+                predicted.append(gain)
+            if not steps:
                 return None, delta
-            found, taken = self.samples.costs(xi[None], self.used, cost)
+            tried, taken = self.samples.costs(one.xi + np.array(steps), self.used, cost)
             self.passes += taken
-            ratio = (cost - float(found[0])) / predicted
+            best = int(np.argmin(tried))
+            length = float(np.linalg.norm(steps[best]))
+            ratio = (cost - float(tried[best])) / predicted[best]
             if ratio < POOR:
-                delta = length * (0.5 if ratio > 0.0 else 0.25)
+                delta = length * (SHORTER if ratio > 0.0 else SHORTER**2)
             elif ratio > GOOD:
                 delta = max(delta, 2.0 * length)
+            several = self.samples.together
             if ratio > ACCEPTED:
-                better = self._about(xi)
+                better = self._about(one.xi + steps[best])
                 if better is not None:
                     return better, delta
         return None, delta
+
+    def _bend(self, one: Passed, step: Array) -> Array:
+        """Return J' d2r/ds2 of the residuals r along a step, by a difference; zero if it fails."""
+        near = self.samples.residuals(one.xi + CLOSE * step)
+        self.passes += 1.0 / (1 + len(step))
+        if near is None:
+            return np.zeros(len(step))
+        J = one.slopes[self.used]
+        change = (near - one.residuals)[self.used] / CLOSE + J @ step
+        bend: Array = J.T @ change * (2.0 / CLOSE) / float(step @ step)
+        return bend if np.isfinite(bend).all() else np.zeros(len(step))
 
     @property
     def suspicious(self) -> bool:
@@ -249,26 +278,25 @@ class _Search:
                 return
 
 
-def _within(sizes: Array, g: Array, delta: float) -> Array:
-    """Return the minimum of a quadratic model within a ball, in its principal axes.
+def _shift(sizes: Array, g: Array, delta: float) -> float:
+    """Return the shift of the Hessian with which the minimum of the model is within a ball.
 
     Parameters
     ----------
     sizes, g
-        Eigenvalues of the Hessian, at least 1, and the descent direction, shapes (r,).
+        Eigenvalues of the Hessian, at least 1, and the descent direction in its axes, shapes (r,).
     delta
         Radius of the ball.
     """
-    step = g / sizes
-    if np.linalg.norm(step) <= delta:
-        return step
+    if np.linalg.norm(g / sizes) <= delta:
+        return 0.0
     # The length falls with the shift; the bracket holds since |g|/(shift + 1) bounds the length.
     low, high = 0.0, float(np.linalg.norm(g)) / delta
     for _ in range(60):
         shift = 0.5 * (low + high)
-        step = g / (sizes + shift)
-        low, high = (shift, high) if np.linalg.norm(step) > delta else (low, shift)
-    return np.asarray(g / (sizes + high))
+        longer = np.linalg.norm(g / (sizes + shift)) > delta
+        low, high = (shift, high) if longer else (low, shift)
+    return high
 
 
 def _normal(count: int, size: int) -> Array:

@@ -18,9 +18,10 @@ class Refit:
     given all stored samples: Levenberg-Marquardt steps in a trust region, new starts where the end
     does not explain the samples, and a second look at refused readings. See `livepde.laws.refit`.
 
-    At the start the samples are fitted each time their number has doubled, so that the search is
-    over while they are few. Later fits take longer than a live run may wait: they are made at the
-    end of a run (`Identifier.run`, `livepde run`) and by `Identifier.refit`.
+    The samples are fitted each time their number has doubled, so that most of the search is over
+    while they are few. Such a call of `step` takes longer than others; where it must not, as in a
+    control loop, a smaller `start` leaves later fits to the end of the run (`Identifier.run`,
+    `livepde run`) and to `Identifier.refit`.
 
     Unknowns that move, noisy inputs and a fading memory have no such fit: there the samples of the
     start are smoothed again, as `livepde.laws.iterated_smoother` does.
@@ -28,7 +29,7 @@ class Refit:
     Parameters
     ----------
     start
-        Up to this many samples are taken again at each doubling.
+        Up to this many samples are taken again at each doubling; 64 at most of unknowns that move.
     window
         At most this many samples are stored. When it is full, the estimate of that moment becomes
         the prior of the next window.
@@ -36,7 +37,7 @@ class Refit:
         A search that takes more passes over the samples has not converged.
     """
 
-    start: int = 64
+    start: int = 4096
     window: int = 4096
     passes: int = 40
 

@@ -40,6 +40,7 @@ __all__ = [
     "without_past",
 ]
 
+SMOOTHED = 64  # samples that are smoothed again where unknowns move, at most
 LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
 NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more
 
@@ -104,7 +105,7 @@ class SensitivityWork:
         """Largest number of samples that are taken again together; 0: none are."""
         if self.refit is None:
             return 0
-        return self.refit.window if self.fits else self.refit.start
+        return self.refit.window if self.fits else min(self.refit.start, SMOOTHED)
 
     @cached_property
     def back(self) -> int:

@@ -21,11 +21,12 @@ from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, BlockFactor, Mask
-from livepde.stepping import Span, StageOfMembers, advance
+from livepde.stepping import BandedStage, Span, StageOfMembers, advance
 
 __all__ = ["Passed", "StoredSamples"]
 
 FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage
+TOGETHER = 6  # trajectories that are tried at once where one array holds them
 AT_ONCE = 32  # trajectories that are followed as one array
 
 
@@ -100,6 +101,21 @@ class StoredSamples:
     def readings(self) -> Array:
         """All readings in units of their noise, (samples, sensors); NaN: missing."""
         return np.array([span.z1[0] for span in self.spans]) / self.noise
+
+    @cached_property
+    def missing(self) -> Array:
+        """NaN for each reading, (samples, sensors)."""
+        return np.full(self.readings.shape, np.nan)
+
+    @cached_property
+    def seen(self) -> Mask:
+        """Samples with a reading, (samples,)."""
+        return np.isfinite(self.readings).any(axis=1)
+
+    @property
+    def together(self) -> int:
+        """Trajectories that cost little more than one."""
+        return TOGETHER if isinstance(self.filter.stage, BandedStage) else 1
 
     @property
     def reached(self) -> Array:
@@ -177,17 +193,27 @@ class StoredSamples:
 
     def about(self, xi: Array) -> Passed | None:
         """Return the samples about one trajectory with derivatives; None if a step fails."""
-        residuals, slopes, x = [], [], None
+        r, x, number = self.missing.copy(), None, -1
+        J = np.zeros((*r.shape, len(xi)))
         for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=True))):
-            predicted, Y = self.filter.sensors.observe(x, span.end)
-            residuals.append((span.z1[0] - predicted[0]) / self.noise[number])
-            slopes.append(Y[0].T / self.noise[number][:, None])
-        if x is None or len(residuals) < len(self.spans):
+            if self.seen[number]:
+                predicted, Y = self.filter.sensors.observe(x, span.end)
+                r[number] = (span.z1[0] - predicted[0]) / self.noise[number]
+                J[number] = Y[0].T / self.noise[number][:, None]
+        if x is None or number + 1 < len(self.spans):
             return None
-        J, r = np.array(slopes), np.array(residuals)
         # Of squares: what overflows there has neither a cost nor a direction.
         squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum() + np.nansum(r**2)
         return Passed(xi=xi, residuals=r, slopes=J, end=x) if np.isfinite(squares) else None
+
+    def residuals(self, xi: Array) -> Array | None:
+        """Return the residuals about one trajectory; None if a step fails."""
+        r, number = self.missing.copy(), -1
+        for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=False))):
+            if self.seen[number]:
+                predicted, _ = self.filter.sensors.observe(x, span.end)
+                r[number] = (span.z1[0] - predicted[0]) / self.noise[number]
+        return r if number + 1 == len(self.spans) else None
 
     def costs(self, points: Array, used: Mask, limit: float = np.inf) -> tuple[Array, float]:
         """Return the costs of trajectories, and how much of a pass they took.
@@ -200,13 +226,16 @@ class StoredSamples:
             part = slice(first, first + AT_ONCE)
             steps = self._followed(self.placed(points[part], rows=False))
             for number, (x, span) in enumerate(steps):
+                taken += len(x)
+                whole[part] = number + 1 == len(self.spans)
+                if not self.seen[number]:
+                    continue
                 predicted, _ = self.filter.sensors.observe(x, span.end)
                 missed = np.where(used[number], span.z1 - predicted, 0.0) / self.noise[number]
                 found[part] += 0.5 * (missed * missed).sum(axis=1)
-                taken += len(predicted)
                 if not (found[part] < limit).any():
+                    whole[part] = False
                     break
-                whole[part] = number + 1 == len(self.spans)
         columns = 1 + self.state.start.C.shape[1]
         cost = np.where(whole & np.isfinite(found), found, np.inf)
         return cost, taken / (columns * max(len(self.spans), 1))
