@@ -81,7 +81,7 @@ def test_empty_rows_between_samples_change_nothing(kind: str, decay: float):
 
 
 # 12 paths of 100 samples: a correct share of 0.95 is off by more than 0.02 once in 700 times.
-@pytest.mark.long
+@pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("decay", "h"), [(0.0, 0.15), (0.0, 6.0), (20.0, 0.15), (20.0, 6.0)])
 def test_coverage(kind: str, decay: float, h: float):
