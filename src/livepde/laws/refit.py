@@ -21,7 +21,7 @@ from livepde.linalg import Array, Mask
 __all__ = ["Found", "refitted"]
 
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
-ENDS = 0.1  # posterior standard deviations of a last step
+ENDS = 0.03  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
 ACCEPTED = 1e-4  # least ratio of actual and predicted decrease of the cost
 POOR, GOOD = 0.25, 0.75  # ratios below and above which the trust region changes

@@ -16,6 +16,8 @@ from livepde.linalg import Array, Mask, nonfinite_allowed
 
 __all__ = ["refit_due", "settle"]
 
+NEAR = 1.0  # standard deviations within which a refit that another one follows keeps these sums
+
 
 def refit_due(
     work: SensitivityWork, state: SensitivityState, due: Mask
@@ -60,7 +62,7 @@ def _refitted(
     samples = StoredSamples.of(work, state)
     found = refitted(samples, options, last=last)
     count, spent = state.assimilated, state.fit.work
-    x = None if found is None else _filter(samples, found)
+    x = None if found is None else _filter(samples, found, last=last)
     if found is None or x is None:
         fit = changed(state.fit, samples=count, converged=np.zeros(1))
         return changed(state, fit=fit)
@@ -77,10 +79,14 @@ def _refitted(
     return changed(state, now=now, newer=newer, fit=fit)
 
 
-def _filter(samples: StoredSamples, found: Found) -> FilterState | None:
+def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
     """Return the filter that continues from the end of a search; None if a step fails."""
     now = samples.state.now
     best = samples.updated(found.best, found.used)
-    if best is not None and usual(now) and apart(samples.filter, best, now) <= HOLDS:
-        return best
+    if best is not None:
+        away = apart(samples.filter, best, now)
+        # Sums of the verdict and errors of the discretisation stay with the filter until then: a
+        # later refit of the same samples may find them anew.
+        if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
+            return best
     return samples.judged(found.best, found.used)
