@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
+from livepde.cases.schema import SensitivitySpec
 from livepde.cases.units import convert
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.streams import Twin
@@ -1346,3 +1348,18 @@ def test_units_of_many_cases_are_those_of_pint():
         found = [quantity.to(unit).magnitude for quantity in (zero, one)]
         assert found == pytest.approx([offset, offset + factor], rel=1e-15, abs=0.0)
         assert units.conversion(given, unit, "here") == units.Affine(factor, offset)
+
+
+def test_every_option_of_the_sensitivity_law_is_a_key_with_the_same_default():
+    keys = SensitivitySpec(kind="sensitivity")
+    for option in dataclasses.fields(lp.SensitivityLaw):
+        usual, given = getattr(lp.SensitivityLaw(), option.name), getattr(keys, option.name)
+        if option.name == "memory":  # a time, which has a unit
+            assert (usual, given) == (np.inf, None)
+        elif dataclasses.is_dataclass(usual) or usual is None:
+            assert bool(given) == (usual is not None)
+        else:
+            assert given == usual
+    assert set(SensitivitySpec.model_fields) == {
+        "kind", *(option.name for option in dataclasses.fields(lp.SensitivityLaw))
+    }  # fmt: skip

@@ -501,7 +501,9 @@ class SensitivitySpec(Spec):
     kind: Literal["sensitivity"]
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
+    rank: PositiveInt | None = SensitivityLaw.rank
     gate: PositiveFloat = SensitivityLaw.gate
+    gate_patience: PositiveInt = SensitivityLaw.gate_patience
     shadows: StrictBool | Annotated[Shadows, _options(Shadows)] = True
     drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
