@@ -141,12 +141,15 @@ class UpdateOptions:
     adaptive
         True if the noise is a first guess whose multiple is found from the samples; their
         likelihood is kept then, too.
+    scored
+        True if the likelihood of the samples is kept.
     decision
         An earlier decision of the gate on the sample, which holds again; None: the gate decides.
     """
 
     gate: Gate = field(default_factory=Gate)
     adaptive: bool = False
+    scored: bool = False
     decision: Decision | None = None
 
 
@@ -225,7 +228,12 @@ def absorb(
         x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
     parts["innovations"] = x.innovations.add(e, measured, newest)
     new, made = filter_.update(x, Y, d, **parts)
-    learned: dict[str, Any] = _learned(x, used, d, noise, made) if options.adaptive else {}
+    learned: dict[str, Any] = {}
+    if options.adaptive or options.scored:
+        logs = (np.log(noise) * used).sum(axis=1)
+        learned["evidence"] = x.evidence - 0.5 * made.misfit - made.spread - logs
+    if options.adaptive:
+        learned |= _learned(x, used, d, made)
     if shadows is not None and off is not None:
         learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
     new = changed(new, **learned) if learned else new
@@ -307,22 +315,20 @@ def _judged(
     return changed(x, causes=causes, ledger=ledger)
 
 
-def _learned(x: FilterState, used: Mask, d: Array, noise: Array, made: Update) -> dict[str, Array]:
-    """Return evidence and noise level after a sample.
+def _learned(x: FilterState, used: Mask, d: Array, made: Update) -> dict[str, Array]:
+    """Return the noise level after a sample.
 
     The noise level is found by expectation maximisation, sample by sample: under the right level
     the mean square of the residual after an update, plus the posterior variance of the prediction,
     is the variance of the noise, also while the unknowns are uncertain.
     """
     left = made.left
-    logs = (np.log(noise) * used).sum(axis=1)
     missed = d - (made.half[:, None] @ left)[:, 0]
     count, told = np.maximum(used.sum(axis=1), 1), used.any(axis=1)
     square = ((missed * missed).sum(axis=1) + (left * left).sum(axis=(1, 2))) / count
     samples = np.minimum(x.samples + LEARN, MEMORY)
     level = x.level * (1.0 + (square - 1.0) / samples)
     return {
-        "evidence": x.evidence - 0.5 * made.misfit - made.spread - logs,
         "level": np.where(told, level, x.level),
         "samples": np.where(told, samples, x.samples),
     }

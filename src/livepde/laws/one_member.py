@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from livepde.laws.assimilation import assimilate
+from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gate import Screened
 from livepde.laws.gauss_newton import (
@@ -41,6 +41,7 @@ from livepde.stepping import Interval
 
 __all__ = ["step_alone"]
 
+NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
 
 
@@ -220,6 +221,43 @@ def _retaken(
     return state, report
 
 
+def _most_likely(
+    work: SensitivityWork, jumps: Jumps, x: FilterState, known: Sequence[Interval], guess: int
+) -> int:
+    """Return after how many samples a jump makes all of them most likely, near a first guess.
+
+    A state that has gone on without the jump, or with it too early, misfits for long, and constants
+    that do not jump would have to explain that.
+    """
+    tried = sorted({guess + shift for shift in NEAR_ONSETS} & set(range(len(known))))
+    # What was refused before the first of them stays refused; all of them explain the rest.
+    open_gate = UpdateOptions(adaptive=work.options.adaptive, scored=True)
+    searching = replace(work.unaccompanied, options=open_gate)
+    x, score, best = work.filter.relinearised(unaccompanied(x)), -np.inf, guess
+    for number, interval in enumerate(known):
+        if number in tried:
+            found = _likelihood(searching, jumps, x, known[number:])
+            score, best = max((score, best), (found, number))
+        x, report = _filtered(searching if number >= tried[0] else work.unaccompanied, x, interval)
+        x = work.filter.relinearised(x)
+        if not report.status.ok:
+            break
+    return best
+
+
+def _likelihood(
+    work: SensitivityWork, jumps: Jumps, x: FilterState, intervals: Sequence[Interval]
+) -> float:
+    """Return the logarithm of the likelihood of all samples if the unknowns jump now."""
+    x = work.filter.inflated(x, jumps.size, work.jumping)
+    for interval in intervals:
+        x, report = _filtered(work, x, interval)
+        x = work.filter.relinearised(x)
+        if not report.status.ok:
+            return -np.inf
+    return float(x.evidence[0])
+
+
 def _watched(
     work: SensitivityWork,
     jumps: Jumps,
@@ -243,7 +281,8 @@ def _watched(
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
         onset = max(jumps.onset(state.watch, e), _doubted(new.now.screened))
-        before = len(known) - reaching([bool(item.present.any()) for item in known], onset)
+        guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
+        before = _most_likely(work, jumps, state.older, known, guess)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()
         for earlier in known[:before]:
             x, found = _filtered(work, x, earlier)
