@@ -33,6 +33,8 @@ class Watch:
     usual
         Statistics of the innovations, with which new ones are compared: none counts for more than
         `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
+    scatters
+        Usual scatter before each of the last samples, newest first, shape (members, samples).
     """
 
     squares: Array
@@ -40,6 +42,7 @@ class Watch:
     seen: IntArray
     resting: IntArray
     usual: Innovations
+    scatters: Array
 
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
@@ -67,7 +70,9 @@ class Watch:
         if counted.any():
             new = usual.add(np.minimum(np.maximum(e, -most), most))
             usual = new if counted.all() else where(counted, new, usual)
-        return Watch(squares, counts, self.seen + 1, np.maximum(self.resting - 1, 0), usual)
+        scatters = np.concatenate([self.usual.scatter[:, None], self.scatters[:, :-1]], axis=1)
+        resting = np.maximum(self.resting - 1, 0)
+        return Watch(squares, counts, self.seen + 1, resting, usual, scatters)
 
 
 @dataclass(frozen=True)
@@ -83,7 +88,8 @@ class Jumps:
 
     The usual size and correlation are those of the last 500 samples that were looked at, with the
     first `settle`; after these none counts for more than three times the usual size. So a jump
-    hardly changes the yardstick of the next one.
+    hardly changes the yardstick of the next one. Samples are compared with what was usual before
+    them: a jump that shows slowly must not become usual while it is looked for.
 
     Parameters
     ----------
@@ -134,7 +140,7 @@ class Jumps:
         """Return the value before any innovation."""
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)
         usual = Innovations.start(sensors, members)
-        return Watch(zero, zero, none, none + self.settle, usual)
+        return Watch(zero, zero, none, none + self.settle, usual, zero + 1.0)
 
     def add(self, watch: Watch, e: Array, refused: IntArray | None = None) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
@@ -172,7 +178,7 @@ class Jumps:
         # with it, too.
         alarm = unlikely(sums)
         if alarm.any():
-            alarm = unlikely(sums / watch.usual.scatter[:, None] ** 2)
+            alarm = unlikely(sums / new.scatters[:, lengths] ** 2)
             alarm &= ~early & (new.counts[:, 0] > 0.0)
         if alarm.any():
             clear = alarm[:, None]
@@ -192,6 +198,6 @@ class Jumps:
         """
         new = watch.add(e, watch.seen < self.settle)
         freedom = np.cumsum(new.counts[0])
-        size = watch.usual.scatter[0] ** 2 * np.maximum(freedom, 1.0)
+        size = new.scatters[0] ** 2 * np.maximum(freedom, 1.0)
         ratio = np.maximum(np.cumsum(new.squares[0]) / size, 1.0)
         return 1 + int(np.argmax(freedom * (ratio - 1.0 - np.log(ratio))))

@@ -38,6 +38,8 @@ GATE_ROUNDS = 4
 GATE = 4.0  # usual deviations from the neighbours beyond which a residual is refused
 WILD = 30.0  # the same for readings, before there is a fit
 NEIGHBOURS = 3  # to each side
+FEW = 2 * NEIGHBOURS  # readings of a sensor of which none has enough neighbours
+LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use is taken to keep
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +83,7 @@ def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | N
     if search.best is None:
         return None
     for _ in range(GATE_ROUNDS if samples.gated else 0):
-        used = _plausible(search.best.residuals)
+        used = search.plausible
         if (used == search.used).all():
             break
         search.begin(used)
@@ -102,12 +104,37 @@ class _Search:
     passes: float = 0.0
 
     def __post_init__(self) -> None:
-        limit = WILD if self.samples.gated else math.inf
-        self.used = _plausible(self.samples.readings, limit)
+        readings = self.samples.readings
+        self.used = np.isfinite(readings)
+        if self.samples.gated:
+            self.used = _plausible(readings, WILD) & _usual(readings)
 
     @property
     def _ends(self) -> float:
         return ENDS if self.last else ENDS_EARLY
+
+    @property
+    def plausible(self) -> Mask:
+        """Readings near the best trajectory, (samples, sensors); not only those in use.
+
+        A residual is refused that is far from those before and after it, and one far beyond what
+        the noise and what is left unknown allow; of few samples there is the latter only.
+        """
+        one, gate = self.best, self.samples.work.options.gate.beyond
+        if one is None:
+            return self.used
+        H, _ = self._model(one)
+        J, r = one.slopes, one.residuals
+        shown = np.einsum("skr,skr->sk", J @ np.linalg.inv(H), J)
+        # Residuals of readings in use vary less than the noise, those of others more.
+        e = r / np.sqrt(np.where(self.used, np.maximum(1.0 - shown, LEVERAGE), 1.0 + shown))
+        near = _plausible(r)
+        for k, column in enumerate(e.T):
+            usual = max(1.0, 1.4826 * _median(np.abs(column[self.used[:, k]])))
+            limit = WILD if np.isfinite(column).sum() > FEW else gate
+            with np.errstate(invalid="ignore"):
+                near[:, k] &= np.abs(column) <= limit * usual
+        return near
 
     def begin(self, used: Mask) -> None:
         """Search again from the best trajectory, with other readings in use."""
@@ -331,12 +358,33 @@ def _plausible(values: Array, limit: float = GATE) -> Mask:
     for k, column in enumerate(values.T):
         (places,) = np.isfinite(column).nonzero()
         seen = column[places]
-        if len(seen) <= 2 * NEIGHBOURS:
+        if len(seen) <= FEW:
             continue
         away = np.abs(seen - _of_neighbours(seen))
         usual = max(1.0, 1.4826 * float(np.median(away)))  # of normal values: the deviation
         used[places, k] = away <= limit * usual
     return used
+
+
+def _usual(values: Array) -> Mask:
+    """Return which values of each sensor are not far off most others, in their usual distance.
+
+    A sensor that shows a wrong constant for some time has neighbours that agree with it. A right
+    value that is far off, as after a long rest, is taken back once a fit without it is found.
+    """
+    used = np.isfinite(values)
+    for k, column in enumerate(values.T):
+        seen = column[used[:, k]]
+        if len(seen) > FEW:
+            away = np.abs(column - np.median(seen))
+            usual = max(1.0, 1.4826 * _median(away[used[:, k]]))
+            used[:, k] &= np.nan_to_num(away) <= WILD * usual
+    return used
+
+
+def _median(values: Array) -> float:
+    """Return the median, 0 of no value."""
+    return float(np.median(values)) if len(values) else 0.0
 
 
 def _of_neighbours(values: Array) -> Array:

@@ -35,7 +35,7 @@ def refit_due(
         else:
             # A window but the first begins with what is known: it has nothing to search for.
             if count <= options.start:
-                one = _refitted(work, options, one, last=False)
+                one = _refitted(work, options, one)
             later = 2 * count if 2 * count <= options.start else options.window
             one = changed(one, due=np.array([later]))
         state = put(state, k, one)
@@ -43,24 +43,42 @@ def refit_due(
 
 
 @nonfinite_allowed()  # such a trajectory is refused
-def settle(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-    """Return all members after a last refit, for the end of a run."""
+def settle(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityState, list[Mask | None]]:
+    """Return all members after a last refit, for the end of a run, and the readings it has used.
+
+    Those of the last samples of each member, (samples, sensors); None of one that is not fitted.
+    """
+    used: list[Mask | None] = [None] * len(state)
     options = work.refit
     if options is None or not work.fits:
-        return state
+        return state, used
     for k in range(len(state)):
         one = take(state, k)
         if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
-            state = put(state, k, _refitted(work, options, one, last=True))
-    return state
+            samples = StoredSamples.of(work, one)
+            found = refitted(samples, options, last=True)
+            used[k] = None if found is None else found.used
+            state = put(state, k, _after(work, one, samples, found, last=True))
+    return state, used
 
 
-def _refitted(
-    work: SensitivityWork, options: Refit, state: SensitivityState, *, last: bool
-) -> SensitivityState:
-    """Return one member after a refit."""
+def _refitted(work: SensitivityWork, options: Refit, state: SensitivityState) -> SensitivityState:
+    """Return one member after a refit that another one follows."""
     samples = StoredSamples.of(work, state)
-    found = refitted(samples, options, last=last)
+    return _after(work, state, samples, refitted(samples, options, last=False), last=False)
+
+
+def _after(
+    work: SensitivityWork,
+    state: SensitivityState,
+    samples: StoredSamples,
+    found: Found | None,
+    *,
+    last: bool,
+) -> SensitivityState:
+    """Return one member that continues from the end of a search."""
     count, spent = state.assimilated, state.fit.work
     x = None if found is None else _filter(samples, found, last=last)
     if found is None or x is None:

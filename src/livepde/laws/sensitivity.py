@@ -465,7 +465,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return state.fit.member(0)
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
-        return settle(work, state)
+        return settle(work, state)[0]
 
     def finite(self, work: SensitivityWork, state: SensitivityState) -> bool:
         x = state.now
@@ -483,8 +483,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> Iterator[Belief]:
         if self.fades:
             return super().smoothed(work, before, after, data)
-        now = self.settled(work, after).now
-        return (self.member_belief(work, x, 0) for x in smoothed(work, before, now, data))
+        settled, (used,) = settle(work, after)
+        found = smoothed(work, before, settled.now, data, used)
+        return (self.member_belief(work, x, 0) for x in found)
 
     def belief(self, work: SensitivityWork, state: SensitivityState) -> Belief:
         return self.member_belief(work, state.now, 0)

@@ -34,10 +34,10 @@ from livepde.laws.iterated_smoother import expecting, missed, moved
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, nonfinite_allowed
+from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import KeptFactors, Span
 
-__all__ = ["evidence", "smoothed"]
+__all__ = ["smoothed"]
 
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 2  # of a step that makes samples and prior less probable
@@ -73,7 +73,11 @@ class _SmootherPass:
 
 
 def smoothed(
-    work: SensitivityWork, before: SensitivityState, after: FilterState, data: FixedInterval
+    work: SensitivityWork,
+    before: SensitivityState,
+    after: FilterState,
+    data: FixedInterval,
+    used: Mask | None = None,
 ) -> Iterator[FilterState]:
     """Iterate over the smoothed filters of one member, the last one first.
 
@@ -84,22 +88,12 @@ def smoothed(
     before, after
         The member before the first sample, and its filter after the last one in the run: its noise
         level and the statistics of its innovations are those of all samples.
+    used
+        Readings of the last samples that a refit has used, (samples, sensors); None: there is none.
     """
     with nonfinite_allowed():  # not finite: not used
-        best = _descended(*_begun(work, before, after, data))
+        best = _descended(*_begun(work, before, after, data, used))
     return _backward(best, after)
-
-
-def evidence(
-    work: SensitivityWork, before: SensitivityState, after: FilterState, data: FixedInterval
-) -> float:
-    """Return the logarithm of the likelihood of all samples, linear about the run's estimates.
-
-    Minus infinity where they cannot be followed. Parameters as for `smoothed`.
-    """
-    with nonfinite_allowed():
-        _, found = _begun(work, before, after, data, adaptive=True)
-    return float(found.points[-1].x.evidence[0]) if found is not None else -np.inf
 
 
 def _begun(
@@ -107,16 +101,16 @@ def _begun(
     before: SensitivityState,
     after: FilterState,
     data: FixedInterval,
-    *,
-    adaptive: bool = False,
+    used: Mask | None,
 ) -> tuple[_FixedInterval, _SmootherPass | None]:
     """Return the samples with the gate's decisions on them, and a first pass; None if all fail.
 
-    The readings are those that the run uses, in each pass. The gate of the run knows the errors of
-    the discretisation, which widen it: what it uses without them it uses with them. So these, which
-    cost twice as much again, are followed only where it refuses a reading.
+    The readings are those that the run uses, in each pass, and its refit where there is one. The
+    gate of the run knows the errors of the discretisation, which widen it: what it uses without
+    them it uses with them. So these, which cost twice as much again, are followed only where it
+    refuses a reading.
     """
-    work = replace(work.unjudged, options=replace(work.options, adaptive=adaptive))
+    work = replace(work.unjudged, options=replace(work.options, adaptive=False))
     start, initial = unjudged(before.now), bool(before.initial[0])
     whole = _FixedInterval(work, start, initial, after, data)
     bare = _FixedInterval(work.unaccompanied, unaccompanied(start), initial, after, data)
@@ -127,10 +121,24 @@ def _begun(
         best = next((one for each in trajectories if (one := whole.about(each))), None)
     if best is None:
         return bare, None
-    samples = bare.decided(best.decisions)
-    if not best.refuses:
+    decisions = best.decisions if used is None else _fitted(best.decisions, used, data)
+    samples = bare.decided(decisions)
+    if not best.refuses and decisions is best.decisions:
         return samples, best
     return samples, samples.about(samples.estimated) or samples.about(None)
+
+
+def _fitted(decisions: list[Decision], used: Mask, data: FixedInterval) -> list[Decision]:
+    """Return the gate's decisions, those on the last samples as a refit has made them."""
+    first = len(decisions) - len(used)
+    found = decisions[:first]
+    for decision, kept, sample in zip(
+        decisions[first:], used, [data.opening, *data.intervals][first:], strict=True
+    ):
+        refused = (np.isfinite(sample.z1) & ~kept)[None]
+        found.append(Decision(refused, decision.anchored & refused))
+    alike = all((a.refused == b.refused).all() for a, b in zip(found, decisions, strict=True))
+    return decisions if alike else found
 
 
 def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _SmootherPass:

@@ -110,7 +110,7 @@ class StoredSamples:
     @cached_property
     def seen(self) -> Mask:
         """Samples with a reading, (samples,)."""
-        return np.isfinite(self.readings).any(axis=1)
+        return np.asarray(np.isfinite(self.readings).any(axis=1))
 
     @property
     def together(self) -> int:
@@ -251,9 +251,10 @@ class StoredSamples:
             return None
         J = one.slopes[used]
         # The prior of xi is N(0, I); about the trajectory its mean is -xi.
-        W, half, _ = contraction(J.T[None], (one.residuals[used] + J @ one.xi)[None])
-        mean = W[0] @ half[0] - one.xi
-        C, U = W[0].T @ end.C[0], W[0].T @ end.U[0]
+        mean, C, U = -one.xi, end.C[0], end.U[0]
+        if len(J):
+            W, half, _ = contraction(J.T[None], (one.residuals[used] + J @ one.xi)[None])
+            mean, C, U = mean + W[0] @ half[0], W[0].T @ C, W[0].T @ U
         # Causes are coordinates on the rows of the square root, which is one up to a rotation: the
         # one that brings these rows nearest to those of the present filter.
         left, _, right = np.linalg.svd(now.C[0] @ np.linalg.pinv(C))
