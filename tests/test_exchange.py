@@ -398,11 +398,10 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
     assert component.outputs[1:5:2] == pytest.approx([1.0, 1.0])
     component.inputs = [0.25, 0.5]
     component.take(0.1)
-    result = identifier.run([(0.1, [0.25, 0.5])])
-    data = result.to_xarray()
+    estimate = identifier.step(0.1, [0.25, 0.5])
     found = dict(zip(names, component.outputs, strict=True))
-    assert [found[f"q[{k}]"] for k in range(1, 8)] == data["q"][-1].values.tolist()
-    assert [found[f"q[{k}]_std"] for k in range(1, 8)] == data["q_std"][-1].values.tolist()
+    assert [found[f"q[{k}]"] for k in range(1, 8)] == estimate.q.tolist()
+    assert [found[f"q[{k}]_std"] for k in range(1, 8)] == estimate.q_std.tolist()
     large = of_code("own:build", lambda: build(1200))
     assert [item.name for item in large.outputs()] == ["estimate_time", "a_model", "b_model"]
     assert large.notes == ["The field q is no output: it has 1201 vertices, more than 1000."]

@@ -111,5 +111,5 @@ def test_the_width_counts():
 @pytest.mark.slow
 def test_a_law_without_covariance():
     model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
-    with pytest.raises(lp.errors.ConfigurationError, match="run SensitivityLaw"):
+    with pytest.raises(lp.errors.ConfigurationError, match="use SensitivityLaw"):
         identifiability(model, replace(belief, q_factor=None))

@@ -120,11 +120,12 @@ def test_all_forms_say_the_same():
     each = [identifier() for _ in range(4)]
     for t, z, std in stream(8):
         a, b = zip(z.tolist(), std.tolist(), strict=True)
+        each[3].run([lp.Sample(t, np.array([a, b]))])
         found = [
             each[0].step(t, {"a": a, "b": b}),
             each[1].step(t, [a, b]),
             each[2].step(t, {"a": a[0], "noise of a": a[1], "b": b}),
-            each[3].run([lp.Sample(t, np.array([a, b]))]).last,
+            each[3].estimate(),
         ]
         assert all(same(found[0], other) for other in found[1:])
 

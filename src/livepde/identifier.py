@@ -501,7 +501,9 @@ class Identifier:
         hidden = np.full(self.withheld.size if self.withheld else 0, np.nan)
         belief = self._belief()
         moment = Moment(self._t, self._inputs)
-        report = Report(Status(), self.observed.predict(belief.u, belief.q, moment))
+        predicted = self.observed.predict(belief.u, belief.q, moment)
+        known = partial(self.law.diagnosed, self._work, self._state)
+        report = Report(Status(), predicted, diagnose=known)
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
     def settled(self, estimate: Estimate) -> Estimate:

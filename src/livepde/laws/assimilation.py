@@ -130,6 +130,12 @@ class Assimilation(NamedTuple):
         return Decision(self.refused, none if self.anchored is None else self.anchored)
 
 
+def without_sample(x: FilterState, sensors: int) -> Assimilation:
+    """Return what a sample without readings has brought."""
+    nothing, none = np.zeros((len(x), sensors)), np.zeros((len(x), sensors), dtype=bool)
+    return Assimilation(nothing, 0, OK, np.ones(len(x), dtype=bool), none, 0.0)
+
+
 @dataclass(frozen=True)
 class UpdateOptions:
     """Predict and update with the options of a law.

@@ -427,6 +427,10 @@ class Law(ABC, Generic[Work, State]):
         """Return the last fit of all stored samples, None for a law without."""
         return None
 
+    def diagnosed(self, work: Work, state: State) -> Diagnostics[float]:
+        """Return what is known of the estimate beside it between two samples."""
+        return Diagnostics()
+
     def weighs_readings(self) -> bool:
         """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
         return False

@@ -242,7 +242,7 @@ class _Search:
     def _bend(self, one: Passed, step: Array) -> Array:
         """Return J' d2r/ds2 of the residuals r along a step, by a difference; zero if it fails."""
         near = self.samples.residuals(one.xi + CLOSE * step)
-        self.passes += 1.0 / (1 + len(step))
+        self.passes += 1.0 / (1 + int(self.samples.alive.sum()))
         if near is None:
             return np.zeros(len(step))
         J = one.slopes[self.used]
@@ -274,8 +274,7 @@ class _Search:
 
     def screen(self) -> None:
         """Search from the best of some points of the prior."""
-        points = SPREAD * _normal(SCREENED, self.samples.state.start.C.shape[1])
-        points = np.array([self.samples.within_bounds(one) for one in points])
+        points = self._spread(SPREAD * _normal(SCREENED, int(self.samples.alive.sum())))
         costs, taken = self.samples.costs(points, self.used)
         self.passes += taken
         order = np.argsort(costs)
@@ -288,6 +287,13 @@ class _Search:
             if not self.suspicious:
                 return
 
+    def _spread(self, points: Array) -> Array:
+        """Return points in all coordinates, within the bounds of the unknowns."""
+        alive = self.samples.alive
+        whole = np.zeros((len(points), len(alive)))
+        whole[:, alive] = points
+        return np.array([self.samples.within_bounds(one) for one in whole])
+
     def _known(self, xi: Array) -> bool:
         """True if a point is at the best trajectory, within a posterior standard deviation."""
         if self.best is None:
@@ -298,8 +304,8 @@ class _Search:
 
     def draw(self) -> None:
         """Search from drawn points, before it is given up."""
-        size = self.samples.state.start.C.shape[1]
-        for xi in LAST_SPREAD * np.random.default_rng(0).standard_normal((LAST, size)):
+        drawn = np.random.default_rng(0).standard_normal((LAST, int(self.samples.alive.sum())))
+        for xi in self._spread(LAST_SPREAD * drawn):
             self.descend(xi)
             if not self.suspicious:
                 return

@@ -16,6 +16,7 @@ from livepde.laws.assimilation import (
     UpdateOptions,
     absorb,
     assimilate,
+    without_sample,
 )
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
@@ -49,6 +50,7 @@ from livepde.laws.sensitivity_state import (
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.verdict import judge_of, judged, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
@@ -463,6 +465,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def fit(self, work: SensitivityWork, state: SensitivityState) -> Fit | None:
         return state.fit.member(0)
+
+    def diagnosed(self, work: SensitivityWork, state: SensitivityState) -> Diagnostics[float]:
+        told = without_sample(state.now, work.filter.problem.observed.size)
+        return reports_of(work, state.now, told).member(0).diagnostics
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         return settle(work, state)[0]

@@ -103,6 +103,12 @@ class StoredSamples:
         return np.array([span.z1[0] for span in self.spans]) / self.noise
 
     @cached_property
+    def alive(self) -> Mask:
+        """Rows of the square root at the start that are not zero, as padding is, shape (r,)."""
+        at = self.placed(np.zeros((1, self.state.start.C.shape[1])), rows=True)
+        return np.asarray(at.C[0].any(axis=1) | at.U[0].any(axis=1))
+
+    @cached_property
     def missing(self) -> Array:
         """NaN for each reading, (samples, sensors)."""
         return np.full(self.readings.shape, np.nan)
@@ -236,7 +242,7 @@ class StoredSamples:
                 if not (found[part] < limit).any():
                     whole[part] = False
                     break
-        columns = 1 + self.state.start.C.shape[1]
+        columns = 1 + int(self.alive.sum())
         cost = np.where(whole & np.isfinite(found), found, np.inf)
         return cost, taken / (columns * max(len(self.spans), 1))
 
