@@ -50,7 +50,7 @@ class GradientParts:
     ----------
     problem, newton, damping
         As given.
-    M_op, N_op, nu, at_estimate
+    M_op, N_op, nu
         As for `StageForms`.
     observed, metric
         Rules for u_alpha and for the metric of Q.
@@ -74,7 +74,6 @@ class GradientParts:
     gate: ExcitationGate | None = None
     probes: Probes | None = None
     memory: Pattern | None = None
-    at_estimate: bool = False
     tests: EquationTests | None = None
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
@@ -83,15 +82,13 @@ class GradientParts:
         return self._stages.get(present.tobytes(), lambda: self._made(present))
 
     def _made(self, present: Array) -> CoupledStage:
-        forms = StageForms(
-            self.problem.model,
-            self.problem.observed.split(present),
-            self.M_op,
-            self.N_op,
-            self.nu,
-            self.at_estimate,
-        )
-        return CoupledStage(StageTerms(forms, self.damping, self.memory), self.newton)
+        terms = StageTerms(self.forms(present), self.damping, self.memory)
+        return CoupledStage(terms, self.newton)
+
+    def forms(self, present: Array) -> StageForms:
+        """Return the forms of the stage for the sensors present."""
+        split = self.problem.observed.split(present)
+        return StageForms(self.problem.model, split, self.M_op, self.N_op, self.nu)
 
     def prepared(self) -> GradientParts:
         """Return the same with the stage of all sensors prepared, before the first sample comes."""
@@ -219,7 +216,6 @@ def constant_parts(
     nu: float = 0.0,
     sigma: float = 0.0,
     gate: ExcitationGate | None = None,
-    at_estimate: bool = False,
 ) -> GradientParts:
     """Return the parts of a law with a constant gain."""
     _require_linear_readings(problem)
@@ -236,7 +232,6 @@ def constant_parts(
         metric=ConstantMetric(problem.model, gain, sigma),
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
-        at_estimate=at_estimate,
     ).prepared()
 
 

@@ -118,7 +118,7 @@ class BilinearSolver(MonolithicSolver):
         terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
         u, q, c = y[:n], y[n:], data.problem.c
         r = forms.split.project(u) - data.problem.u_alpha
-        w = u if forms.at_estimate else u - r
+        w = forms.argument(u, r)
         coupling_in, coupling_out = self._coupling
         if data.inside is not None:
             (A, transposed), flux = data.inside.A, data.inside.flux

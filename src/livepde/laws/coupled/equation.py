@@ -465,7 +465,7 @@ class StageSolver(ABC):
         model, moment = forms.model, data.problem.moment
         u, q = y[:n], y[n:]
         r = forms.split.project(u) - data.problem.u_alpha
-        w = u if forms.at_estimate else u - r  # u_alpha + P u, since P = I - R
+        w = forms.argument(u, r)
         if data.inside is not None:
             A_in, flux = data.inside.A, data.inside.flux
             driven = A_in @ q
