@@ -12,8 +12,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from experiments.related_laws import BaumeisterLaw, KueglerLaw, _FormsAtEstimate, _Linear
 from experiments.relatives import EXPECTED, LAWS, law, relatives
-from livepde.laws.coupled import CoupledStage, StageProblem, StageTerms
-from livepde.laws.metrics import ConstantMetric
+from livepde.laws.coupled import CoupledStage, Metric, StageProblem, StageTerms
 from livepde.model import mass_form
 from livepde.stepping import Newton
 from livepde.streams import Twin
@@ -98,7 +97,7 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     c = 0.3 * rng.standard_normal(n + model.Q.dim)
     c[:n] *= model.X.free
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-    metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
+    metric = Metric(1.0 / gain)
     problem = StageProblem(c, h, lp.fem.Moment(0.2), u_alpha, metric)
     y = stage.solve(problem, lambda: np.zeros_like(c))[0].y
     u, q = y[:n], y[n:]

@@ -159,7 +159,7 @@ class StageSequence:
         carries, moment = self.coupled.carries, self.path.interval.at(t)
         # A shorter step makes up for its share only: in no time the rest would be an impulse.
         left = min(1.0, self.width / h) * self.left if carries else None
-        problem = StageProblem(c, h, moment, u_alpha, self.metric(c[n:], h), left)
+        problem = StageProblem(c, h, moment, u_alpha, self.metric(h), left)
         # The observed part moves with the data, the rest as in the step before.
         follows = c.copy()
         follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u
@@ -229,7 +229,7 @@ def constant_parts(
         N_op=N_op,
         nu=nu,
         observed=inverse,
-        metric=ConstantMetric(problem.model, gain, sigma),
+        metric=ConstantMetric(gain, sigma),
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
     ).prepared()
