@@ -345,7 +345,7 @@ def _iterations(model: Model, c1: float, gain: float) -> tuple[int, tuple[str, s
         )
     u = model.initial(_bump)
     c = np.concatenate([u, model.initial_parameter(0.5)])
-    metric = Metric(1.0 / (gain * STEP), 0.0, np.zeros(model.Q.dim))
+    metric = Metric(1.0 / gain)
     data = blocks.data(StageProblem(c, STEP, Moment(STEP), split.project(u), metric))
     at = blocks.evaluate(data, c)
     _, count = blocks.factor(data, at).iterate(at.residual, TOLERANCE)

@@ -1,9 +1,10 @@
 """Comparison of the paper's law with two related laws on the same data.
 
 The paper's example and the excited twin, exact discrete data, all of the state and a part of it
-observed; the laws of Boiger and Kaltenbacher (2016), Baumeister et al. (1997) and Kügler (2010)
-through the same model, observation and coupled stage, each with one gain and three pulls, all with
-the strict steps of `livepde.paper`. The slopes at the ends are kept.
+observed; the law of Boiger and Kaltenbacher (2016), and the laws of Baumeister et al. (1997) and
+Kügler (2010) as their paper describes them, through the same model, observation and coupled stage,
+each with one gain and three pulls, all with the strict steps of `livepde.paper`. The slopes at the
+ends are kept.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+from experiments.related_laws import BaumeisterLaw, KueglerLaw
 from livepde import paper, plots
 from livepde.errors import LawError
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, BaumeisterLaw, KueglerLaw, ResidualDamping
+from livepde.laws import AnyLaw, ResidualDamping
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Track, failures, track

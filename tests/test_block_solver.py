@@ -13,10 +13,9 @@ import livepde as lp
 from benchmarks import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled import StageProblem, block_factors
+from livepde.laws.coupled import Metric, StageProblem, block_factors
 from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.block_factors import BlockJacobian, BlockSolver
-from livepde.laws.metrics import ConstantMetric
 from livepde.linalg import choice
 
 EXACT = lp.stepping.Newton(tolerance=1e-11, share=0.0)
@@ -152,7 +151,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     assert isinstance(stage.solver, BlockSolver)
     u = model.initial(lambda x: 2.0 + x[0] * (1 - x[0]) * x[1] * (1 - x[1]))
     c = np.concatenate([u, model.initial_parameter(0.5)])
-    metric = ConstantMetric(model, gain, 0.0).stage(c[model.X.dim :], 0.05, gain, 0.0)
+    metric = Metric(1.0 / gain)
     u_alpha = stage.terms.forms.split.R @ u
     data = stage.solver.data(StageProblem(c, 0.05, Moment(0.05), u_alpha, metric))
     return stage.solver, data, c

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -23,9 +23,10 @@ from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
 
 import livepde as lp
 from livepde.fem import Moment
-from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
+from livepde.laws.coupled import CoupledStage, Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled import coupled_stage as stage_module
-from livepde.laws.metrics import ConstantMetric
+from livepde.laws.coupled.bilinear import BilinearSolver
+from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.model import h1_form
 from livepde.stepping import ForwardStage, Near, StepFailed
 
@@ -222,7 +223,7 @@ def a_stage(rule, gain=50.0, nu=0.4, sigma=0.3, size=1.0, h=0.3, seed=0, newton=
     c = rng.standard_normal(n + model.Q.dim)
     c[:n] *= size * model.X.free
     u_alpha = split.R @ (size * model.initial(lambda x: excited_u(x, 0.3)))
-    metric = ConstantMetric(model, gain, sigma).stage(c[n:], h, gain, sigma)
+    metric = Metric(1.0 / gain, sigma)
     problem = StageProblem(c, h, Moment(0.3), u_alpha, metric)
     given = (c, h, u_alpha, model.F(Moment(0.3)) * model.X.free)
     return stage_of(model, split, rule, newton, nu), problem, dense, given
@@ -245,6 +246,24 @@ def test_stage_solves_its_equations(rule, nu):
     y = solved(stage, problem, problem.c.copy)
     assert dense.relative(y, *given) <= 1e-12
     assert dense.relative(y + 1e-6 * problem.c, *given) > 1e-9  # which would show a wrong solution
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_products_made_ahead_state_the_same_equation(left):
+    """Residual, its size and the Jacobian are those of the forms, at any point."""
+    stage, problem, *_ = a_stage(lp.laws.ResidualDamping(3.0))
+    rng = np.random.default_rng(3)
+    y = problem.c + 0.1 * rng.standard_normal(len(problem.c))
+    if left:
+        problem = replace(problem, left=0.1 * rng.standard_normal(len(y)))
+    found = []
+    for solver in (stage.solver, MonolithicSolver(stage.terms)):
+        data = solver.data(problem)
+        at = solver.evaluate(data, y)
+        update = solver.factor(data, at).solve(at.residual)
+        found.append(np.concatenate([at.residual, [at.size, *at.scales], update]))
+    assert isinstance(stage.solver, BilinearSolver)
+    np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-12 * np.abs(found[0]).max())
 
 
 @pytest.mark.slow
@@ -550,8 +569,7 @@ def free_stage(model, rule=None):
     stage = stage_of(model, split, rule or lp.laws.ResidualDamping())
 
     def problem(c, h=0.1):
-        metric = ConstantMetric(model, 1.0, 0.0).stage(c[model.X.dim :], h, 1.0, 0.0)
-        return StageProblem(c, h, Moment(h), np.zeros(model.X.dim), metric)
+        return StageProblem(c, h, Moment(h), np.zeros(model.X.dim), Metric(1.0))
 
     return stage, problem
 

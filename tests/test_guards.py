@@ -326,6 +326,21 @@ def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: floa
 
 
 @pytest.mark.slow
+def test_a_rest_without_the_gate_loses_what_was_learned():
+    """Relative errors against the truth: at the start of the rest, and after 30 s of it."""
+    model = reaction(lambda t: 1.0 * (t < 20.0))
+    stream = list(full(model, 1000))
+
+    def error(c: Any) -> float:
+        true = 2 + np.sin(np.pi * c["x"].values)
+        return float(np.linalg.norm(c.values - true) / np.linalg.norm(true))
+
+    held, free = (learned(model, stream, **o)["c"] for o in ({}, {"gate": None}))
+    assert error(held[-1]) < 1.2 * error(held[399])
+    assert error(free[-1]) > 7.0 * error(held[-1])
+
+
+@pytest.mark.slow
 def test_the_law_goes_on_when_excitation_returns():
     model = reaction(lambda t: 1.0 * (t < 2.0 or t > 20.0))
     data = learned(model, full(model, 1000), gain=1.0)

@@ -1,4 +1,4 @@
-"""Baumeister et al. (1997) and Kügler (2010) as laws."""
+"""The laws of the experiment: Baumeister et al. (1997) and Kügler (2010)."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from factories import excited, excited_q, excited_u, laplace, observe, reaction
 from skfem import ElementLineP1
 
 import livepde as lp
+from experiments.related_laws import BaumeisterLaw, KueglerLaw, _FormsAtEstimate, _Linear
 from experiments.relatives import EXPECTED, LAWS, law, relatives
-from livepde.laws.coupled import CoupledStage, StageForms, StageProblem, StageTerms
-from livepde.laws.metrics import ConstantMetric
-from livepde.laws.related_laws import _Linear
+from livepde.laws.coupled import CoupledStage, Metric, StageProblem, StageTerms
 from livepde.model import mass_form
 from livepde.stepping import Newton
 from livepde.streams import Twin
@@ -42,9 +41,9 @@ def identifier(model: lp.Model, observation: lp.observation.Observation, law: An
 @pytest.mark.parametrize(
     ("law", "observation"),
     [
-        (lp.laws.BaumeisterLaw(100.0), lp.Full()),
-        (lp.laws.KueglerLaw(100.0), lp.Full()),
-        (lp.laws.KueglerLaw(100.0), PART),
+        (BaumeisterLaw(100.0), lp.Full()),
+        (KueglerLaw(100.0), lp.Full()),
+        (KueglerLaw(100.0), PART),
     ],
 )
 def test_contract(law: Any, observation: lp.observation.Observation) -> None:
@@ -68,14 +67,14 @@ def test_energy_falls_with_exact_data(name: str) -> None:
 
 def test_baumeister_refuses_partial_data() -> None:
     with pytest.raises(lp.errors.LawError, match=r"all of the state; .* Use GradientLaw"):
-        identifier(excited(10), PART, lp.laws.BaumeisterLaw())
+        identifier(excited(10), PART, BaumeisterLaw())
 
 
 def test_baumeister_is_the_papers_law_with_a_linear_pull() -> None:
     """With R = I, (est_exact_q) and (est_exact_u) with theta = mu."""
     model = excited(10)
     paper = identifier(model, lp.Full(), lp.GradientLaw(100.0, _Linear(2.0)))
-    other = identifier(model, lp.Full(), lp.laws.BaumeisterLaw(100.0, 2.0))
+    other = identifier(model, lp.Full(), BaumeisterLaw(100.0, 2.0))
     for sample in twin(model, lp.Full()):
         one, two = paper.step(sample.t, sample.z), other.step(sample.t, sample.z)
     assert np.array_equal(one.q, two.q)
@@ -92,13 +91,13 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     model = reaction(lp.interval(0.0, 1.0, 10), ElementLineP1(), B=B)
     observed = observe(model, PART)
     split, gain, mu, h = observed.split(), 50.0, 3.0, 0.2
-    forms = StageForms(model, split, None, None, 0.0, at_estimate=True)
+    forms = _FormsAtEstimate(model, split, None, None, 0.0)
     stage = CoupledStage(StageTerms(forms, _Linear(mu)), Newton(tolerance=1e-12, share=0.0))
     rng, n = np.random.default_rng(0), model.X.dim
     c = 0.3 * rng.standard_normal(n + model.Q.dim)
     c[:n] *= model.X.free
     u_alpha = split.R @ model.initial(lambda x: excited_u(x, 0.3))
-    metric = ConstantMetric(model, gain, 0.0).stage(c[n:], h, gain, 0.0)
+    metric = Metric(1.0 / gain)
     problem = StageProblem(c, h, lp.fem.Moment(0.2), u_alpha, metric)
     y = stage.solve(problem, lambda: np.zeros_like(c))[0].y
     u, q = y[:n], y[n:]
@@ -114,14 +113,14 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     assert np.abs(learned * model.Q.free).max() < 1e-10
 
 
-@pytest.mark.parametrize("kind", [lp.laws.BaumeisterLaw, lp.laws.KueglerLaw])
+@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
 @pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": np.inf}, {"mu": -1.0}, {"mu": np.nan}])
 def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
     with pytest.raises(lp.errors.LawError, match="must be a number"):
         kind(**options)
 
 
-@pytest.mark.parametrize("kind", [lp.laws.BaumeisterLaw, lp.laws.KueglerLaw])
+@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
 def test_no_sensor_of_the_parameter(kind: Any) -> None:
     model = lp.Model(
         lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),

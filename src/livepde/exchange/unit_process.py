@@ -14,7 +14,7 @@ from livepde.cases import Case
 from livepde.cases.units import conversion
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.identifier import Identifier
-from livepde.laws import BaumeisterLaw, GradientLaw, KueglerLaw
+from livepde.laws import GradientLaw
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.records import STATUS_CODES
@@ -287,4 +287,4 @@ def _ports(observed: Observed, text: str) -> list[Port]:
 
 
 def _has_covariance(law: object) -> bool:
-    return not isinstance(law, GradientLaw | BaumeisterLaw | KueglerLaw)
+    return not isinstance(law, GradientLaw)

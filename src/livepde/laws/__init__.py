@@ -31,14 +31,12 @@ from livepde.laws.law import (
     stepped,
 )
 from livepde.laws.refit_options import Refit
-from livepde.laws.related_laws import BaumeisterLaw, KueglerLaw
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows
 from livepde.laws.step_diagnostics import Diagnostics
 
 __all__ = [
     "AnyLaw",
-    "BaumeisterLaw",
     "Belief",
     "ConstantDamping",
     "Constants",
@@ -52,7 +50,6 @@ __all__ = [
     "Guards",
     "InitialReading",
     "Jumps",
-    "KueglerLaw",
     "Law",
     "MemberReports",
     "NoisyBound",

@@ -72,6 +72,9 @@ class GradientLaw(Law[GradientParts, GradientState]):
         q' = gain A(w)* r - sigma q,            w = u_alpha + P u,  r = R u - u_alpha
         M u' + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
 
+    `StageSolver.evaluate` of `livepde.laws.coupled.equation` has these two lines, as one implicit
+    step solves them for every model.
+
     u_alpha = G^+ z, or G_alpha z if the observation has a `reconstruction` that regularises: then
     these are (noisy_q) and (noisy_u), and the diagnostics of each report hold alpha and the misfit
     ||G u_alpha - z||_Z. For a `Subdomain` the integrals are split as the paper splits them: over

@@ -50,7 +50,7 @@ class GradientParts:
     ----------
     problem, newton, damping
         As given.
-    M_op, N_op, nu, at_estimate
+    M_op, N_op, nu
         As for `StageForms`.
     observed, metric
         Rules for u_alpha and for the metric of Q.
@@ -74,7 +74,6 @@ class GradientParts:
     gate: ExcitationGate | None = None
     probes: Probes | None = None
     memory: Pattern | None = None
-    at_estimate: bool = False
     tests: EquationTests | None = None
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
@@ -83,15 +82,13 @@ class GradientParts:
         return self._stages.get(present.tobytes(), lambda: self._made(present))
 
     def _made(self, present: Array) -> CoupledStage:
-        forms = StageForms(
-            self.problem.model,
-            self.problem.observed.split(present),
-            self.M_op,
-            self.N_op,
-            self.nu,
-            self.at_estimate,
-        )
-        return CoupledStage(StageTerms(forms, self.damping, self.memory), self.newton)
+        terms = StageTerms(self.forms(present), self.damping, self.memory)
+        return CoupledStage(terms, self.newton)
+
+    def forms(self, present: Array) -> StageForms:
+        """Return the forms of the stage for the sensors present."""
+        split = self.problem.observed.split(present)
+        return StageForms(self.problem.model, split, self.M_op, self.N_op, self.nu)
 
     def prepared(self) -> GradientParts:
         """Return the same with the stage of all sensors prepared, before the first sample comes."""
@@ -162,7 +159,7 @@ class StageSequence:
         carries, moment = self.coupled.carries, self.path.interval.at(t)
         # A shorter step makes up for its share only: in no time the rest would be an impulse.
         left = min(1.0, self.width / h) * self.left if carries else None
-        problem = StageProblem(c, h, moment, u_alpha, self.metric(c[n:], h), left)
+        problem = StageProblem(c, h, moment, u_alpha, self.metric(h), left)
         # The observed part moves with the data, the rest as in the step before.
         follows = c.copy()
         follows[:n] += u_alpha - self.path.at(max(t - h, self.path.interval.t0)).u
@@ -219,7 +216,6 @@ def constant_parts(
     nu: float = 0.0,
     sigma: float = 0.0,
     gate: ExcitationGate | None = None,
-    at_estimate: bool = False,
 ) -> GradientParts:
     """Return the parts of a law with a constant gain."""
     _require_linear_readings(problem)
@@ -233,10 +229,9 @@ def constant_parts(
         N_op=N_op,
         nu=nu,
         observed=inverse,
-        metric=ConstantMetric(problem.model, gain, sigma),
+        metric=ConstantMetric(gain, sigma),
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
-        at_estimate=at_estimate,
     ).prepared()
 
 

@@ -287,14 +287,15 @@ class InformationMetric(MetricRule[Information]):
         prior = state.spread * self.model.Q.dual(begin.q - state.origin)
         left = state.right.sum(axis=0) - J @ begin.q - prior
         load = left / (PULL * begin.length)
-        return lambda c, h: Metric(state.spread / PULL, 0.0, h * load, held, PULL / h)
+        weight = state.spread / PULL
+        return lambda h: Metric(h * weight, 0.0, h * load, held, PULL / h)
 
     def frozen(self, state: Information, forms: StageForms, begin: StepBegin) -> MetricStep:
         A = forms.A_in.data("v", "q", begin.moment, u=begin.w, q=begin.q)
         trace = float(self.normal(forms).trace(A, self.probes).sum())
         spread = HELD * max(state.spread, begin.length * trace) or 1.0
-        held, load = state.held / PULL, np.zeros_like(begin.q)
-        return lambda c, h: Metric(spread / PULL, 0.0, load, held, PULL / h)
+        held, weight = state.held / PULL, spread / PULL
+        return lambda h: Metric(h * weight, 0.0, None, held, PULL / h)
 
     def normal(self, forms: StageForms) -> NormalEquations:
         """Return the contribution of the samples of a stage to the normal equations."""

@@ -1,7 +1,7 @@
 """The metric of Q in which q learns: a constant gain, or the information that the data have given.
 
-The second line (est_exact_q) reads q' = gain G_Q^{-1} A(w)^T r in coefficients. A rule gives the
-operator in the place of G_Q/gain for each stage, and carries its statistics from sample to sample.
+A rule returns the `Metric` of the second line for each stage, and carries its statistics from
+sample to sample.
 """
 
 from __future__ import annotations
@@ -11,21 +11,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-import numpy as np
-
 from livepde.fem import Moment
 from livepde.laws.coupled import Metric
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
-from livepde.model import Model
 
 __all__ = ["ConstantMetric", "MetricRule", "MetricStep", "NoState", "StepBegin", "Transition"]
 
 HOLD = 1e12  # times smaller is a gain that keeps q where it is
 
-MetricStep = Callable[[Array, float], Metric]
-"""(c_q, h) -> the metric of a stage that begins at c_q."""
+MetricStep = Callable[[float], Metric]
+"""Step h of a stage -> its metric."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +109,8 @@ class MetricRule(ABC, Generic[State]):
 
 @dataclass(frozen=True, eq=False)
 class ConstantMetric(MetricRule[NoState]):
-    """G_Q/gain, and the stabilising term of (noisy_q): q' = gain G_Q^{-1} A(w)^T r - sigma q.
+    """G_Q/gain, and the stabilising term sigma q of (noisy_q)."""
 
-    An unknown that moves by itself adds K (q - prior), with its generator K.
-    """
-
-    model: Model
     gain: float
     sigma: float
 
@@ -125,20 +118,7 @@ class ConstantMetric(MetricRule[NoState]):
         return NoState()
 
     def step(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
-        return lambda c, h: self.stage(c, h, self.gain, self.sigma)
+        return lambda _: Metric(1.0 / self.gain, self.sigma)
 
     def frozen(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
-        return lambda c, h: self.stage(c, h, self.gain / HOLD, 0.0)
-
-    def stage(self, c: Array, h: float, gain: float, sigma: float) -> Metric:
-        """Return the metric of a stage that begins at c."""
-        latent, Q = self.model.latent, self.model.Q
-        # G_Q ((q - c)/h + sigma q)/gain = A(w)^T r as an equation for q - c: the terms in c are
-        # loads.
-        load = np.zeros_like(c)
-        if sigma:
-            load = load - Q.dual(c) * (sigma / gain)
-        if latent.generator.nnz:
-            load = load + Q.dual(latent.generator @ (c - latent.prior)) / gain
-        drift = 1.0 / gain if latent.generator.nnz else 0.0
-        return Metric((1.0 / h + sigma) / gain, drift, load)
+        return lambda _: Metric(HOLD / self.gain)

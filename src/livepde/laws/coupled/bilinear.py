@@ -9,13 +9,8 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.laws.coupled.equation import (
-    Inside,
-    StageData,
-    StageIterate,
-    StageProblem,
-    StageTerms,
-)
+from livepde.fem import Moment
+from livepde.laws.coupled.equation import Inside, StageData, StageIterate, StageTerms
 from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.laws.coupled.split_forms import AnyForm
 from livepde.linalg import Array, Pattern, compact
@@ -24,7 +19,10 @@ __all__ = ["BilinearSolver"]
 
 
 class BilinearSolver(MonolithicSolver):
-    """A residual is a few products with small or sparse matrices, and no form is evaluated."""
+    """A, B and the Jacobian by products with small or sparse matrices: no form is evaluated.
+
+    The equation is that of `StageSolver.evaluate`.
+    """
 
     @classmethod
     def of(cls, terms: StageTerms) -> BilinearSolver | None:
@@ -44,14 +42,13 @@ class BilinearSolver(MonolithicSolver):
 
     def prepare(self) -> None:
         super().prepare()
-        _ = self._products, self._coupling, self._jacobian, self._fixed_data
+        _ = self._coupling, self._slopes, self._offset, self._jacobian, self._fixed_data
 
     @cached_property
     def _coupling(self) -> tuple[_Coupling, _Coupling | None]:
         """A(w) over omega as a function of w, and outside of it as one of u."""
-        forms, terms = self.terms.forms, self.terms
-        inside = _Coupling.of(forms.A_in, terms)
-        return inside, None if forms.A_out is None else _Coupling.of(forms.A_out, terms)
+        forms = self.terms.forms
+        return _Coupling.of(forms.A_in), None if forms.A_out is None else _Coupling.of(forms.A_out)
 
     @cached_property
     def _jacobian(self) -> sp.csr_array:
@@ -73,16 +70,17 @@ class BilinearSolver(MonolithicSolver):
         return sp.csr_array(sp.hstack([by_w, by_u, by_q, by_r]))
 
     @cached_property
-    def _slopes(self) -> tuple[sp.csr_array, sp.csr_array, Array]:
-        """B' over omega, and elsewhere with nu N; and B(0), on the free coefficients."""
-        forms, free = self.terms.forms, sp.diags_array(self.terms.free)
-        zero = np.zeros(self.terms.n)
-        inside = free @ forms.B_in.matrix("v", "u", u=zero)
-        outside = forms.hidden
-        if forms.B_out is not None:
-            outside = outside + forms.B_out.matrix("v", "u", u=zero)
-        offset = self.terms.free * forms.model.B(zero)
-        return sp.csr_array(inside), sp.csr_array(free @ outside), offset
+    def _slopes(self) -> tuple[Any, Any]:
+        """B' over omega, and elsewhere."""
+        forms, zero = self.terms.forms, np.zeros(self.terms.n)
+        outside = None if forms.B_out is None else forms.B_out.matrix("v", "u", u=zero)
+        inside = compact(forms.B_in.matrix("v", "u", u=zero))
+        return inside, None if outside is None else compact(outside)
+
+    @cached_property
+    def _offset(self) -> Array:
+        """B(0), shape (n,)."""
+        return self.terms.forms.model.B(np.zeros(self.terms.n))
 
     @cached_property
     def _fixed_data(self) -> Array:
@@ -95,62 +93,18 @@ class BilinearSolver(MonolithicSolver):
             found += self.maps["B_out"] @ forms.B_out.data("v", "u", u=zero)
         return found
 
-    @cached_property
-    def _products(self) -> dict[str, sp.csr_array | Array]:
-        forms, free = self.terms.forms, sp.diags_array(self.terms.free)
-        return {
-            "M": compact(sp.csr_array(free @ forms.model.mass)),
-            "r": compact(sp.csr_array(sp.vstack([forms.pull, forms.mass]))),
-            "G": compact(sp.csr_array(sp.diags_array(self.terms.free_q) @ self.terms.gram)),
-            "B_in": compact(self._slopes[0]),
-            "B_out": compact(self._slopes[1]),
-        }
+    def source(self, moment: Moment) -> Array:
+        return super().source(moment) - self._offset
 
-    def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        forms, inside = self.terms.forms, None
-        known = forms.model.F(problem.moment) * self.terms.free - self._slopes[2]
-        if forms.W is None:
-            w = forms.model.impose(problem.u_alpha, problem.moment) if w is None else w
-            inside = Inside(self._coupling[0].at(w), self._products["B_in"] @ w)
-        return self.terms.given(problem, known, inside)
+    def inside(self, moment: Moment, w: Array, q: Array | None = None) -> Inside:
+        A, transposed = self._coupling[0].at(w)
+        return Inside(A, transposed, self._slopes[0] @ w)
 
-    def evaluate(self, data: StageData, y: Array) -> StageIterate:
-        terms, forms, n, products = self.terms, self.terms.forms, self.terms.n, self._products
-        u, q, c = y[:n], y[n:], data.problem.c
-        r = forms.split.project(u) - data.problem.u_alpha
-        w = u if forms.at_estimate else u - r
-        coupling_in, coupling_out = self._coupling
-        if data.inside is not None:
-            (A, transposed), flux = data.inside.A, data.inside.flux
-        else:
-            (A, transposed), flux = coupling_in.at(w), products["B_in"] @ w
-        driven = A @ q
-        if coupling_out is not None:
-            driven = driven + coupling_out.matrix(u) @ q
-        # R^T M_op r and R^T M r by one product.
-        by_r = products["r"] @ r
-        Mr, mass_r = by_r[:n], by_r[n:]
-        norms = terms.norms(r, Mr, mass_r, data.observed)
-        theta = terms.theta(data, norms)
-        rate = products["M"] @ ((u - c[:n]) / data.problem.h)
-        pull = (theta * terms.free) * Mr
-        change, coupling = self.weighed(data, q - c[n:]), transposed @ r
-        residual = np.empty_like(y)
-        residual[:n] = rate + flux + products["B_out"] @ u + driven + pull - data.source
-        residual[n:] = change - (coupling + data.load) * terms.free_q
-        first = [residual[:n], rate, driven, pull]
-        second = [residual[n:], change, coupling]
-        accuracy = self.accuracy(data)
-        size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
-        return StageIterate(
-            y, residual, size, resolved, scales, w, r, None, theta, norms, Mr, mass_r
-        )
-
-    def weighed(self, data: StageData, change: Array) -> Array:
-        if data.problem.metric.drift:
-            return super().weighed(data, change) * self.terms.free_q
-        weighed: Array = self._products["G"] @ (data.problem.metric.scale * change)
-        return weighed if data.J is None else weighed + (data.J @ change) * self.terms.free_q
+    def outside(self, moment: Moment, u: Array, q: Array) -> tuple[Array, Array]:
+        coupling, slope = self._coupling[1], self._slopes[1]
+        if coupling is None:
+            return super().outside(moment, u, q)
+        return coupling.at(u)[0] @ q, slope @ u
 
     def changing(self, data: StageData, at: StageIterate) -> Array:
         n = self.terms.n
@@ -160,20 +114,14 @@ class BilinearSolver(MonolithicSolver):
 
 @dataclass(frozen=True, eq=False)
 class _Coupling:
-    """A(w) on the free coefficients, as a matrix whose data are linear in w."""
+    """A(w) as a matrix whose data are linear in w."""
 
     pattern: Pattern
     data: sp.csr_array | Array
 
     @classmethod
-    def of(cls, form: AnyForm, terms: StageTerms) -> _Coupling:
-        pattern = form.pattern("v", "q")
-        kept = terms.free[pattern.rows] * terms.free_q[pattern.indices]
-        return cls(pattern, compact(sp.csr_array(sp.diags_array(kept) @ _tensors(form)[0])))
-
-    def matrix(self, w: Array) -> Any:
-        """Return A(w); a small one is dense."""
-        return self.pattern.compact(self.data @ w)
+    def of(cls, form: AnyForm) -> _Coupling:
+        return cls(form.pattern("v", "q"), compact(_tensors(form)[0]))
 
     def at(self, w: Array) -> tuple[Any, Any]:
         """Return A(w) and its transpose; small ones are dense."""

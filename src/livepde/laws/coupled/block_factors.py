@@ -116,8 +116,7 @@ class BlockSolver(StageSolver):
         form, moment, h, n = forms.A_in, data.problem.moment, data.problem.h, terms.n
         u, q, free, free_q = at.y[:n], at.y[n:], terms.free, terms.free_q
         S = masked(sp.csr_array(forms.model.mass / h), free, free)
-        A_in = at.A_in if at.A_in is not None else form.matrix("v", "q", moment, u=at.w, q=q)
-        A = masked(A_in, free, free_q)
+        A = masked(at.A_in, free, free_q)
         back, curved = None, None
         if forms.W is not None:
             flux = forms.B_in.matrix("v", "u", moment, u=at.w)
@@ -150,11 +149,11 @@ class BlockSolver(StageSolver):
         terms, metric = self.terms, data.problem.metric
         rest = np.zeros(terms.auxiliary)
         free = np.concatenate([terms.free_q, 1.0 - rest])
-        H = terms.gram * metric.scale
+        H = terms.gram * metric.scale(data.problem.h)
         generator = terms.forms.model.latent.generator
-        if metric.drift and generator.nnz:
+        if generator.nnz:
             K = sp.block_diag([generator, sp.csr_array((len(rest), len(rest)))])
-            H = H - terms.gram @ (sp.csr_array(K) * metric.drift)
+            H = H - terms.gram @ (sp.csr_array(K) * metric.weight)
         if metric.information is not None and terms.memory is not None:
             H = H + _widened(terms.memory.matrix(metric.information), len(rest))
         return sp.csr_array(masked(sp.csr_array(H), free, free) + sp.diags_array(1.0 - free))

@@ -43,7 +43,7 @@ class KeptFactor:
     ----------
     y, u_alpha, h
         Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
-    scale, drift, information, theta
+    weight, sigma, information, theta
         Of its metric; `information` is empty and `theta` NaN without one.
     spent
         Updates that stages took since then, beyond one each.
@@ -52,8 +52,8 @@ class KeptFactor:
     y: Array
     u_alpha: Array
     h: float
-    scale: float
-    drift: float
+    weight: float
+    sigma: float
     information: Array
     theta: float
     spent: int
@@ -70,7 +70,7 @@ class KeptFactor:
         information = np.zeros(0) if metric.information is None else metric.information
         theta = math.nan if metric.theta is None else metric.theta
         made = y, problem.u_alpha, problem.h
-        return cls(*made, metric.scale, metric.drift, information, theta, 0)
+        return cls(*made, metric.weight, metric.sigma, information, theta, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,8 +217,7 @@ class CoupledStage:
             return last[1]
         information = kept.information if len(kept.information) else None
         theta = None if math.isnan(kept.theta) else kept.theta
-        load = np.zeros_like(problem.metric.load)
-        metric = Metric(kept.scale, kept.drift, load, information, theta)
+        metric = Metric(kept.weight, kept.sigma, None, information, theta)
         n = self.terms.n
         w = kept.u_alpha.copy()
         fixed = self.terms.forms.model.X.fixed

@@ -1,15 +1,17 @@
 """The nonlinear equation of one coupled stage: its residual, term by term, and when it is solved.
 
 With w = u_alpha + P u and r = R u - u_alpha, the unknowns y = (u, q) of one implicit Euler stage of
-(est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), solve
+(est_exact_q), (est_exact_u), or (noisy_q), (noisy_u), with u_t = (u - c_u)/h, q_t = (q - c_q)/h,
+solve
 
-    M (u - c_u)/h + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
-    H (q - c_q)                                                      = load + A(w)^T r
+    M u_t + B(w) + A(w) q + theta R^T M_op r + nu P^T N_op P u = F
+    G_Q (q_t + sigma q)/gain                                   = A(w)^T r
 
-together (`Metric` says what H and load are), so that with full data the two terms with A cancel in
-the energy, as in the paper (align:neplusnr). Over omega w is the data, elsewhere the estimate.
+together, so that with full data the two terms with A cancel in the energy, as in the paper
+(align:neplusnr). Over omega w is the data, elsewhere the estimate. `StageSolver.evaluate` has both
+lines. `Metric` lists what may stand in the second one besides.
 The remaining residual of the stage before, times the ratio of its step to this one, is subtracted
-from F and load: so the residuals of a run of stages do not add up.
+from both right-hand sides: so the residuals of a run of stages do not add up.
 
 theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
 in q, A(w) in the second line is its derivative.
@@ -31,7 +33,7 @@ from livepde.fem import Moment
 from livepde.laws.coupled.metric import Metric
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.damping import Damping, Residual
-from livepde.linalg import Array, Factor, Pattern
+from livepde.linalg import Array, Factor, Pattern, compact
 from livepde.stepping import TINY
 
 __all__ = ["Inside", "StageData", "StageIterate", "StageProblem", "StageSolver", "StageTerms"]
@@ -47,10 +49,11 @@ ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exa
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """Terms over omega that the data determine: A(w), a matrix or its data, B(w), shape (n,)."""
+    """Terms over omega: A(w) and its transpose, dense if small, and B(w), shape (n,)."""
 
     A: Any
-    flux: Array
+    transposed: Any
+    B: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +69,7 @@ class StageProblem:
     u_alpha
         Observed part of the state, shape (n,).
     metric
-        H and load of the second line.
+        Weights of the second line.
     left
         Remaining residual of the stage before, for which this one makes up, a dual vector, shape
         (n + m,); None: residuals are not carried from stage to stage.
@@ -90,11 +93,13 @@ class StageData:
         The stage.
     source, load
         F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
+    rest
+        Left side of the second line for a q that does not change, shape (m,).
     inside
         A and B over omega, where the data give all of w there.
     sizes
         Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of
-        F and of the load, or of changes by `RESTING` of c if these are larger.
+        F and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
     observed
         Function that returns the squared norms of u_alpha, computed once.
     J
@@ -104,6 +109,7 @@ class StageData:
     problem: StageProblem
     source: Array
     load: Array
+    rest: Array
     inside: Inside | None
     sizes: tuple[float, float, float]
     observed: Callable[[], Residual]
@@ -125,7 +131,7 @@ class StageIterate:
     w, r
         Argument of A and B over omega, and the observed residual, shape (n,).
     A_in
-        A(w) over omega, shape (n, m), where it is a matrix of its own.
+        A(w) over omega, shape (n, m).
     theta
         Weight of R^T M_op r.
     norms
@@ -141,7 +147,7 @@ class StageIterate:
     scales: tuple[float, float]
     w: Array
     r: Array
-    A_in: sp.csr_array | None
+    A_in: Any
     theta: float
     norms: Residual
     Mr: Array
@@ -278,14 +284,60 @@ class StageTerms:
 
         The remaining residual of the stage before is subtracted here.
         """
-        load, left = problem.metric.load, problem.left
+        metric, left, c_q = problem.metric, problem.left, problem.c[self.n :]
+        load = np.zeros_like(c_q) if metric.load is None else metric.load
         if left is not None:
             source, load = source - left[: self.n], load - left[self.n :]
         J = None
-        if problem.metric.information is not None and self.memory is not None:
-            J = self.memory.compact(problem.metric.information)
-        sizes, observed = self.sizes(problem, source, load), self.observed(problem.u_alpha)
-        return StageData(problem, source, load, inside, sizes, observed, J)
+        if metric.information is not None and self.memory is not None:
+            J = self.memory.compact(metric.information)
+        still = not (metric.sigma or self.moves)
+        rest = np.zeros_like(c_q) if still else self.learned(problem, c_q)
+        sizes, observed = self.sizes(problem, source, load - rest), self.observed(problem.u_alpha)
+        return StageData(problem, source, load, rest, inside, sizes, observed, J)
+
+    def learned(self, problem: StageProblem, q: Array, J: Any = None) -> Array:
+        """Return the left side of (est_exact_q), (noisy_q) over the gain, G_Q (q_t + sigma q)/gain.
+
+        Of unknowns that move by themselves less G_Q K (q - prior)/gain, and with the information
+        J (q - c_q). A dual vector, shape (m,).
+        """
+        metric, latent = problem.metric, self.forms.model.latent
+        change = q - problem.c[self.n :]
+        rate = change / problem.h + metric.sigma * q
+        if self.moves:
+            rate = rate - latent.generator @ (q - latent.prior)
+        learned: Array = metric.weight * self.dual(rate)
+        return learned if J is None else learned + J @ change
+
+    def dual(self, q: Array) -> Array:
+        """Return G_Q q."""
+        dual: Array = self.forms.model.Q.dual(q) if self.auxiliary else self._small_gram @ q
+        return dual
+
+    @cached_property
+    def _small_gram(self) -> Any:
+        return compact(self.gram)
+
+    @cached_property
+    def moves(self) -> bool:
+        """True if an unknown moves by itself."""
+        return bool(self.forms.model.latent.generator.nnz)
+
+    @cached_property
+    def mass(self) -> Any:
+        """M, dense if small, shape (n, n)."""
+        return compact(self.forms.model.mass)
+
+    @cached_property
+    def pull(self) -> Any:
+        """R^T M_op R over omega, dense if small, shape (n, n)."""
+        return compact(self.forms.pull)
+
+    @cached_property
+    def observed_mass(self) -> Any:
+        """R^T M R over omega, dense if small, shape (n, n)."""
+        return compact(self.forms.mass)
 
     def sizes(
         self, problem: StageProblem, source: Array, load: Array
@@ -294,7 +346,7 @@ class StageTerms:
         # Where nothing moves, all terms of a line are rounding errors, and none is a scale.
         unchanged = np.square(problem.c) * self.diagonal
         least = math.sqrt(float(unchanged[: self.n].sum())) / problem.h
-        least_q = math.sqrt(float(unchanged[self.n :].sum())) * problem.metric.scale
+        least_q = math.sqrt(float(unchanged[self.n :].sum())) * problem.metric.scale(problem.h)
         (own,) = self.duals([source], self.parts[0])
         (other,) = self.duals([load], self.parts[1])
         known = math.sqrt(float(self.lumped @ np.square(problem.u_alpha)))
@@ -310,7 +362,7 @@ class StageTerms:
 
         @cache
         def norms() -> Residual:
-            return self.norms(u_alpha, self.forms.pull @ u_alpha, self.forms.mass @ u_alpha)
+            return self.norms(u_alpha, self.pull @ u_alpha, self.observed_mass @ u_alpha)
 
         return norms
 
@@ -391,7 +443,8 @@ class StageTerms:
             first += abs(forms.A_out.matrix("v", "q", moment, q=at.y[n:], **own)) @ q
             first += abs(forms.B_out.matrix("v", "u", moment, **own)) @ u
         gram = abs(self.gram)[: len(q), : len(q)]
-        second = problem.metric.scale * (gram @ (q + c[n:])) + A.T @ (forms.split.R @ (u + v))
+        second = problem.metric.scale(problem.h) * (gram @ (q + c[n:]))
+        second += A.T @ (forms.split.R @ (u + v))
         (state,) = self.duals([first], self.parts[0])
         (other,) = self.duals([second], self.parts[1])
         return ROUNDING * state, ROUNDING * other
@@ -445,7 +498,7 @@ class StageSolver(ABC):
         """Compute the parts that do not depend on the samples."""
 
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        """Return a stage, with the terms over omega that the data alone determine.
+        """Return a stage, with the terms that do not depend on its solution.
 
         Parameters
         ----------
@@ -455,53 +508,59 @@ class StageSolver(ABC):
         forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:
             w = forms.model.impose(problem.u_alpha, moment) if w is None else w
-            A = forms.A_in.matrix("v", "q", moment, u=w)
-            inside = Inside(A, forms.B_in.vector("v", moment, u=w))
-        return self.terms.given(problem, forms.model.F(moment), inside)
+            inside = self.inside(moment, w)
+        return self.terms.given(problem, self.source(moment), inside)
 
     def evaluate(self, data: StageData, y: Array) -> StageIterate:
-        """Return the stage at y."""
-        terms, forms, n = self.terms, self.terms.forms, self.terms.n
-        model, moment = forms.model, data.problem.moment
+        """Return the stage at y = (u, q): (est_exact_u), (est_exact_q), or (noisy_u), (noisy_q).
+
+        These are the only lines that state the method. How A, B and F are computed is the matter of
+        `inside`, `outside` and `source`.
+        """
+        terms, forms, stage, n = self.terms, self.terms.forms, data.problem, self.terms.n
         u, q = y[:n], y[n:]
-        r = forms.split.project(u) - data.problem.u_alpha
-        w = u if forms.at_estimate else u - r  # u_alpha + P u, since P = I - R
-        if data.inside is not None:
-            A_in, flux = data.inside.A, data.inside.flux
-            driven = A_in @ q
-        else:
-            A_in = forms.A_in.matrix("v", "q", moment, u=w, q=q)
-            flux = forms.B_in.vector("v", moment, u=w)
-            driven = A_in @ q if terms.linear else forms.A_in.vector("v", moment, u=w, q=q)
-        if forms.B_out is not None and forms.A_out is not None:
-            flux = flux + forms.B_out.vector("v", moment, u=u)
-            driven = driven + forms.A_out.vector("v", moment, u=u, q=q)
+        r = forms.split.project(u) - stage.u_alpha
+        w = forms.argument(u, r)
+        inside = data.inside or self.inside(stage.moment, w, q)
+        A, B = inside.A, inside.B
+        Aq = A @ q if terms.linear else forms.A_in.vector("v", stage.moment, u=w, q=q)
+        if forms.A_out is not None:
+            more, flux = self.outside(stage.moment, u, q)
+            Aq, B = Aq + more, B + flux
         if forms.nu:
-            flux = flux + forms.hidden @ u
-        Mr, mass_r = forms.pull @ r, forms.mass @ r
+            B = B + forms.hidden @ u
+        Mr, mass_r = terms.pull @ r, terms.observed_mass @ r
         norms = terms.norms(r, Mr, mass_r, data.observed)
         theta = terms.theta(data, norms)
-        rate = model.mass @ ((u - data.problem.c[:n]) / data.problem.h)
-        pull = theta * Mr
-        change = self.weighed(data, q - data.problem.c[n:])
-        coupling = A_in.T @ r
+
+        u_t = terms.mass @ ((u - stage.c[:n]) / stage.h)
+        pull, coupling = theta * Mr, inside.transposed @ r
+        learned = terms.learned(stage, q, data.J)
         residual = np.empty_like(y)
-        # Both lines of the docstring of this module; rows of fixed coefficients are zero.
-        residual[:n] = (rate + flux + driven + pull - data.source) * terms.free
-        residual[n:] = (change - data.load - coupling) * terms.free_q
-        first = [residual[:n], rate, driven, pull]
-        second = [residual[n:], change, coupling]
+        # u' + A(w) q + B(w) + theta R^T M r + nu P^T N P u = f, and (q' + sigma q)/gain = A(w)* r;
+        # rows of fixed coefficients are zero.
+        residual[:n] = (u_t + Aq + B + pull - data.source) * terms.free
+        residual[n:] = (learned - coupling - data.load) * terms.free_q
+
+        first, second = [residual[:n], u_t, Aq, pull], [residual[n:], learned - data.rest, coupling]
         accuracy = self.accuracy(data)
         size, resolved, scales = terms.measured(data, first, second, norms.X, theta, accuracy)
-        return StageIterate(
-            y, residual, size, resolved, scales, w, r, A_in, theta, norms, Mr, mass_r
-        )
+        return StageIterate(y, residual, size, resolved, scales, w, r, A, theta, norms, Mr, mass_r)
 
-    def weighed(self, data: StageData, change: Array) -> Array:
-        """Return H times a change of q, a dual vector."""
-        model, metric = self.terms.forms.model, data.problem.metric
-        scaled = metric.scale * change
-        if metric.drift:
-            scaled = scaled - metric.drift * (model.latent.generator @ change)
-        weighed = model.Q.dual(scaled)
-        return weighed if data.J is None else weighed + data.J @ change
+    def source(self, moment: Moment) -> Array:
+        """Return F, less a constant part of B, shape (n,)."""
+        return self.terms.forms.model.F(moment)
+
+    def inside(self, moment: Moment, w: Array, q: Array | None = None) -> Inside:
+        """Return A(w) and B(w) over omega; q where A is not linear in it."""
+        forms = self.terms.forms
+        A = forms.A_in.matrix("v", "q", moment, **({"u": w} if q is None else {"u": w, "q": q}))
+        return Inside(A, A.T, forms.B_in.vector("v", moment, u=w))
+
+    def outside(self, moment: Moment, u: Array, q: Array) -> tuple[Array, Array]:
+        """Return A(u) q and B(u) outside of omega, shape (n,)."""
+        forms = self.terms.forms
+        if forms.A_out is None or forms.B_out is None:
+            return np.zeros_like(u), np.zeros_like(u)
+        driven = forms.A_out.vector("v", moment, u=u, q=q)
+        return driven, forms.B_out.vector("v", moment, u=u)

@@ -1,4 +1,4 @@
-"""The metric of the parameter in one stage: the operator on q in the second line."""
+"""The metric of the parameter in one stage: how the second line weighs a change of q."""
 
 from __future__ import annotations
 
@@ -11,28 +11,34 @@ __all__ = ["Metric"]
 
 @dataclass(frozen=True, eq=False)
 class Metric:
-    """The second line of a stage, H (q - c_q) = load + A(w)^T r, a dual vector of Q.
+    """Weights of the second line of a stage, an equation of dual vectors of Q.
 
-        H = scale G_Q - drift G_Q K + J
+        weight G_Q (q_t + sigma q - K (q - prior)) + J (q - c_q) = A(w)^T r + load
 
-    with the Gram matrix G_Q and the generator K of unknowns that move by themselves.
+    with q_t = (q - c_q)/h, the Gram matrix G_Q, and the generator K of unknowns that move by
+    themselves. With J = 0 and without load it is (noisy_q), and with sigma = 0 (est_exact_q), for
+    weight = 1/gain.
 
     Attributes
     ----------
-    scale
-        Weight of G_Q, > 0: 1/(gain h) + sigma/gain for a constant gain.
-    drift
-        Weight of G_Q K, 1/gain.
+    weight
+        1/gain, >= 0.
+    sigma
+        Stabilising term of (noisy_q), >= 0.
     load
-        Terms of the right-hand side that do not depend on q, shape (m,).
+        Terms of the right-hand side besides A(w)^T r, shape (m,); None: zero.
     information
         Data of J, in the pattern that the stage was made with; None: zero.
     theta
         Weight of R^T M_op r in the stage, where the metric sets it; None: by the damping rule.
     """
 
-    scale: float
-    drift: float
-    load: Array
+    weight: float
+    sigma: float = 0.0
+    load: Array | None = None
     information: Array | None = None
     theta: float | None = None
+
+    def scale(self, h: float) -> float:
+        """Return the weight of G_Q q in a stage with step h."""
+        return self.weight * (1.0 / h + self.sigma)

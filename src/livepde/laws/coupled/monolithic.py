@@ -35,8 +35,7 @@ class MonolithicSolver(StageSolver):
         terms, forms, maps = self.terms, self.terms.forms, self.maps
         A, moment, n = forms.A_in, data.problem.moment, self.terms.n
         u, q = at.y[:n], at.y[n:]
-        A_in = at.A_in.data if at.A_in is not None else A.data("v", "q", moment, u=at.w, q=q)
-        found: Array = maps["A_in"] @ A_in
+        found: Array = maps["A_in"] @ at.A_in.data
         if forms.W is not None:
             found += maps["A_in u"] @ A.data("v", "u", moment, u=at.w, q=q)
             found += maps["B_in"] @ forms.B_in.data("v", "u", moment, u=at.w)
@@ -72,17 +71,17 @@ class MonolithicSolver(StageSolver):
         return factor
 
     def _fixed(self, data: StageData) -> Array:
-        """Return the data that depend on the step and the metric's scale only."""
+        """Return the data that depend on the step and on weight and sigma of the metric only."""
         h, metric = data.problem.h, data.problem.metric
-        key = (h, metric.scale, metric.drift)
+        key = (h, metric.weight, metric.sigma)
         # Copies of an identifier share this, maybe in threads: the pair is read once, and replaced
         # as a whole, so that the data are those of their key.
         known = self._constant
         if known is None or known[0] != key:
             parts = self._parts
-            found = parts["M"] / h + metric.scale * parts["G"] + parts["rest"]
+            found = parts["M"] / h + metric.scale(h) * parts["G"] + parts["rest"]
             if "GK" in parts:
-                found = found - metric.drift * parts["GK"]
+                found = found - metric.weight * parts["GK"]
             self._constant = known = (key, found)
         return known[1]
 
@@ -156,7 +155,7 @@ class MonolithicSolver(StageSolver):
 
     @cached_property
     def _parts(self) -> dict[str, Array]:
-        """Data that never change: with 1/h, with the metric's scale and drift, and the rest."""
+        """Data that never change: of M, of G_Q and G_Q K, and the rest."""
         terms, forms, maps = self.terms, self.terms.forms, self.maps
         gram = _stored(terms.gram)
         rest = maps["N"] @ _stored(forms.hidden)

@@ -20,7 +20,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.fem import Composed, Form
-from livepde.linalg import IntArray
+from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
@@ -42,8 +42,6 @@ class StageForms:
         Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
     nu
         Weight of N.
-    at_estimate
-        Evaluate A and B at the estimate on omega, too (Kügler 2010).
     """
 
     model: Model
@@ -51,7 +49,6 @@ class StageForms:
     M_op: Any
     N_op: Any
     nu: float
-    at_estimate: bool = False
 
     @cached_property
     def _outside(self) -> IntArray | None:
@@ -84,12 +81,14 @@ class StageForms:
         """B outside of omega; None where there is nothing."""
         return None if self._outside is None else self.model.form_B.on(self._outside)
 
+    def argument(self, u: Array, r: Array) -> Array:
+        """Return w = u_alpha + P u, which A and B see over omega: u - r, since P = I - R."""
+        return u - r
+
     @cached_property
     def W(self) -> sp.csr_array | None:
         """dw/du over omega, shape (n, n); None where w is known there: the data give all of it."""
         n = self.model.X.dim
-        if self.at_estimate:
-            return sp.csr_array(sp.eye_array(n))
         estimated = sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
         if self.split.omega is not None:
             # Only coefficients that the forms over omega read can make w unknown.

@@ -1,9 +1,8 @@
-"""Two older laws that the paper's method grew out of, through the same coupled stage.
+"""Two laws after the paper's description of related methods, through its coupled stage.
 
-Boiger and Kaltenbacher call their method "strongly motivated" by both. Neither article could be
-read for this module; the implemented equations are stated below, after the description by Boiger
-and Kaltenbacher: Baumeister et al. observe all of the state, Kügler demands a monotone C and
-evaluates it at the estimate.
+Boiger and Kaltenbacher call their method "strongly motivated" by both. The original articles were
+not read. The equations below follow the description by Boiger and Kaltenbacher: Baumeister et al.
+observe all of the state, Kügler requires a monotone C and evaluates it at the estimate.
 
                   C evaluated at          pull                      q^' = gain A(.)* r, r
     paper         u_alpha + P u^          mu R M r / ||r||_V~       R u^ - u_alpha
@@ -13,13 +12,16 @@ evaluates it at the estimate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
+from livepde.laws.coupled import StageForms
 from livepde.laws.damping import Damping, Residual
 from livepde.laws.gradient import GradientLaw, GradientState
 from livepde.laws.gradient_parts import GradientParts, constant_parts
@@ -65,16 +67,9 @@ class _Relative(Law[GradientParts, GradientState]):
         # The step is that of the gradient law: what differs is in `work`, from `_parts`.
         return GradientLaw(self.gain, _Linear(self.mu), newton=self.newton)
 
-    def _parts(self, problem: Problem, pull: Any, *, at_estimate: bool) -> GradientParts:
-        return constant_parts(
-            problem,
-            self.gain,
-            _Linear(self.mu),
-            self.newton,
-            M_op=pull,
-            N_op=pull,
-            at_estimate=at_estimate,
-        )
+    def _parts(self, problem: Problem, pull: Any) -> GradientParts:
+        damping = _Linear(self.mu)
+        return constant_parts(problem, self.gain, damping, self.newton, M_op=pull, N_op=pull)
 
     def init(self, work: GradientParts, q0: Array, u0: Array) -> GradientState:
         return self._base.init(work, q0, u0)
@@ -93,7 +88,7 @@ class _Relative(Law[GradientParts, GradientState]):
 
 @dataclass(frozen=True)
 class BaumeisterLaw(_Relative):
-    """The adaptive observer after Baumeister, Scondo, Demetriou and Rosen (1997).
+    """The adaptive observer as the paper describes Baumeister, Scondo, Demetriou and Rosen (1997).
 
     SIAM Journal on Control and Optimization 35, 678-713. All of the state is measured, z = u:
 
@@ -102,7 +97,7 @@ class BaumeisterLaw(_Relative):
 
     with a coercive operator A_0 that draws u^ to the measured state; both equations are solved
     together in one implicit step. It is (est_exact_q), (est_exact_u) for R = I, P = 0, with the
-    coercive A_0 in the place of mu M / ||r||_V~: Boiger and Kaltenbacher added P u^ where nothing
+    coercive A_0 instead of mu M / ||r||_V~: Boiger and Kaltenbacher added P u^ where nothing
     is measured, and a pull whose size mu adapts.
 
     Parameters
@@ -135,12 +130,38 @@ class BaumeisterLaw(_Relative):
                 "coefficients. Use GradientLaw, which estimates what is not observed, KueglerLaw "
                 "if C is monotone, or observe Full()."
             )
-        return self._parts(problem, self.A_0, at_estimate=False)
+        return self._parts(problem, self.A_0)
+
+
+class _FormsAtEstimate(StageForms):
+    """Forms with A and B at the estimate over omega, too: w = u^."""
+
+    def argument(self, u: Array, r: Array) -> Array:
+        return u
+
+    @cached_property
+    def W(self) -> sp.csr_array:
+        return sp.csr_array(sp.eye_array(self.model.X.dim))
+
+
+class _PartsAtEstimate(GradientParts):
+    """Parts of the gradient law whose stages have such forms."""
+
+    @classmethod
+    def of(cls, parts: GradientParts) -> GradientParts:
+        given = {part.name: getattr(parts, part.name) for part in fields(parts)}
+        # The stages that `parts` has kept have the forms of the paper's law.
+        del given["_stages"]
+        return cls(**given).prepared()
+
+    def forms(self, present: Array) -> StageForms:
+        split = self.problem.observed.split(present)
+        return _FormsAtEstimate(self.problem.model, split, self.M_op, self.N_op, self.nu)
 
 
 @dataclass(frozen=True)
 class KueglerLaw(_Relative):
-    """The law after Kügler (2010) for monotone C, evaluated at the estimate.
+    """The law for monotone C, evaluated at the estimate, as the paper describes Kügler (2010).
 
     Inverse Problems 26, 035004: "Online parameter identification without Ricatti-type equations in
     a class of time-dependent partial differential equations: an extended state approach with
@@ -167,4 +188,4 @@ class KueglerLaw(_Relative):
 
     def prepare(self, problem: Problem) -> GradientParts:
         # Without M_op the pull is mu R^T M r.
-        return self._parts(problem, None, at_estimate=True)
+        return _PartsAtEstimate.of(self._parts(problem, None))
