@@ -182,12 +182,10 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert "runs/mine already holds a run" in refused.stderr
 
     # For the same table he might have begun with a case of its own, and found the same.
-    assert "fill in what it says '?' for" in shell.ok(
-        "livepde", "init", "own", "--data", "mine/rod.csv"
-    )
+    assert "replace each '?'" in shell.ok("livepde", "init", "own", "--data", "mine/rod.csv")
     refused = shell("livepde", "check", "own/case.toml")
     assert refused.returncode == 2
-    assert "still to be filled in, where it says '?': mesh.from, mesh.to" in refused.stderr
+    assert "own/case.toml: mesh.to = \"? m\": replace '?' by a value." in refused.stderr
     edit(home / "own" / "case.toml", OPEN)
     shell.ok("livepde", "run", "own/case.toml")
     again = json.loads(shell.ok("livepde", "report", "runs/own", "--json"))["measures"]

@@ -16,6 +16,7 @@ from livepde import cases
 from livepde.cases.data import source_of
 from livepde.cases.measured import measured
 from livepde.cases.new_case import write_template
+from livepde.cases.read import blanks_in, read_toml
 from livepde.cli import app
 from livepde.models import EQUATIONS
 
@@ -140,14 +141,10 @@ def test_what_loggers_write_for_no_value_is_missing(here):
         ("16/06/28 06:45", "16/06/28 07:00", "'%y/%m/%d %H:%M' (2016-06-28 06:45:00)"),
     ],
 )
-def test_an_order_of_day_and_month_that_cannot_be_known_is_asked_for(here, first, second, told):
+def test_an_order_of_day_and_month_that_cannot_be_known_is_refused(here, first, second, told):
     with pytest.raises(lp.errors.DataError, match=re.escape(told)) as error:
         begun(f"time,T\n{first},20\n{second},20\n")
     assert f"the order of day, month and year in '{first}' cannot be known" in str(error.value)
-    table = measured(Path("my.csv"), "s", choose=lambda column, cell, formats: formats[-1])
-    assert table.time_format in told or "%m/%d/%Y" in table.time_format
-    given = measured(Path("my.csv"), "s", time_format=table.time_format)
-    assert given.samples.origin == table.samples.origin
 
 
 @pytest.mark.parametrize(
@@ -244,8 +241,9 @@ def test_numbered_columns_with_a_table_of_places(here):
     assert places.read_text().splitlines()[:2] == ["name,x", "T 1,?"]
     filled = {"mesh.from": 0, "mesh.to": "20 cm", "law.noise": "1 K"}
     filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
-    with pytest.raises(lp.errors.CaseError, match=r"places\.csv, row 2: still to be filled in"):
+    with pytest.raises(lp.errors.CaseError, match=r"places\.csv, row 2: replace '\?'") as error:
         cases.load("mine/case.toml", settings=filled)
+    assert len(str(error.value).splitlines()) == 9
     rows = [f"{name},{0.02 * k}" for k, name in enumerate(names)]
     places.write_text("\n".join(["name,x", *rows]) + "\n")
     assert len(cases.load("mine/case.toml", settings=filled).sensors) == 9
@@ -342,9 +340,11 @@ def test_a_case_of_every_equation_has_what_it_needs(here, name):
         for key, option in equation.options.items()
         if option.default is None or any(key in equation.alternatives[one] for one in chosen)
     }
-    sides = r"mesh\.x, mesh\.y," if equation.dimension > 1 else r"mesh\.from, mesh\.to,"
-    with pytest.raises(lp.errors.CaseError, match=rf"still to be filled in, .* {sides}"):
+    sides = ("mesh.x", "mesh.y") if equation.dimension > 1 else ("mesh.from", "mesh.to")
+    with pytest.raises(lp.errors.CaseError) as error:
         cases.load("mine/case.toml")
+    for side in sides:
+        assert f"mine/case.toml: {side} = " in str(error.value)
 
 
 def test_a_preview_of_what_was_read(here):
@@ -399,67 +399,30 @@ def test_options_for_what_the_table_does_not_tell(here):
         assert f"{option[0]} belongs to a table of your own" in str(error)
 
 
-def test_questions_on_a_terminal(here, monkeypatch):
-    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
-    rows = "03/02/2026 08:00,20,20,20,20\n03/02/2026 08:10,20,20,20,21\n"
-    Path("my.csv").write_text(f"time,T_l,T_1,T_2,T_3\n{rows}")
-    answers = [
-        "3",  # of two orders of day and month: asked again
-        "1",
-        "0",  # mesh.from
-        "40 s",  # mesh.to: no length, asked again
-        "40 cm",
-        "5e-5",  # prior
-        "",  # std: skipped
-        "0.05",  # law.noise
-        "left",
-        "0.1",
-        "-",
-        "",
-    ]
-    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "\n".join(answers) + "\n")
+def test_each_place_that_is_left_open_is_named(here):
+    """By `init`, and by `check` and `run` in a sentence each."""
+    names = [f"T {k}" for k in range(1, 10)]
+    row = ",".join("20" for _ in names)
+    Path("my.csv").write_text(f"time,Q [gpm],{','.join(names)}\n0,1,{row}\n9,1,{row}\n")
+    begin = ["init", "mine", "--data", "my.csv", "--equation", "borehole"]
+    runner = CliRunner()
+    done = runner.invoke(app, begin, "0\n1\n")
     assert done.exit_code == 0, done.output
-    assert "1  %d/%m/%Y %H:%M" in done.output
-    assert "'s' cannot be converted to 'm'" in done.output
-    assert "fill in what it says '?' for (2)" in done.output
-    found = tomllib.loads(Path("mine/case.toml").read_text())
-    assert found["data"]["time_format"] == "%d/%m/%Y %H:%M"
-    assert found["mesh"] == {"from": "0 m", "to": "40 cm", "cells": 40}
-    alpha = {"prior": "5e-05 m^2/s", "std": "? m^2/s", "transform": "log"}
-    assert found["unknowns"] == {"alpha": alpha}
-    assert found["channels"] == {
-        "T_l": {"role": "boundary", "column": "T_l", "at": "left"},
-        "T_1": {"role": "sensor", "column": "T_1", "at": "0.1 m"},
-        "T_3": {"role": "sensor", "column": "T_3", "at": "? m"},
-    }
-    assert found["law"] == {"noise": "0.05 K"}
-
-
-def test_without_a_terminal_nothing_is_asked(here):
-    Path("my.csv").write_text("time_s,T\n0,20\n1,20\n")
-    done = CliRunner().invoke(app, ["init", "mine", "--data", "my.csv"], "0\n1\n")
-    assert done.exit_code == 0
-    assert "Press Enter" not in done.output
-    assert tomllib.loads(Path("mine/case.toml").read_text())["mesh"]["from"] == "? m"
-
-
-def test_questions_on_rows_of_sensors_and_on_columns(here, monkeypatch):
-    monkeypatch.setattr("livepde.cli.questions.asks", lambda: True)
-    names = [f"s_{k}" for k in range(9)]
-    row = ",".join("0" for _ in names)
-    Path("my.csv").write_text(f"time_s,rate,{','.join(names)}\n0,1,{row}\n60,1,{row}\n")
-    answers = ["8 m", "0.1", "900", "", "", "", "", "flow", "rate", "", "-", "1", "1, 9 m"]
-    begin = ["init", "mine", "--data", "my.csv", "--equation", "pumping_test"]
-    done = CliRunner().invoke(app, begin, "\n".join(answers) + "\n")
-    assert done.exit_code == 0, done.output
-    assert "inputs.Q: got 'flow'; expected a number in m^3/s" in done.output
-    assert "Got 1 values; expected 2" in done.output
-    found = tomllib.loads(Path("mine/case.toml").read_text())
-    assert found["options"] == {"b": "8 m"}
-    assert found["channels"] == {
-        "s": {"role": "sensor", "column": "s_{}", "each": ["1 m", "9 m", 9]},
-        "Q": {"role": "input", "column": "rate"},
-    }
+    case = Path("mine/case.toml")
+    document = read_toml(case.read_text(), "mine/case.toml")
+    blanks = blanks_in(document)
+    assert "law.noise" in blanks
+    assert "data.time_unit" in blanks
+    for line in (f'{key} = "{value}"' for key, value in blanks.items()):
+        assert f"  {line}\n" in done.output
+    assert "  positions in mine/places.csv\n" in done.output
+    for command in ("check", "run"):
+        error = runner.invoke(app, [command, "mine/case.toml"]).exception
+        assert str(error).splitlines() == [
+            f"mine/case.toml: {key} = \"{value}\": replace '?' by a "
+            f"{'unit' if key.endswith('unit') else 'value'}."
+            for key, value in blanks.items()
+        ]
 
 
 def test_an_equation_belongs_to_a_table(here):
@@ -534,18 +497,16 @@ def test_from_a_table_to_estimates(here):
     runner = CliRunner()
     done = runner.invoke(app, ["init", "mine", "--data", "rod/rod.csv"])
     assert done.exit_code == 0
-    assert (
-        "Wrote mine/case.toml for rod/rod.csv: fill in what it says '?' for (10). Next:"
-        in done.stdout
-    )
+    assert "Wrote mine/case.toml for rod/rod.csv: replace each '?' (10):\n" in done.stdout
     case = Path("mine/case.toml")
     with pytest.raises(lp.errors.CaseError) as error:
         cases.load(case)
-    named = "mesh.from, mesh.to, unknowns.alpha.prior, unknowns.alpha.std, law.noise, "
-    assert str(error.value) == (
-        f"mine/case.toml: still to be filled in, where it says '?': {named}channels.T_left.at, "
-        "channels.T_10.at, channels.T_20.at, channels.T_30.at, channels.T_right.at."
-    )
+    places = ("mesh.from", "mesh.to", *(f"channels.T_{k}.at" for k in (10, 20, 30)))
+    said = str(error.value).splitlines()
+    assert len(said) == 10
+    assert said[-1] == "mine/case.toml: channels.T_right.at = \"? m\": replace '?' by a value."
+    for place in places:
+        assert f"mine/case.toml: {place} = \"? m\": replace '?' by a value." in said
     places = {f"channels.T_{k}.at": f"{k} cm" for k in (10, 20, 30)}
     ends = {
         f"channels.T_{end}.{key}": value

@@ -399,6 +399,9 @@ def _listed(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tup
     table = _positions_table(case, key, file)
     axes = [axis for axis in "xyz" if axis in table.columns]
     found: dict[str, tuple[Any, str]] = {}
+    blank = [k for k, row in enumerate(table[axes].to_numpy(), 2) if any(map(is_blank, row))]
+    if blank:
+        raise CaseError("\n".join(f"{file}, row {k}: replace '?' by a value." for k in blank))
     # Row 1 of the file is its header.
     for row, label in enumerate(table["name"], 2):
         if not label or label in found:
@@ -428,8 +431,6 @@ def _positions_table(case: CaseContent, key: str, file: Path) -> pd.DataFrame:
 
 
 def _coordinate(case: CaseContent, cell: str, where: str) -> float:
-    if is_blank(cell):
-        raise CaseError(f"{where}: still to be filled in, where it says '?'.")
     try:
         value: float | str = float(cell)
     except ValueError:

@@ -2,65 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import tomlkit
 from tomlkit.items import InlineTable
 
-from livepde.cases.read import apply, is_blank, key_path, read_toml, spec_of, toml_key, toml_line
+from livepde.cases.read import apply, key_path, read_toml, spec_of, toml_key, toml_line
 from livepde.errors import CaseError
 
-__all__ = ["Blank", "blanks", "filled", "with_channel"]
-
-
-@dataclass(frozen=True)
-class Blank:
-    """A value of a case that is still to be filled in.
-
-    Attributes
-    ----------
-    path
-        Its keys, as ("channels", "T_1", "at").
-    value
-        The placeholder: "? m", or a list that holds one.
-    comment
-        The comment of its line.
-    """
-
-    path: tuple[str, ...]
-    value: Any
-    comment: str
-
-    @property
-    def key(self) -> str:
-        """The keys as `--set` takes them."""
-        return ".".join(self.path)
-
-    @property
-    def unit(self) -> str:
-        """The unit that stands beside the question mark; empty if there is none."""
-        marks = self.value if isinstance(self.value, list) else [self.value]
-        return next((mark.partition(" ")[2] for mark in marks if is_blank(mark)), "")
-
-
-def blanks(text: str) -> list[Blank]:
-    """Return the blanks in the text of a case, line by line."""
-    return list(_blanks(tomlkit.parse(text), ()))
-
-
-def _blanks(table: Any, path: tuple[str, ...]) -> Iterator[Blank]:
-    """Yield the blanks of a table; those of an inline one share the comment of its line."""
-    for name, item in table.items():
-        here = (*path, name)
-        if isinstance(item, InlineTable):
-            blank = ((key, value) for key, value in item.unwrap().items() if is_blank(value))
-            yield from (Blank((*here, key), value, item.trivia.comment) for key, value in blank)
-        elif isinstance(item, Mapping):
-            yield from _blanks(item, here)
-        elif is_blank(item.unwrap()):
-            yield Blank(here, item.unwrap(), item.trivia.comment)
+__all__ = ["filled"]
 
 
 def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
@@ -86,11 +37,6 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
     if settings:
         spec_of(read_toml(text, where), where)
     return text
-
-
-def with_channel(text: str, name: str, given: Mapping[str, Any]) -> str:
-    """Return the text of a case with one more channel."""
-    return _with(text, ("channels", name), given)
 
 
 def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:

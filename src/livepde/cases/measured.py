@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -23,7 +23,7 @@ from livepde.streams.clock import date_formats, number_of
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES, MISSING
 
-__all__ = ["IN_BRACKETS", "DateOrder", "Measured", "measured", "unit_in"]
+__all__ = ["IN_BRACKETS", "Measured", "measured", "unit_in"]
 
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
@@ -31,9 +31,6 @@ HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
 VALUES = {"number", "date"}  # kinds of cells that a header does not have
-
-DateOrder = Callable[[str, str, Sequence[str]], str]
-"""(column, first cell, formats) -> the format of dates whose order cannot be known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,12 +118,7 @@ def _moment(t: float, origin: datetime | None) -> str:
 
 
 def measured(
-    table: Path,
-    time_unit: str,
-    *,
-    time_format: str = "",
-    skip: int | None = None,
-    choose: DateOrder | None = None,
+    table: Path, time_unit: str, *, time_format: str = "", skip: int | None = None
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
@@ -138,8 +130,6 @@ def measured(
         Of dates; empty: found from the cells.
     skip
         Lines before the header; None: found from the lines.
-    choose
-        Is asked for the order of day, month and year where the cells leave it open.
 
     Raises
     ------
@@ -153,7 +143,7 @@ def measured(
     time = _times(table, written, kinds)
     found = ""
     if kinds[time[0]] == "date":
-        found = _format(table, written, time, time_format, choose)
+        found = _format(table, written, time, time_format)
     numbers = [name for name in _of_kind(kinds, "number") if name not in time]
     counted = tuple(name for name in numbers if _counts_rows(name, written))
     columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
@@ -252,14 +242,8 @@ def _most_like_times(numbers: Sequence[str], written: Written) -> list[str]:
     return [*both, *filter(CALLED_TIME.match, rising), *others, *rising, *timed]
 
 
-def _format(
-    table: Path,
-    written: Written,
-    time: tuple[str, ...],
-    given: str,
-    choose: DateOrder | None,
-) -> str:
-    """Return the format of dates; asks where the order of day, month and year is open."""
+def _format(table: Path, written: Written, time: tuple[str, ...], given: str) -> str:
+    """Return the format of dates; refuses cells whose order of day and month is not unique."""
     cells = [" ".join(parts) for parts in zip(*(_cells(n, written) for n in time), strict=False)]
     if given:
         return given
@@ -271,8 +255,6 @@ def _format(
             f"{table}, column '{time[0]}': got '{cells[0]}'; say --time-format, as "
             "'%d.%m.%Y %H:%M'."
         )
-    if choose is not None:
-        return choose(time[0], cells[0], formats)
     candidates = " or ".join(
         f"'{form}' ({_moment(Clock('').stamp(cells[0], form) or 0.0, datetime(1970, 1, 1))})"
         for form in formats

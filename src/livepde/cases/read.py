@@ -24,6 +24,7 @@ __all__ = [
     "BLANK",
     "apply",
     "beside",
+    "blanks_in",
     "did_you_mean",
     "is_blank",
     "key_path",
@@ -34,6 +35,7 @@ __all__ = [
     "spec_of",
     "toml_key",
     "toml_line",
+    "toml_value",
 ]
 
 BLANK = "?"  # how a value begins that is still to be filled in
@@ -147,8 +149,14 @@ def _line(text: str, reason: str) -> str:
 
 def read_spec(raw: Mapping[str, Any], where: str) -> CaseSpec:
     """Return the checked content of a case's document; raises `CaseError`."""
-    if blanks := list(_blanks_in(raw)):
-        raise CaseError(f"{where}: still to be filled in, where it says '?': {', '.join(blanks)}.")
+    if blanks := blanks_in(raw):
+        raise CaseError(
+            "\n".join(
+                f"{where}: {key} = {toml_value(value)}: replace '?' by a "
+                f"{'unit' if key.endswith('unit') else 'value'}."
+                for key, value in blanks.items()
+            )
+        )
     return spec_of(raw, where)
 
 
@@ -167,13 +175,16 @@ def is_blank(value: Any) -> bool:
     return isinstance(value, str) and value.split(" ")[0] == BLANK
 
 
-def _blanks_in(value: Any, key: str = "") -> Iterator[str]:
-    """Yield the keys whose values `livepde init --data` has left open: '?', '? m'."""
-    if isinstance(value, Mapping):
-        for name, item in value.items():
-            yield from _blanks_in(item, f"{key}.{name}" if key else name)
-    elif is_blank(value):
-        yield key
+def blanks_in(document: Mapping[str, Any], table: str = "") -> dict[str, Any]:
+    """Return key -> value of what `livepde init --data` has left open: '?', '? m'."""
+    found: dict[str, Any] = {}
+    for name, value in document.items():
+        key = f"{table}.{name}" if table else name
+        if isinstance(value, Mapping):
+            found |= blanks_in(value, key)
+        elif is_blank(value):
+            found[key] = value
+    return found
 
 
 def beside(path: Path, folder: Path) -> Path:
@@ -385,7 +396,7 @@ def toml_line(key: str, value: Any) -> str:
     >>> toml_line("T 1", {"role": "sensor", "at": 0.5})
     '"T 1" = { role = "sensor", at = 0.5 }'
     """
-    return f"{toml_key(key)} = {_value(value)}"
+    return f"{toml_key(key)} = {toml_value(value)}"
 
 
 def toml_key(name: str) -> str:
@@ -393,13 +404,13 @@ def toml_key(name: str) -> str:
     return tomlkit.key(name).as_string()
 
 
-def _value(value: Any) -> str:
+def toml_value(value: Any) -> str:
     """Return a value on one line, with blanks inside of the braces of an inline table."""
     if isinstance(value, Mapping):
         items = ", ".join(toml_line(key, item) for key, item in value.items())
         return f"{{ {items} }}" if items else "{}"
     if isinstance(value, list):
-        return f"[{', '.join(map(_value, value))}]"
+        return f"[{', '.join(map(toml_value, value))}]"
     shown: str = tomlkit.item(value).as_string()
     return shown
 

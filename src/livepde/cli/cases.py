@@ -62,12 +62,14 @@ def init(
 ) -> None:
     """Write a commented case to start from, with made-up data that it runs on, or for your own.
 
-    On a terminal it asks for what your table does not tell; each question may be skipped.
+    For your own data, replace each '?' in the case: the table has no value for it.
 
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
+    from livepde.cases.fill import filled
     from livepde.cases.new_case import check_free, files_for, write_files, write_template
+    from livepde.cases.read import parse
     from livepde.models import EQUATIONS
 
     console = terminal()
@@ -92,49 +94,39 @@ def init(
         read = _read(data, found, time_format, skip)
         files = files_for(read, folder, found)
         _show_read(console, read, found)
-        files["case.toml"] = _known(files["case.toml"], read, found, settings or [], f"{case}")
+        files["case.toml"] = filled(files["case.toml"], parse(settings or []), f"{case}")
         write_files(folder, files)
         _show_written(console, case, data, files)
     console.print(f"  livepde check {case}\n  livepde run {case}", soft_wrap=True)
 
 
 def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int | None) -> Measured:
-    """Read the tables; on a terminal ask for the order of day and month if it is ambiguous."""
+    """Read the tables, and join them."""
     from livepde.cases.measured import measured
-    from livepde.cli.questions import asks, date_order
 
-    choose = date_order if asks() else None
     first, *others = (
-        measured(file, equation.time_unit, time_format=time_format, skip=skip, choose=choose)
-        for file in data
+        measured(file, equation.time_unit, time_format=time_format, skip=skip) for file in data
     )
     for other in others:
         first = first.joined(other)
     return first
 
 
-def _known(text: str, read: Measured, equation: Equation, settings: list[str], where: str) -> str:
-    """Return the text of a case with the values given by --set and by answers to questions."""
-    from livepde.cases.fill import filled
-    from livepde.cases.read import parse
-    from livepde.cli.questions import answered, asks
-
-    text = filled(text, parse(settings), where)
-    return answered(text, equation, list(read.columns), where) if asks() else text
-
-
 def _show_written(
     console: Console, case: Path, data: Sequence[Path], files: Mapping[str, str]
 ) -> None:
-    """Print the names of the written files, and the number of blanks in them."""
-    from livepde.cases.fill import blanks
+    """Print the names of the written files, and what is to be filled in there."""
+    from livepde.cases.read import blanks_in, read_toml, toml_value
 
-    left = len(blanks(files["case.toml"]))
-    told = ": nothing is left open" if not left else f": fill in what it says '?' for ({left})"
-    console.print(f"Wrote {case} for {' and '.join(map(str, data))}{told}. Next:", soft_wrap=True)
-    for name in files:
-        if name != "case.toml":
-            console.print(f"  fill in {case.parent / name}", soft_wrap=True)
+    blanks = blanks_in(read_toml(files["case.toml"], str(case)))
+    places = [f"{key} = {toml_value(value)}" for key, value in blanks.items()]
+    places += [f"positions in {case.parent / name}" for name in files if name != "case.toml"]
+    told = f"replace each '?' ({len(places)})" if places else "nothing is left open. Next"
+    console.print(f"Wrote {case} for {' and '.join(map(str, data))}: {told}:", soft_wrap=True)
+    for place in places:
+        console.print(escape(f"  {place}"), soft_wrap=True)
+    if places:
+        console.print("Next:")
 
 
 def _show_read(console: Console, read: Measured, equation: Equation) -> None:

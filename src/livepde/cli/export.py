@@ -45,13 +45,6 @@ def export(
             "Of .vtu and .vtk: the time of the fields, as 3600, '1 h' or a date. Default: the last."
         ),
     ] = None,
-    salvage: Annotated[
-        bool,
-        typer.Option(
-            "--salvage",
-            help="Of a damaged journal: write the estimates that are whole, and say which are not.",
-        ),
-    ] = False,
     force: ForceOption = False,
 ) -> None:
     """Write a run, also one that still goes on, in formats that other programs open.
@@ -73,14 +66,9 @@ def export(
                 f"{', '.join(known)}."
             )
         if ending == REPORT:
-            if salvage:
-                raise ConfigurationError(
-                    f"{target}: a page is not salvaged: take the numbers, as .nc or .csv."
-                )
             need(target, ["plotly", "jinja2"], "dashboard")
         need(target, NEEDS.get(ending, []))
         refuse_file(target, force)
-    told = opened.salvage() if salvage else []
     moment = None if at is None else _moment(at, opened.dataset)
     for target in targets:
         if target.suffix.lower() == REPORT:
@@ -90,8 +78,6 @@ def export(
         else:
             write(opened, target, at=moment, force=force)
         terminal().print(escape(f"Written: {target}"), soft_wrap=True)
-    for sentence in told:
-        terminal().print(escape(sentence), soft_wrap=True)
 
 
 def _moment(text: str, data: Dataset) -> float:

@@ -15,6 +15,7 @@ from livepde.errors import RunError
 
 __all__ = [
     "AGAIN",
+    "check_file",
     "checksum",
     "damaged",
     "in_memory",
@@ -24,7 +25,6 @@ __all__ = [
     "reader",
     "released",
     "remedy_of",
-    "salvager",
     "sound",
     "told",
     "writer",
@@ -44,7 +44,6 @@ DAMAGE = (
     ValueError,
 )
 AGAIN = "run the case again into another folder"
-SALVAGE = f"'livepde export RUN FILE --salvage' reads what is whole, or {AGAIN}"
 REMEDIES = {  # primary result code of SQLite -> what to do
     sqlite3.SQLITE_FULL: "make room",
     sqlite3.SQLITE_IOERR: "make room or mend the disk",
@@ -87,11 +86,18 @@ def reader(path: Path) -> sqlite3.Connection:
     return connection
 
 
-def salvager(path: Path) -> sqlite3.Connection:
-    """Open a damaged or truncated file to read its intact records."""
-    connection = _connect(path, "mode=ro")
-    connection.execute("PRAGMA writable_schema = ON")  # a truncated file opens nevertheless
-    return connection
+def check_file(path: Path, connection: sqlite3.Connection) -> None:
+    """Raise `RunError` if SQLite finds the pages of a file damaged.
+
+    A changed byte in a page may hide rows; their checksums do not show that. The check reads the
+    file once, in about a third of the time that reading its rows takes.
+    """
+    try:
+        (found,), *_ = connection.execute("PRAGMA quick_check(1)").fetchall()
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise RunError(told(path, error)) from error
+    if found != "ok":
+        raise RunError(damaged(path, str(found).splitlines()[-1]))
 
 
 class _Connection(sqlite3.Connection):
@@ -195,7 +201,7 @@ def remedy_of(error: Exception) -> str:
 
 def damaged(path: Path, why: str) -> str:
     """Return a sentence on a damaged journal, with its remedy."""
-    return f"{path} is damaged ({why}): {SALVAGE}."
+    return f"{path} is damaged ({why}): restore it from a copy, or {AGAIN}."
 
 
 def checksum(table: str, *values: Any) -> int:

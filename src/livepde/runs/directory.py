@@ -35,7 +35,6 @@ from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Check, FigureFactory, Table, attempted
 from livepde.runs.run_verdict import verdict, verdict_table
-from livepde.runs.salvage import Salvage
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
@@ -318,7 +317,7 @@ class Run:
         """Estimates over time, as `Result.to_xarray` gave them."""
         path = self.path / ESTIMATES
         journal = self.path / JOURNAL
-        if self.status == "running" and journal.is_file():
+        if journal.is_file() and (self.status == "running" or not path.is_file()):
             with Journal.open(journal) as kept:
                 return kept.dataset()
         if not path.is_file():
@@ -343,18 +342,8 @@ class Run:
         ) as error:
             remedy = "run the case again, into another folder"
             if journal.is_file():
-                remedy = (
-                    f"the journal has the estimates, too: 'livepde export {self.path} FILE.nc "
-                    "--salvage' writes them"
-                )
+                remedy = "delete it: they are read from the journal then"
             raise RunError(f"{path} is damaged: {error}; {remedy}.") from error
-
-    def salvage(self) -> list[str]:
-        """Read the intact records of a damaged journal as dataset; return sentences on the rest."""
-        kept = Salvage(self.path / JOURNAL)
-        with kept:
-            self.__dict__["dataset"] = kept.dataset()
-        return kept.sentences()
 
     def case_file(self) -> Path:
         """Return the case file to run again: the original if it is unchanged, else the copy.

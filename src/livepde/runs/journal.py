@@ -13,9 +13,8 @@ A process that is killed loses nothing. A power cut leaves the file intact, but 
 recent samples: a sync to disk for each sample would cost more than its step. A file that is
 followed delivers them again; a broker to which they were acknowledged does not.
 
-Each record has a checksum, which is verified on each read, and records are numbered without gaps
-other than those that the journal has recorded: a damaged or missing record raises `RunError`, and
-`Run.salvage` reads the intact ones.
+Each record has a checksum, which is verified on each read. SQLite checks the pages of the file when
+a writer opens it, and when estimates are read from the first one on. Damage raises `RunError`.
 
 After a failed write (a full disk) a journal accepts no further records, so that no checkpoint can
 skip lost samples. Records committed before are intact; `reopen`, or a new writer, continues from
@@ -44,6 +43,7 @@ from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import (
     AGAIN,
+    check_file,
     checksum,
     damaged,
     in_memory,
@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 __all__ = ["Event", "Journal", "Taken"]
 
 LOG = logging.getLogger("livepde.run")
-FORMAT = 3
+FORMAT = 4
 MEMORY = Path(":memory:")
 KEPT_CHECKPOINTS = 2
 KEPT_EVENTS = 10_000
@@ -87,7 +87,6 @@ SCHEMA = (
     "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
     "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
     "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, said TEXT NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE withdrawn (id INTEGER PRIMARY KEY)",
     "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
 )
 ESTIMATES = (
@@ -154,12 +153,9 @@ class Journal:
         self._stand()
 
     def _stand(self) -> None:
-        """Read the numbers of the last estimate and sample; raise `RunError` if some are lost."""
+        """Read the numbers of the last estimate and sample."""
         self._last = self._current = self._highest("estimates")
-        self._newest = max(self.accepted, *self._withdrawn(), 0)
-        # A checkpoint is written after its estimate, so one without an estimate is damage.
-        if self._highest("checkpoints") > self._last:
-            raise RunError(damaged(self.path, f"the estimates after {self._last} are gone"))
+        self._newest = self.accepted
 
     # --- opening -------------------------------------------------------------------------------
 
@@ -197,7 +193,10 @@ class Journal:
             raise RunError(f"{path}: there is no journal.")
         lock = locked(path) if write else None
         with released(path, lock):
-            return cls(path, writer(path) if write else reader(path), lock)
+            found = cls(path, writer(path) if write else reader(path), lock)
+            if write:
+                check_file(path, found._db)
+            return found
 
     def close(self) -> None:
         """Commit, close the file and release its lock."""
@@ -335,12 +334,9 @@ class Journal:
     def _forget(self, number: int) -> None:
         for table in ("samples", "estimates", "fields", "checkpoints", "tries"):
             self._execute(f"DELETE FROM {table} WHERE id = ?", number)
-        # The newest number is used again. A gap before later samples remains, and is recorded,
-        # because readers take an unrecorded gap for damage.
+        # The newest number is used again; before later samples a gap remains.
         if number == self._newest:
             self._newest -= 1
-        else:
-            self._execute("INSERT OR IGNORE INTO withdrawn VALUES (?)", number)
 
     def mark(self) -> int:
         """Count and commit one more try of the last sample; return the number of tries."""
@@ -470,28 +466,6 @@ class Journal:
             found.append(values)
         return found
 
-    def _withdrawn(self) -> set[int]:
-        return {int(number) for (number,) in self._read("SELECT id FROM withdrawn")}
-
-    def _follow(self, table: str, before: int, numbers: Iterable[int]) -> None:
-        """Raise `RunError` if records are missing that were neither withdrawn nor thinned."""
-        known: tuple[set[int], int, int] | None = None
-        for number in numbers:
-            for gone in range(before + 1, number):
-                # Withdrawals are read after the records, so that a concurrent writer has recorded
-                # by then the reason of every gap that was seen.
-                known = known or (self._withdrawn(), *self._thinning())
-                withdrawn, end, every = known
-                if not (gone in withdrawn or (gone < end and (table == "samples" or gone % every))):
-                    raise RunError(damaged(self.path, f"{table}: {gone} is gone"))
-            before = number
-
-    def _thinning(self) -> tuple[int, int]:
-        """Return the number below which estimates are thinned, and the `every` of `thin`."""
-        with sound(self.path):
-            end, every = json.loads(self._meta().get("thinned", "[0, 1]"))
-            return int(end), int(every)
-
     @property
     def health(self) -> str:
         """Reason why the run is not well, as last stored by its writer; empty if it is."""
@@ -575,8 +549,7 @@ class Journal:
             # A damaged one is deleted, since its number may be needed for a new checkpoint.
             self._execute("DELETE FROM checkpoints WHERE id = ?", number)
         if state is None and numbers:
-            first = self.first
-            if self._thinning()[0] or first is None:
+            if "thinned" in self._meta() or self.first is None:
                 raise RunError(damaged(self.path, "no checkpoint is as it was"))
             number = 0  # all samples are taken again
         if numbers and number < numbers[0]:
@@ -602,7 +575,6 @@ class Journal:
         while (
             found := next(self._samples("WHERE id > ? ORDER BY id LIMIT 1", self._current), None)
         ) is not None:
-            self._follow("samples", self._current, [found.id])
             self._current = found.id
             yield found
 
@@ -641,9 +613,10 @@ class Journal:
 
     def after(self, number: int) -> Iterator[tuple[int, Record]]:
         """Iterate over the estimates of the samples after one, with their numbers."""
+        if not number:
+            check_file(self.path, self._db)
         while True:
             rows = self._read(f"{ESTIMATES} id > ? ORDER BY id LIMIT ?", number, TOGETHER)
-            self._follow("estimates", number, [row[0] for row in rows])
             for row in rows:
                 number = row[0]
                 yield number, self._estimate(row)
@@ -726,13 +699,12 @@ class Journal:
         self._execute(
             "DELETE FROM estimates WHERE id >= ? AND id < ? AND id % ?", self._thinned, end, every
         )
-        # Readers still expect an estimate at each multiple of `every`, so those gaps stay recorded.
-        self._execute("DELETE FROM withdrawn WHERE id < ? AND id % ?", end, every)
         self._execute("DELETE FROM tries WHERE id < ?", end)
         self._execute(
             "DELETE FROM events WHERE id <= (SELECT MAX(id) FROM events) - ?", KEPT_EVENTS
         )
-        self._say("thinned", json.dumps([max(end, self._thinning()[0]), every]))
+        if end:  # without a whole checkpoint the run cannot begin again from its first sample
+            self._say("thinned", str(end))
         self._write(self._db.commit)
         self._thinned = max(self._thinned, end)
 
