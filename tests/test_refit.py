@@ -15,6 +15,7 @@ from scipy.special import erfc, erfcx
 import livepde as lp
 from livepde.laws.refit import refitted
 from livepde.laws.stored_samples import StoredSamples
+from livepde.models import heat
 
 V, D, AT, NOISE = 0.258, 0.0357, 11.0, 0.01
 TIMES = np.arange(1.5, 66.1, 1.5)
@@ -257,3 +258,18 @@ def test_unknowns_that_move_are_not_fitted():
     who = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=lp.laws.Refit()), u0=0.0)
     last = who.run([(0.1 * k, {"a": 0.05 * math.sin(k)}) for k in range(1, 9)]).last
     assert last.fit is None
+
+
+def test_a_reading_whose_place_is_missing_is_not_fitted():
+    model = heat(lp.interval(0.0, 1.0, 12), lp.Normal(0.2, 0.1), {"left": 1.0, "right": 0.0})
+    probe = lp.observation.Moving({"probe": "x_p"}, noise=0.01)
+    missing, never = (lp.Identifier(model, probe, lp.SensitivityLaw(), u0=0.0) for _ in range(2))
+    for k in range(1, 12):
+        z, place = 0.5 + 0.01 * (k % 3), {"x_p": 0.3 + 0.02 * k}
+        lost = {"x_p": math.nan} if k == 5 else place
+        one = missing.step(0.1 * k, {"probe": z}, lost)
+        other = never.step(0.1 * k, {"probe": math.nan if k == 5 else z}, place)
+    one, other = missing.settled(one), never.settled(other)
+    assert one.fit is not None
+    assert one.fit.cost == pytest.approx(other.fit.cost)
+    assert one.q == pytest.approx(other.q)

@@ -99,8 +99,16 @@ class StoredSamples:
 
     @cached_property
     def readings(self) -> Array:
-        """All readings in units of their noise, (samples, sensors); NaN: missing."""
-        return np.array([span.z1[0] for span in self.spans]) / self.noise
+        """All readings in units of their noise, (samples, sensors); NaN: missing.
+
+        A reading of a sensor whose position is missing is none.
+        """
+        found = np.array([span.z1[0] for span in self.spans]) / self.noise
+        for number, span in enumerate(self.spans):
+            if np.isnan(span.end.inputs).any():
+                predicted, _ = self.filter.sensors.observe(self.state.start, span.end)
+                found[number, ~np.isfinite(predicted[0])] = np.nan
+        return found
 
     @cached_property
     def alive(self) -> Mask:
@@ -204,12 +212,14 @@ class StoredSamples:
         for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=True))):
             if self.seen[number]:
                 predicted, Y = self.filter.sensors.observe(x, span.end)
-                r[number] = (span.z1[0] - predicted[0]) / self.noise[number]
-                J[number] = Y[0].T / self.noise[number][:, None]
+                there = np.isfinite(self.readings[number])
+                r[number, there] = ((span.z1[0] - predicted[0]) / self.noise[number])[there]
+                J[number, there] = (Y[0].T / self.noise[number][:, None])[there]
         if x is None or number + 1 < len(self.spans):
             return None
         # Of squares: what overflows there has neither a cost nor a direction.
-        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum() + np.nansum(r**2)
+        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum()
+        squares += (r[np.isfinite(self.readings)] ** 2).sum()
         return Passed(xi=xi, residuals=r, slopes=J, end=x) if np.isfinite(squares) else None
 
     def residuals(self, xi: Array) -> Array | None:
