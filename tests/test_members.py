@@ -206,8 +206,9 @@ def test_rows_that_a_member_has_missed_stay_out_of_its_log_after_an_alarm():
         times = fleet._state.log[1, :, 0]
         times = times[np.isfinite(times)]
         wanted = one._state.log[0, :, 0]
-        assert (times > 0.0).sum() == (wanted > 0.0).sum()
-        np.testing.assert_allclose(times[times > 0.0], wanted[wanted > 0.0])
+        # That of a fleet is shortened sooner: its members share one length.
+        times, wanted = times[times > 0.0], wanted[wanted > 0.0]
+        np.testing.assert_allclose(times, wanted[len(wanted) - len(times) :])
     assert alarms
 
 

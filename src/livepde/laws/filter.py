@@ -321,7 +321,7 @@ class Filter:
         new = changed(end, **parts)
         if noise and stop == span.t1:
             new = changed(new, rate=self._rate(new, noise, span))
-        return self._compressed(new) if count > self.rank else new, steps, None
+        return self.compressed(new) if count > self.rank else new, steps, None
 
     def _rate(self, x: FilterState, noise: NoiseRows, span: Span) -> Array:
         """Return how fast the readings at the end forget the process noise, shape (members,)."""
@@ -405,7 +405,7 @@ class Filter:
         rows = size * (np.eye(k) if chosen is None else np.eye(k)[chosen])
         U = np.zeros((members, len(rows), x.u.shape[1]))
         new = with_rows(x, U, np.broadcast_to(rows, (members, *rows.shape)))
-        return self._compressed(new) if new.C.shape[1] > self.rank else new
+        return self.compressed(new) if new.C.shape[1] > self.rank else new
 
     def with_prior(self, x: FilterState) -> FilterState:
         """Return the state with the prior of the unknowns, and u as it is estimated."""
@@ -421,7 +421,7 @@ class Filter:
         new = changed(x, u=x.u + x.du, q=prior, du=du, da=da, U=U, C=C, past=past, causes=causes)
         return changed(new, shadows=shadows)
 
-    def _compressed(self, x: FilterState) -> FilterState:
+    def compressed(self, x: FilterState) -> FilterState:
         """Return the state with a square root of `rank` rows.
 
         A rotation gathers all that is uncertain about the unknowns, and the state with them, in the

@@ -31,6 +31,7 @@ CURVED = 0.75  # largest second-order part of a step over its first-order part (
 SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
 LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
 UNSURE = 0.5  # only where a direction keeps more than this share of its prior standard deviation
+ROUNDING = 1e-12  # share of a variance
 QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
 SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
 LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
@@ -263,7 +264,12 @@ class _Search:
         if self._square <= DOUBTFUL:
             return False
         H, _ = self._model(self.best)
-        return 1.0 / math.sqrt(np.linalg.eigvalsh(H)[0]) > UNSURE
+        # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
+        C = self.samples.state.start.C[0]
+        before, after = C.T @ C, C.T @ np.linalg.solve(H, C)
+        floor = ROUNDING * np.trace(before) * np.eye(len(before))
+        shares = scipy.linalg.eigh(after, before + floor, eigvals_only=True)
+        return math.sqrt(max(shares[-1], 0.0)) > UNSURE
 
     @property
     def _square(self) -> float:

@@ -101,10 +101,9 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
     """Return the filter that continues from the end of a search; None if a step fails."""
     now = samples.state.now
     best = samples.updated(found.best, found.used)
-    if best is not None:
-        away = apart(samples.filter, best, now)
-        # Sums of the verdict and errors of the discretisation stay with the filter until then: a
-        # later refit of the same samples may find them anew.
-        if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
-            return best
+    away = apart(samples.filter, best, now)
+    # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
+    # refit of the same samples may find them anew.
+    if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
+        return best
     return samples.judged(found.best, found.used)

@@ -15,7 +15,7 @@ import numpy as np
 
 from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter, contraction
-from livepde.laws.filter_state import FilterState
+from livepde.laws.filter_state import FilterState, extended
 from livepde.laws.gate import Gate
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
@@ -256,16 +256,12 @@ class StoredSamples:
         cost = np.where(whole & np.isfinite(found), found, np.inf)
         return cost, taken / (columns * max(len(self.spans), 1))
 
-    def updated(self, one: Passed, used: Mask) -> FilterState | None:
+    def updated(self, one: Passed, used: Mask) -> FilterState:
         """Return the filter after all readings in use, linear about a trajectory.
 
-        Ledger and discretisation errors are those of the present filter, which has to be near by:
-        None if its square root has other rows.
+        Ledger and discretisation errors are those of the present filter, which has to be near by.
         """
-        end, now = one.end, self.state.now
-        if now.C.shape != end.C.shape:
-            return None
-        J = one.slopes[used]
+        end, now, J = one.end, self.state.now, one.slopes[used]
         # The prior of xi is N(0, I); about the trajectory its mean is -xi.
         mean, C, U = -one.xi, end.C[0], end.U[0]
         if len(J):
@@ -273,17 +269,16 @@ class StoredSamples:
             mean, C, U = mean + W[0] @ half[0], W[0].T @ C, W[0].T @ U
         # Causes are coordinates on the rows of the square root, which is one up to a rotation: the
         # one that brings these rows nearest to those of the present filter.
-        left, _, right = np.linalg.svd(now.C[0] @ np.linalg.pinv(C))
+        rows = max(now.C.shape[1], len(C))
+        C, U = (extended(part[None], rows - len(part))[0] for part in (C, U))
+        parts = {name: getattr(now, name) for name in ("C", "past", "causes")}
+        parts = {name: extended(part, rows - part.shape[1]) for name, part in parts.items()}
+        left, _, right = np.linalg.svd(parts["C"][0] @ np.linalg.pinv(C))
         turn = left @ right
-        return changed(
-            now,
-            q=end.q,
-            u=end.u,
-            da=(mean @ end.C[0])[None],
-            du=(mean @ end.U[0])[None],
-            C=(turn @ C)[None],
-            U=(turn @ U)[None],
-        )
+        parts |= {"C": (turn @ C)[None], "U": (turn @ U)[None]}
+        parts |= {"da": (mean @ end.C[0])[None], "du": (mean @ end.U[0])[None]}
+        found: FilterState = changed(now, q=end.q, u=end.u, **parts)
+        return self.filter.compressed(found) if rows > self.filter.rank else found
 
     def judged(self, one: Passed, used: Mask) -> FilterState | None:
         """Return the filter that has taken the readings in use one by one, about a trajectory.
