@@ -45,7 +45,7 @@ def test_each_case_is_one_file_without_a_law() -> None:
         assert not {"law", "steps", "intake"} & set(case)
 
 
-@pytest.mark.long
+@pytest.mark.study
 def test_intervals_of_the_walks_hold_the_truth() -> None:
     for walk, seeds in (("furnace", 1), ("borehole", 10)):
         outcome = first_hour((walk,), seeds=seeds)

@@ -116,10 +116,9 @@ def check(strategy: st.SearchStrategy[Any], examples: int, function: Callable[..
 
 
 def drawn(few: int) -> Any:
-    """Run a test with some drawn options, in the long tests with more, in studies with many."""
+    """Run a test with some drawn options, and in studies with ten times as many."""
     counts = (
         pytest.param(few, marks=pytest.mark.slow),
-        pytest.param(2 * few, marks=pytest.mark.long),
         pytest.param(10 * few, marks=pytest.mark.study),
     )
     return pytest.mark.parametrize("examples", counts)

@@ -59,6 +59,7 @@ def found(seed: int, law: lp.SensitivityLaw) -> Found:
     identifier = lp.Identifier(model, points, law, u0=0.0, scheme=lp.Alexander2())
     for t, row in zip(TIMES, z, strict=True):
         estimate = identifier.step(float(t), row)
+    estimate = identifier.settled(estimate)
     low, high = estimate["q"].interval()
     prior = 2 * 1.959964 * np.sqrt(model.Q.variance)
     return Found(

@@ -383,7 +383,9 @@ class Live:
             self.result.settle(last := self.identifier.settled(last))
             self.journal.judge(last.verdict.to_dict())
         if self.journal.estimated:
-            self.journal.keep(self.result.snapshot(last or self.identifier.estimate()))
+            # Nothing was left to do where there is no last estimate: the fields stay the same.
+            final = last or self.identifier.settled(self.identifier.estimate())
+            self.journal.keep(self.result.snapshot(final))
 
     def _run(self) -> None:
         ended = False
