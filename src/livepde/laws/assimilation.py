@@ -20,7 +20,7 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, ScoredSample
 
-__all__ = ["OK", "Assimilation", "Decision", "MemberReports", "absorb", "assimilate"]
+__all__ = ["OK", "Assimilation", "GateDecision", "MemberReports", "absorb", "assimilate"]
 
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
@@ -79,7 +79,7 @@ class MemberReports:
         return MemberReports(tuple(statuses), predicted, steps, diagnosed)
 
 
-class Decision(NamedTuple):
+class GateDecision(NamedTuple):
     """What a gate has decided on a sample.
 
     Attributes
@@ -124,10 +124,10 @@ class Assimilation(NamedTuple):
     anchored: Mask | None = None
 
     @property
-    def decision(self) -> Decision:
+    def decision(self) -> GateDecision:
         """What the gate has decided."""
         none = np.zeros_like(self.refused)
-        return Decision(self.refused, none if self.anchored is None else self.anchored)
+        return GateDecision(self.refused, none if self.anchored is None else self.anchored)
 
 
 def without_sample(x: FilterState, sensors: int) -> Assimilation:
@@ -156,7 +156,7 @@ class UpdateOptions:
     gate: Gate = field(default_factory=Gate)
     adaptive: bool = False
     scored: bool = False
-    decision: Decision | None = None
+    decision: GateDecision | None = None
 
 
 def assimilate(

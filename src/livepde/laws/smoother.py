@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from livepde.errors import LawError
-from livepde.laws.assimilation import Decision, absorb
+from livepde.laws.assimilation import GateDecision, absorb
 from livepde.laws.filter_state import FilterState, unaccompanied, unjudged
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.iterated_smoother import expecting, missed, moved
@@ -65,7 +65,7 @@ class _SmootherPass:
     trajectory: Array
     points: list[_Point]
     misfit: float
-    decisions: list[Decision]
+    decisions: list[GateDecision]
 
     @property
     def refuses(self) -> bool:
@@ -128,7 +128,7 @@ def _begun(
     return samples, samples.about(samples.estimated) or samples.about(None)
 
 
-def _fitted(decisions: list[Decision], used: Mask, data: FixedInterval) -> list[Decision]:
+def _fitted(decisions: list[GateDecision], used: Mask, data: FixedInterval) -> list[GateDecision]:
     """Return the gate's decisions, those on the last samples as a refit has made them."""
     first = len(decisions) - len(used)
     found = decisions[:first]
@@ -136,7 +136,7 @@ def _fitted(decisions: list[Decision], used: Mask, data: FixedInterval) -> list[
         decisions[first:], used, [data.opening, *data.intervals][first:], strict=True
     ):
         refused = (np.isfinite(sample.z1) & ~kept)[None]
-        found.append(Decision(refused, decision.anchored & refused))
+        found.append(GateDecision(refused, decision.anchored & refused))
     alike = all((a.refused == b.refused).all() for a, b in zip(found, decisions, strict=True))
     return decisions if alike else found
 
@@ -220,7 +220,7 @@ class _FixedInterval:
         initial: bool,
         after: FilterState,
         data: FixedInterval,
-        decisions: Sequence[Decision] | None = None,
+        decisions: Sequence[GateDecision] | None = None,
     ) -> None:
         self.work, self.data, self.decisions = work, data, decisions
         self.jumps = set(data.jumps) if work.jumps is not None else set()
@@ -236,12 +236,14 @@ class _FixedInterval:
             length=length,
         )
 
-    def decided(self, decisions: Sequence[Decision]) -> _FixedInterval:
+    def decided(self, decisions: Sequence[GateDecision]) -> _FixedInterval:
         """Return the same samples with the gate's decisions on them."""
         start, initial, after = self.window.start, self.window.initial, self.window.now
         return _FixedInterval(self.work, start, initial, after, self.data, decisions)
 
-    def _absorbed(self, x: FilterState, span: Span, number: int) -> tuple[FilterState, Decision]:
+    def _absorbed(
+        self, x: FilterState, span: Span, number: int
+    ) -> tuple[FilterState, GateDecision]:
         """Return the filter after the update by a sample, and the gate's decision on it."""
         options = self.work.options
         if self.decisions is not None:
@@ -291,7 +293,7 @@ class _FixedInterval:
             misfit = np.inf  # a pass about each estimate in turn follows no single trajectory
         return _SmootherPass(np.array(followed), points, misfit, decisions)
 
-    def _started(self, trajectory: Array | None) -> tuple[FilterState, float, Decision]:
+    def _started(self, trajectory: Array | None) -> tuple[FilterState, float, GateDecision]:
         """Return the filter after a sample at the start, the misfit, and the gate's decision."""
         filter_, opening, start = self.work.filter, self.data.opening, self.window.start
         q, shift = start.q[0], np.zeros(start.C.shape[2])
@@ -305,7 +307,7 @@ class _FixedInterval:
         span = filter_.span(filter_.problem.unread(opening))
         predicted, Y = filter_.sensors.observe(x, span.end)
         none = np.zeros(predicted.shape, dtype=bool)
-        decision = Decision(none, none)
+        decision = GateDecision(none, none)
         if Y.any():  # as the law begins
             misfit += missed(filter_, x, opening)
             x, decision = self._absorbed(x, span, 0)
