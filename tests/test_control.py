@@ -624,7 +624,11 @@ def told(**changes: Any) -> Any:
         ({"q_std": None}, "no covariance"),
         ({"q": np.array([0.0]), "q_std": np.array([0.0])}, "lies at its bound"),
         ({"verdict": Verdict.of([Finding("flat", "caution", "f")])}, ""),
-        ({"verdict": Verdict.unjudged()}, "Not judged: whether the model"),
+        ({"verdict": Verdict.unjudged()}, ""),  # of few samples the innovations are a test
+        (
+            {"verdict": Verdict.unjudged(), "diagnostics": lp.laws.Diagnostics()},
+            "Not judged: whether the model",
+        ),
     ],
 )
 def test_an_estimate_is_trusted_only_where_all_tests_pass(changes, says):

@@ -55,7 +55,7 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
     run.journal.close()
     with Journal.open(tmp_path / "journal.sqlite") as reader:
         kept = reader.layout.dataset(list(reader))
-    # The last estimate of the result is that of the fit at the end: in the journal its fields alone.
+    # The last estimate of the result is that of the final fit; the journal has its fields.
     kept, told = (data.isel(time=slice(-1)) for data in (kept, found))
     xr.testing.assert_identical(kept.assign_attrs(verdict=told.attrs["verdict"]), told)
 

@@ -34,8 +34,8 @@ class Trust:
     - Each unknown number is well determined: its standard deviation is at most `spread` times its
       value or, if it may be negative, times the prior standard deviation where that is larger.
     - Each lies inside of its bounds, not at one.
-    - The run has judged itself (`Estimate.verdict`): one of fewer than 20 samples, or of a law that
-      makes no tests, is "not judged".
+    - It was tested at all: by these innovations, or by the verdict of the run. A law that makes no
+      tests gives no estimate to control by.
 
     Parameters
     ----------
@@ -84,7 +84,8 @@ class Trust:
                 return f"{label} = {value:.4g} is known to {deviation:.2g} only"
             if not low < value < high:
                 return f"{label} = {value:.4g} lies at its bound"
-        return "" if estimate.verdict.judged else estimate.verdict.sentences[0]
+        tested = estimate.verdict.judged or math.isfinite(misfit)
+        return "" if tested else estimate.verdict.sentences[0]
 
 
 class Estimator(Protocol):
