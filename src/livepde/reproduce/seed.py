@@ -18,6 +18,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.integrate import trapezoid
 
 from livepde import paper, plots
 from livepde.fem import Field, Normal, dot, grad, hermite, interval
@@ -165,7 +166,7 @@ def _row(twin: Twin, gain: Any, c1: Any, found: Track, expected: float | None) -
 
 def shift(x: Array, q: Array) -> float:
     """Return the first moment of q about the middle, over the integral of q*."""
-    moment, whole = np.trapezoid((x - 0.5) * q, x), np.trapezoid(q_true([x]), x)
+    moment, whole = trapezoid((x - 0.5) * q, x), trapezoid(q_true([x]), x)
     return float(moment / whole)
 
 
