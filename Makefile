@@ -55,7 +55,7 @@ test-fast: $(READY)  ## Run those that take a fraction of a second each
 test-system: $(READY)  ## Run those with programs of their own, brokers, browsers and pages
 	@$(BIN)/$(PYTEST) $(SYSTEM)
 
-test-long: $(READY)  ## Run those that take longer, which CI runs, too
+test-long: $(READY)  ## Run those that take longer, before a release and after changes of laws
 	@$(BIN)/$(PYTEST) $(LONG)
 
 test-threads: $(READY)  ## Run those of threads with 100 trials of each law

@@ -33,6 +33,7 @@ def failed(outcome) -> list[str]:
 
 
 @pytest.mark.process
+@pytest.mark.long
 @pytest.mark.parametrize("part", ["file", "stdin", pytest.param("mqtt", marks=MQTT)])
 def test_runs_are_killed_and_lose_nothing(part):
     if part == "mqtt":
@@ -45,6 +46,7 @@ def test_runs_are_killed_and_lose_nothing(part):
 
 
 @pytest.mark.process
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="needs prlimit")
 def test_disks_fail_and_nothing_is_lost(monkeypatch):
     monkeypatch.setattr(disk, "CALLS", {})
@@ -58,6 +60,7 @@ def test_disks_fail_and_nothing_is_lost(monkeypatch):
 
 
 @pytest.mark.broker
+@pytest.mark.long
 @MQTT
 def test_sources_go_away_and_come_back():
     pytest.importorskip("paho.mqtt")
