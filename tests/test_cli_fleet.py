@@ -289,7 +289,6 @@ def longer(alike):
 
 
 @pytest.mark.process
-@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="workers are found in /proc")
 @pytest.mark.usefixtures("longer")
 def test_a_killed_worker_is_replaced_and_told():
