@@ -145,8 +145,7 @@ class UpdateOptions:
     gate
         Which readings are used.
     adaptive
-        True if the noise is a first guess whose multiple is found from the samples; their
-        likelihood is kept then, too.
+        True if the noise is a first guess whose multiple is found from the samples.
     scored
         True if the likelihood of the samples is kept.
     decision
@@ -235,7 +234,7 @@ def absorb(
     parts["innovations"] = x.innovations.add(e, measured, newest)
     new, made = filter_.update(x, Y, d, **parts)
     learned: dict[str, Any] = {}
-    if options.adaptive or options.scored:
+    if options.scored:
         logs = (np.log(noise) * used).sum(axis=1)
         learned["evidence"] = x.evidence - 0.5 * made.misfit - made.spread - logs
     if options.adaptive:

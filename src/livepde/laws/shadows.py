@@ -340,7 +340,7 @@ class InputShadow(Shadow):
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
         """Return the error of inputs by straight lines, and by values held in a gap."""
         length, change = span.t1 - span.t0, span.inputs1 - span.inputs0
-        if len(length) < len(s):  # the members of a bank have their samples in common
+        if len(length) < len(s):  # members that have their samples in common
             length = np.repeat(length, len(s))
         if len(change) < len(s):
             change = np.repeat(change, len(s), axis=0)
