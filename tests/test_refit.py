@@ -273,3 +273,17 @@ def test_a_reading_whose_place_is_missing_is_not_fitted():
     assert one.fit is not None
     assert one.fit.cost == pytest.approx(other.fit.cost)
     assert one.q == pytest.approx(other.q)
+
+
+def test_a_fit_that_leaves_out_many_readings_says_so():
+    """Also where its filter, which has taken the others one by one, has refused none of them."""
+    z, wild = np.array(measured()), np.arange(len(TIMES)) % 6 == 3
+    who = column((0.3, 0.1, 0.05, 0.03))
+    last = who.run(stream((z + np.where(wild, 0.3, 0.0)).tolist())).last
+    assert last.fit is not None
+    assert (last.fit.readings, last.fit.refused) == (len(TIMES), wild.sum())
+    (said,) = [one for one in last.verdict.findings if one.what == "fit"]
+    assert said.severity == "caution"
+    assert "left out" in said.text
+    clean = column((0.3, 0.1, 0.05, 0.03)).run(stream()).last
+    assert not [one for one in clean.verdict.findings if one.what == "fit"]

@@ -515,10 +515,17 @@ class Identifier:
         if state is self._state:
             return estimate
         latent, judge = self.law.deferred(self._work, state)
+
+        def diagnose() -> Diagnostics[float]:
+            # What the last sample brought stays; the shifts belong to the new estimate.
+            now = self.law.diagnosed(self._work, state)
+            return replace(estimate.diagnostics, shifts=now.shifts)
+
         return replace(
             estimate,
             belief=self.problem.physical(latent()),
-            judge=self._judge(judge, estimate.diagnose),
+            diagnose=diagnose,
+            judge=self._judge(judge, diagnose),
             fit=self.law.fit(self._work, state),
         )
 

@@ -84,7 +84,7 @@ class Trust:
                 return f"{label} = {value:.4g} is known to {deviation:.2g} only"
             if not low < value < high:
                 return f"{label} = {value:.4g} lies at its bound"
-        tested = estimate.verdict.judged or math.isfinite(misfit)
+        tested = math.isfinite(misfit) or estimate.verdict.judged
         return "" if tested else estimate.verdict.sentences[0]
 
 

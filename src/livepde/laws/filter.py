@@ -1,9 +1,9 @@
 """The filter: state and reduced unknowns with a joint square root, about a linearisation point.
 
 Reduced-order filter of Moireau, Chapelle and Le Tallec (2008), written for several members at once:
-the leading axis of every array is the members. One is an identifier, six a bank, any number a
-fleet. With a ~ N(0, I) the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q
-in q and P = [U C]^T [U C] the joint covariance of u and a,
+the leading axis of every array is the members. One is an identifier, any number a fleet. With
+a ~ N(0, I) the reduced unknowns, S the Jacobian of a step, A the derivative of A(u) q in q and
+P = [U C]^T [U C] the joint covariance of u and a,
 
     predict   one implicit step for u;   U+ S^T = U M/h - C Phi^T A(u+)^T
     update    d = z - h(u, q),  Y = U H_u^T + C Phi^T H_q^T,  W W^T = (I + Y N^-1 Y^T)^-1

@@ -173,8 +173,8 @@ class Fit:
     passes
         Passes over these samples that all fits of the run so far have taken; a pass of the state
         alone counts as its share.
-    refused
-        Readings that were left out.
+    readings, refused
+        Readings of these samples, and those of them that were left out.
     converged
         False if the search did not end in a minimum, or in one that explains the samples.
     """
@@ -182,6 +182,7 @@ class Fit:
     samples: int
     cost: float
     passes: float
+    readings: int
     refused: int
     converged: bool
 

@@ -84,10 +84,12 @@ def _after(
     if found is None or x is None:
         fit = changed(state.fit, samples=count, converged=np.zeros(1))
         return changed(state, fit=fit)
+    there = np.isfinite(samples.readings)
     fit = FitState(
         samples=count,
         cost=np.array([found.best.cost(found.used)]),
-        refused=np.array([float((np.isfinite(samples.readings) & ~found.used).sum())]),
+        readings=np.array([float(there.sum())]),
+        refused=np.array([float((there & ~found.used).sum())]),
         work=spent + found.passes * len(samples.spans),
         converged=np.array([float(found.converged)]),
     )

@@ -173,9 +173,11 @@ class FitState:
     ----------
     samples
         How many samples it took, 0 before the first one, shape (members,).
-    cost, refused
-        Half the sum of squares of residuals in use and of the unknowns, in standard deviations, and
-        readings that were not used; shape (members,).
+    cost
+        Half the sum of squares of residuals in use and of the unknowns, in standard deviations,
+        shape (members,).
+    readings, refused
+        Readings of these samples, and those of them that were not used, shape (members,).
     work
         Samples that all refits of the window have taken, one with derivatives counting 1.
     converged
@@ -184,6 +186,7 @@ class FitState:
 
     samples: IntArray
     cost: Array
+    readings: Array
     refused: Array
     work: Array
     converged: Array
@@ -192,7 +195,9 @@ class FitState:
     def none(cls, members: int = 1) -> FitState:
         """Return the value before any refit."""
         zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
-        return cls(samples=nothing, cost=zero, refused=zero, work=zero, converged=zero)
+        return cls(
+            samples=nothing, cost=zero, readings=zero, refused=zero, work=zero, converged=zero
+        )
 
     def member(self, k: int) -> Fit | None:
         """Return the last refit of one member, None before it."""
@@ -202,6 +207,7 @@ class FitState:
             samples=int(self.samples[k]),
             cost=float(self.cost[k]),
             passes=float(self.work[k]) / int(self.samples[k]),
+            readings=int(self.readings[k]),
             refused=int(self.refused[k]),
             converged=bool(self.converged[k]),
         )

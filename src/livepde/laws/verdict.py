@@ -16,6 +16,7 @@ from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
+    REFUSED,
     WINDOWS,
     Dictionary,
     Finding,
@@ -88,14 +89,28 @@ def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict
 
 
 def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
-    """Return a verdict with a finding where the last fit of the samples has not converged."""
-    if fit is None or fit.converged:
+    """Return a verdict with findings on the last fit of the samples.
+
+    That it has not converged, or has left out more than 2 % of the readings.
+    """
+    if fit is None:
         return judge
-    text = (
-        f"The fit of {fit.samples} samples did not converge: start from another prior, or check "
-        "the model."
-    )
-    return lambda: judge().with_findings([Finding("fit", "do not trust", text)])
+    found = []
+    if not fit.converged:
+        text = (
+            f"The fit of {fit.samples} samples did not converge: start from another prior, or "
+            "check the model."
+        )
+        found.append(Finding("fit", "do not trust", text))
+    share = fit.refused / max(fit.readings, 1)
+    if share > REFUSED:
+        text = (
+            f"The fit of {fit.samples} samples left out {share:.1%} of the readings "
+            f"({fit.refused}): they lie far from those around them, or from the model."
+        )
+        remedy = "Look at these readings, state a larger noise, or open the gate."
+        found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
+    return (lambda: judge().with_findings(found)) if found else judge
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

@@ -22,6 +22,7 @@ from livepde.verdict import (
     FLAT,
     MOST,
     REFINE,
+    REFUSED,
     Finding,
     Severity,
     Shifts,
@@ -51,7 +52,6 @@ MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twic
 MOST_JUMPS = 5  # that get a sentence of their own
 WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
-REFUSED = 0.02  # share of the readings that a gate refuses
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 INPUT_KINDS = {

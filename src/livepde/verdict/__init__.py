@@ -1,6 +1,6 @@
 """Verdict of a run on itself: its level, with the findings against it."""
 
-from livepde.verdict.assess import Position, assess
+from livepde.verdict.assess import REFUSED, Position, assess
 from livepde.verdict.channel_ledgers import InputLedger, WithheldLedger
 from livepde.verdict.directions import Dictionary, ScoreDirection
 from livepde.verdict.findings import (
@@ -31,6 +31,7 @@ __all__ = [
     "NOT_JUDGED",
     "NUMBERS",
     "REFINE",
+    "REFUSED",
     "TELLING",
     "WINDOWS",
     "Cause",
