@@ -20,7 +20,15 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, ScoredSample
 
-__all__ = ["OK", "Assimilation", "GateDecision", "MemberReports", "absorb", "assimilate"]
+__all__ = [
+    "OK",
+    "Assimilation",
+    "GateDecision",
+    "MemberReports",
+    "absorb",
+    "assimilate",
+    "no_readings",
+]
 
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
@@ -130,8 +138,8 @@ class Assimilation(NamedTuple):
         return GateDecision(self.refused, none if self.anchored is None else self.anchored)
 
 
-def without_sample(x: FilterState, sensors: int) -> Assimilation:
-    """Return what a sample without readings has brought."""
+def no_readings(x: FilterState, sensors: int) -> Assimilation:
+    """Return the outcome of a sample without readings."""
     nothing, none = np.zeros((len(x), sensors)), np.zeros((len(x), sensors), dtype=bool)
     return Assimilation(nothing, 0, OK, np.ones(len(x), dtype=bool), none, 0.0)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy
 
+from livepde.laws.outliers import FEW, near_most, near_neighbours, usual_size
 from livepde.laws.refit_options import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, Mask
@@ -36,10 +37,8 @@ QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
 SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
 LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
 GATE_ROUNDS = 4
-GATE = 4.0  # usual deviations from the neighbours beyond which a residual is refused
-WILD = 30.0  # the same for readings, before there is a fit
-NEIGHBOURS = 3  # to each side
-FEW = 2 * NEIGHBOURS  # readings of a sensor of which none has enough neighbours
+WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
+GATE = 4.0  # the same for residuals, from those before and after them
 LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use is taken to keep
 
 
@@ -108,7 +107,7 @@ class _Search:
         readings = self.samples.readings
         self.used = np.isfinite(readings)
         if self.samples.gated:
-            self.used = _plausible(readings, WILD) & _usual(readings)
+            self.used = near_neighbours(readings, WILD) & near_most(readings, WILD)
 
     @property
     def _ends(self) -> float:
@@ -129,9 +128,9 @@ class _Search:
         shown = np.einsum("skr,skr->sk", J @ np.linalg.inv(H), J)
         # Residuals of readings in use vary less than the noise, those of others more.
         e = r / np.sqrt(np.where(self.used, np.maximum(1.0 - shown, LEVERAGE), 1.0 + shown))
-        near = _plausible(r)
+        near = near_neighbours(r, GATE)
         for k, column in enumerate(e.T):
-            usual = max(1.0, 1.4826 * _median(np.abs(column[self.used[:, k]])))
+            usual = usual_size(column[self.used[:, k]])
             limit = WILD if np.isfinite(column).sum() > FEW else gate
             with np.errstate(invalid="ignore"):
                 near[:, k] &= np.abs(column) <= limit * usual
@@ -359,52 +358,3 @@ def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
             if len(block):
                 squares.append(float((block**2).mean()) / noise)
     return float(np.quantile(squares, QUANTILE)) if squares else 0.0
-
-
-def _plausible(values: Array, limit: float = GATE) -> Mask:
-    """Return which values of each sensor lie near the median of their neighbours.
-
-    A model error, which changes slowly, stays; `values` are in units of the noise, NaN: missing.
-    """
-    used = np.isfinite(values)
-    for k, column in enumerate(values.T):
-        (places,) = np.isfinite(column).nonzero()
-        seen = column[places]
-        if len(seen) <= FEW:
-            continue
-        away = np.abs(seen - _of_neighbours(seen))
-        usual = max(1.0, 1.4826 * float(np.median(away)))  # of normal values: the deviation
-        used[places, k] = away <= limit * usual
-    return used
-
-
-def _usual(values: Array) -> Mask:
-    """Return which values of each sensor are not far off most others, in their usual distance.
-
-    A sensor that shows a wrong constant for some time has neighbours that agree with it. A right
-    value that is far off, as after a long rest, is taken back once a fit without it is found.
-    """
-    used = np.isfinite(values)
-    for k, column in enumerate(values.T):
-        seen = column[used[:, k]]
-        if len(seen) > FEW:
-            away = np.abs(column - np.median(seen))
-            usual = max(1.0, 1.4826 * _median(away[used[:, k]]))
-            used[:, k] &= np.nan_to_num(away) <= WILD * usual
-    return used
-
-
-def _median(values: Array) -> float:
-    """Return the median, 0 of no value."""
-    return float(np.median(values)) if len(values) else 0.0
-
-
-def _of_neighbours(values: Array) -> Array:
-    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
-    count, reach = len(values), NEIGHBOURS
-    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
-    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
-    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
-    first = [np.median(values[which]) for which in edges.values()]
-    last = [np.median(values[count - 1 - which]) for which in edges.values()]
-    return np.concatenate([first, inner, last[::-1]])

@@ -16,7 +16,7 @@ from livepde.laws.assimilation import (
     UpdateOptions,
     absorb,
     assimilate,
-    without_sample,
+    no_readings,
 )
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
@@ -467,7 +467,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return state.fit.member(0)
 
     def diagnosed(self, work: SensitivityWork, state: SensitivityState) -> Diagnostics[float]:
-        told = without_sample(state.now, work.filter.problem.observed.size)
+        told = no_readings(state.now, work.filter.problem.observed.size)
         return reports_of(work, state.now, told).member(0).diagnostics
 
     def settled(self, work: SensitivityWork, state: SensitivityState) -> SensitivityState:

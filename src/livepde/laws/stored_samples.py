@@ -205,30 +205,45 @@ class StoredSamples:
                     return
             yield changed(x, u=columns[0], U=columns[1:].transpose(1, 0, 2), kept=kept), span
 
+    def _compared(self, start: FilterState) -> Iterator[tuple[FilterState, Array, Array]]:
+        """Yield trajectories after each span, with residuals and derivatives in units of the noise.
+
+        Shapes (points, sensors) and (points, r, sensors); empty at samples without a reading.
+        """
+        nothing = np.zeros((0, 0)), np.zeros((0, 0, 0))
+        for number, (x, span) in enumerate(self._followed(start)):
+            if not self.seen[number]:
+                yield x, *nothing
+                continue
+            predicted, Y = self.filter.sensors.observe(x, span.end)
+            noise, there = self.noise[number], np.isfinite(self.readings[number])
+            yield x, np.where(there, (span.z1 - predicted) / noise, np.nan), Y / noise
+
     def about(self, xi: Array) -> Passed | None:
         """Return the samples about one trajectory with derivatives; None if a step fails."""
-        r, x, number = self.missing.copy(), None, -1
-        J = np.zeros((*r.shape, len(xi)))
-        for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=True))):
-            if self.seen[number]:
-                predicted, Y = self.filter.sensors.observe(x, span.end)
-                there = np.isfinite(self.readings[number])
-                r[number, there] = ((span.z1[0] - predicted[0]) / self.noise[number])[there]
-                J[number, there] = (Y[0].T / self.noise[number][:, None])[there]
+        there = np.isfinite(self.readings)
+        r, J = self.missing.copy(), np.zeros((*there.shape, len(xi)))
+        x, number = None, -1
+        for number, (after, missed, Y) in enumerate(
+            self._compared(self.placed(xi[None], rows=True))
+        ):
+            x = after
+            if len(missed):
+                r[number] = missed[0]
+                J[number, there[number]] = Y[0].T[there[number]]
         if x is None or number + 1 < len(self.spans):
             return None
         # Of squares: what overflows there has neither a cost nor a direction.
-        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum()
-        squares += (r[np.isfinite(self.readings)] ** 2).sum()
+        squares = (J**2).sum() + (x.u**2).sum() + (x.U**2).sum() + (r[there] ** 2).sum()
         return Passed(xi=xi, residuals=r, slopes=J, end=x) if np.isfinite(squares) else None
 
     def residuals(self, xi: Array) -> Array | None:
         """Return the residuals about one trajectory; None if a step fails."""
         r, number = self.missing.copy(), -1
-        for number, (x, span) in enumerate(self._followed(self.placed(xi[None], rows=False))):
-            if self.seen[number]:
-                predicted, _ = self.filter.sensors.observe(x, span.end)
-                r[number] = (span.z1[0] - predicted[0]) / self.noise[number]
+        compared = self._compared(self.placed(xi[None], rows=False))
+        for number, (_, missed, _) in enumerate(compared):
+            if len(missed):
+                r[number] = missed[0]
         return r if number + 1 == len(self.spans) else None
 
     def costs(self, points: Array, used: Mask, limit: float = np.inf) -> tuple[Array, float]:
@@ -240,15 +255,12 @@ class StoredSamples:
         whole, taken = np.zeros(len(points), dtype=bool), 0
         for first in range(0, len(points), AT_ONCE):
             part = slice(first, first + AT_ONCE)
-            steps = self._followed(self.placed(points[part], rows=False))
-            for number, (x, span) in enumerate(steps):
+            compared = self._compared(self.placed(points[part], rows=False))
+            for number, (x, missed, _) in enumerate(compared):
                 taken += len(x)
                 whole[part] = number + 1 == len(self.spans)
-                if not self.seen[number]:
-                    continue
-                predicted, _ = self.filter.sensors.observe(x, span.end)
-                missed = np.where(used[number], span.z1 - predicted, 0.0) / self.noise[number]
-                found[part] += 0.5 * (missed * missed).sum(axis=1)
+                if len(missed):
+                    found[part] += 0.5 * (np.where(used[number], missed, 0.0) ** 2).sum(axis=1)
                 if not (found[part] < limit).any():
                     whole[part] = False
                     break
