@@ -11,7 +11,7 @@ from livepde.models import heat
 
 SENSORS = lp.Points([0.2, 0.5, 0.8], noise=0.02)
 TIMES = 0.1 * np.arange(41)
-# Constant unknowns have a fit of their own, unless a memory fades, however little.
+# Constant unknowns are fitted instead, unless a memory fades, however slowly.
 FADING = {"memory": 1e9}
 
 

@@ -88,8 +88,8 @@ class Jumps:
 
     The usual size and correlation are those of the last 500 samples that were looked at, with the
     first `settle`; after these none counts for more than three times the usual size. So a jump
-    hardly changes the yardstick of the next one. Samples are compared with what was usual before
-    them: a jump that shows slowly must not become usual while it is looked for.
+    hardly changes the yardstick of the next one. Samples are compared with the usual size before
+    them, so that a jump that shows slowly is not compared with itself.
 
     Parameters
     ----------

@@ -105,7 +105,7 @@ def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState 
     best = samples.updated(found.best, found.used)
     away = apart(samples.filter, best, now)
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
-    # refit of the same samples may find them anew.
+    # refit of the same samples may compute them again.
     if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
         return best
     return samples.judged(found.best, found.used)
