@@ -459,6 +459,26 @@ def test_slow_visitors_do_not_keep_others_out(serving, monkeypatch, token):
 
 
 @pytest.mark.slow
+def test_a_server_closes_while_an_answer_wakes_it(monkeypatch):
+    """The threads that answer pull the same trigger, and another pull may be the one that ends."""
+    server = Server(hello, Address())
+    assert ask(server)[0] == 200
+    trigger = server._server.trigger
+    pull = trigger._physical_pull
+
+    def slowly() -> None:
+        pull()
+        server._thread.join(PATIENCE)
+        pull()
+
+    monkeypatch.setattr(trigger, "_physical_pull", slowly)
+    server.close()
+    assert not server._thread.is_alive()
+    with pytest.raises(ConnectionRefusedError):
+        ask(server)
+
+
+@pytest.mark.slow
 def test_who_may_not_ask_is_answered_whatever_is_sent_along(serving):
     server = serving(token=TOKEN)
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)

@@ -117,9 +117,20 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
         def end() -> None:
             for visitor in [*self.active_channels.values()]:
                 visitor.handle_close()
+            self.trigger.del_channel(self._map)
             wasyncore.close_all(self._map)
 
         self.trigger.pull_trigger(end)
+
+    def close(self) -> None:
+        """Close the listening socket; the trigger stays open for those who may be pulling it."""
+        wasyncore.dispatcher.close(self)
+
+    def release(self) -> None:
+        """End the threads that answer, and close the trigger that they pull; after `run`."""
+        self.task_dispatcher.shutdown()
+        if not self.task_dispatcher.threads:
+            self.trigger.close()
 
 
 def listener(application: WSGIApplication, place: socket.socket, refusal: Refusal) -> Listener:

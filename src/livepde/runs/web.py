@@ -148,7 +148,7 @@ class Server:
         if self._thread.is_alive():
             self._server.stop()
             self._thread.join()
-            self._server.task_dispatcher.shutdown()
+            self._server.release()
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
