@@ -53,7 +53,12 @@ def main(D: float = 3e-15) -> dict[str, float]:
     model, cell = particle(24), Cell(D)
     sensor = lp.observation.Transformed(lp.Points({"V": R}), voltage, noise=NOISE)
     identifier = lp.Identifier(
-        model, sensor, lp.SensitivityLaw(), u0=0.3 * FULL, scheme=lp.Alexander2(), hold=True
+        model,
+        sensor,
+        lp.SensitivityLaw(),
+        u0=0.3 * FULL,
+        scheme=lp.Alexander2(),
+        between={"I": "next"},  # the current since the sample before
     )
 
     seen = lp.observation.Functionals(

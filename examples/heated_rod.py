@@ -48,7 +48,10 @@ def main() -> dict[str, tuple[float, float]]:
     model, plant = rod(30), Plant()
     sensors = lp.Points({"T_5": 0.05, "T_10": 0.10}, noise=0.2)
     law = lp.SensitivityLaw(jumps=lp.Jumps())
-    identifier = lp.Identifier(model, sensors, law, u0=ROOM, hold=True, scheme=lp.Alexander2())
+    applied = {"heater": "next"}  # since the sample before
+    identifier = lp.Identifier(
+        model, sensors, law, u0=ROOM, between=applied, scheme=lp.Alexander2()
+    )
 
     seen = lp.Points({"face": 0.0, "tip": 0.15})
     reduced = ct.reduce(model, seen, controls=["heater"], sensors=sensors)

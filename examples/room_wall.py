@@ -71,7 +71,8 @@ def main(days: int = 4) -> dict[str, tuple[float, float]]:
     """Heat a cold building; return the estimates, and how long it was too cold on the last day."""
     model, truth = room(4), room(10)
     sensors = lp.Points({"air": 0.0, "face": 0.03}, noise=0.1)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=COLD, hold=True)
+    applied = {"heater": "next", "outside": "next"}  # since the sample before
+    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=COLD, between=applied)
     reduced = ct.reduce(model, lp.Points({"air": 0.0}), ["heater"], sensors=sensors, u=COLD)
     goal = ct.Goal(
         track={},

@@ -50,14 +50,15 @@ class Gaussian:
 class Rod:
     """The rod with its time steps.
 
-    `hold`: inputs have their later value over a whole interval. `input_std`: deviation of the error
-    of T_0, constant over an interval, independent from one to the next.
+    `between`: how T_0 and Q behave in an interval: on a line, or with the value of its start (hold)
+    or its end (next). `input_std`: deviation of the error of T_0, constant over an interval,
+    independent from one to the next.
     """
 
     cells: int
     scheme: str = "alexander"
     dt_max: float = math.inf
-    hold: bool = False
+    between: tuple[str, str] = ("line", "line")
     input_std: float = 0.0
 
     @property
@@ -86,13 +87,13 @@ class Rod:
         u, (s, c) = state[:n].copy(), state[n : n + 2]
         count = 1 if t1 - t0 <= self.dt_max else math.ceil((t1 - t0) / self.dt_max - 1e-9)
         h = (t1 - t0) / count
-        start = last if self.hold else first
+        ends = {"line": (first, last), "hold": (first, first), "next": (last, last)}
 
         def stage(before: np.ndarray, t: float, length: float) -> np.ndarray:
             share = (t - t0) / (t1 - t0)
             T_0, Q = (
-                (1.0 - share) * getattr(start, name) + share * getattr(last, name)
-                for name in ("T_0", "Q")
+                (1.0 - share) * getattr(ends[own][0], name) + share * getattr(ends[own][1], name)
+                for name, own in zip(("T_0", "Q"), self.between, strict=True)
             )
             S = M / length + B
             right = M @ before / length + (s + Q) * loads[:, 0] + c * loads[:, 1]

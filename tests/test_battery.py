@@ -157,7 +157,8 @@ def test_an_ageing_diffusivity_is_followed_through_a_voltage():
         noise=noise,
     )
     observed = observe(model, voltage)
-    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, hold=True)
+    between = {"I": "next"}
+    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, between=between)
     rng = np.random.default_rng(0)
     c = model.initial(START)
     times = np.arange(0.0, end + 1.0, 40.0)

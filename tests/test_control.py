@@ -52,7 +52,7 @@ GOAL = ct.Goal(track={"tip": 1.0}, move={"heater": 500.0}, inputs={"heater": (0.
 def identifier(**options: Any) -> lp.Identifier:
     given = {
         "law": lp.SensitivityLaw(refit=lp.laws.Refit(start=4), shadows=None),
-        "hold": True,
+        "between": {"heater": "next", "room": "next"},
         "scheme": lp.Alexander2(),
         **options,
     }
@@ -908,17 +908,19 @@ def test_references_and_forecasts_are_checked():
         ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"heater": np.inf})
     with pytest.raises(lp.errors.SampleError, match="unknown input 'wind'"):
         loop.step(0.0, z, {"wind": ROOM}, reference={"tip": 45.0})
-    with pytest.raises(lp.errors.ConfigurationError, match="hold=True"):
-        ct.Loop(identifier(hold=False), ct.LQ(reduced(), GOAL, PERIOD))
+    with pytest.raises(lp.errors.ConfigurationError, match="between={'room': 'next'}"):
+        ct.Loop(identifier(between={"heater": "next"}), ct.LQ(reduced(), GOAL, PERIOD))
 
 
 @pytest.mark.slow
 def test_inputs_that_are_held_do_not_ramp():
     """Several substeps see what the sample brings, as many samples with the same input would."""
     nothing, ends = np.full(2, np.nan), []
-    for hold, parts in ((True, 1), (False, 1), (True, 4)):
+    for between, parts in (("next", 1), ("line", 1), ("next", 4)):
         one = identifier(
-            hold=hold, scheme=lp.ImplicitEuler(), dt_max=15.0 if parts == 1 else np.inf
+            between={"heater": between, "room": between},
+            scheme=lp.ImplicitEuler(),
+            dt_max=15.0 if parts == 1 else np.inf,
         )
         one.step(0.0, [ROOM, ROOM], {"heater": 0.0, "room": ROOM})
         for k in range(1, parts):

@@ -109,11 +109,11 @@ def mended(*, fault: bool) -> list[str]:
 
 
 @cache
-def fed(*, gaps: bool = False, hold: bool = False) -> list[str]:
+def fed(*, gaps: bool = False, between: str = "line") -> list[str]:
     values = rods.driven(rods.TIMES)
     if gaps:
         values[1:][np.random.default_rng(5).random(len(values) - 1) < 0.3] = np.nan
-    return kinds(rods.fed(values, hold=hold).verdict)
+    return kinds(rods.fed(values, between=between).verdict)
 
 
 @cache
@@ -251,7 +251,7 @@ RUNS = {
     "assess: prior": Pair(partial(rod, "far from the prior"), rod),
     "channel_ledgers: input": Pair(partial(fed, gaps=True), fed),
     "channel_ledgers: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
-    "shifts: hold": Pair(partial(fed, hold=True), fed),
+    "shifts: hold": Pair(partial(fed, between="next"), fed),
     "shifts: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
     "findings: bound": Pair(partial(warned_of, NARROW), partial(warned_of, ONE)),
     "findings: flat": Pair(partial(warned_of, BESIDE), partial(warned_of, ONE)),

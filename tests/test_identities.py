@@ -42,7 +42,7 @@ class Options:
     calibrated: str  # "no", "offset", "curve"
     multiplies: bool  # an unknown also multiplies the state: not linear
     input_noise: bool
-    hold: bool
+    between: tuple[str, str]  # of T_0 and of Q
     dt_max: float
     scheme: str
     halvings: int
@@ -85,7 +85,7 @@ def options(**fixed: Any) -> st.SearchStrategy[Options]:
         "calibrated": st.sampled_from(["no", "offset", "curve"]),
         "multiplies": st.booleans(),
         "input_noise": st.booleans(),
-        "hold": st.booleans(),
+        "between": st.tuples(*2 * [st.sampled_from(["line", "hold", "next"])]),
         "dt_max": st.sampled_from([np.inf, np.inf, 0.09]),
         "scheme": st.sampled_from(sorted(SCHEMES)),
         "halvings": st.sampled_from([0, 8]),
@@ -196,6 +196,7 @@ def parts(
         "dt_max": o.dt_max * frame.time,
         "halvings": o.halvings,
         "assimilate_from": frame.origin + (0.15 if o.spin_up else -1.0) * frame.time,
+        "between": dict(zip(("T_0", "Q"), o.between, strict=True)),
         "input_noise": {"T_0": INPUT_NOISE * frame.state} if o.input_noise else None,
     }
     return (found, observation(o.calibrated, frame), law(o, kind)), keywords
@@ -205,7 +206,7 @@ def identifier(
     o: Options, frame: Frame = PLAIN, kind: type[lp.SensitivityLaw] = lp.SensitivityLaw
 ) -> lp.Identifier:
     positional, keywords = parts(o, frame, kind)
-    return lp.Identifier(*positional, hold=o.hold, **keywords)
+    return lp.Identifier(*positional, **keywords)
 
 
 def rod(o: Options) -> kalman.Rod:
@@ -213,7 +214,7 @@ def rod(o: Options) -> kalman.Rod:
         cells=CELLS,
         scheme=o.scheme,
         dt_max=o.dt_max,
-        hold=o.hold,
+        between=o.between,
         input_std=INPUT_NOISE if o.input_noise else 0.0,
     )
 
@@ -386,7 +387,7 @@ def test_a_member_of_a_fleet_is_a_single_identifier(examples):
                 one = each[m][k]
                 close(found.member(m), who.step(one.t, one.z, one.inputs))
 
-    check(options(hold=False, verdict=False), examples, same)  # a fleet has neither
+    check(options(verdict=False), examples, same)  # a fleet has none
 
 
 FRAMES = {

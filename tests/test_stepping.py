@@ -16,6 +16,7 @@ from livepde.linalg import Pattern, analyse
 from livepde.stepping import (
     End,
     ForwardStage,
+    Held,
     Interval,
     Kept,
     Near,
@@ -452,16 +453,14 @@ def test_the_matrix_of_a_stage_is_assembled_once_for_each_parameter(prior):
 
 
 def test_held_inputs_are_held_exactly():
-    held = lp.Advance(lp.Alexander2(), hold=True)
-    between = held.over(
-        Interval.between(
-            End(t=0.0, inputs=Inputs({"Q": 5.0}), z=np.ones(1)),
-            End(t=1.0, inputs=Inputs({"Q": 0.1}), z=np.ones(1)),
-        )
-    )
+    held = Held(next=("Q",))
+    between = Interval.between(
+        End(t=0.0, inputs=Inputs({"Q": 5.0}), z=np.ones(1)),
+        End(t=1.0, inputs=Inputs({"Q": 0.1}), z=np.ones(1)),
+    ).driven(held)
     assert between.at(1.0 / 3.0).inputs["Q"] == between.at(1.0).inputs["Q"] == 0.1
     assert between.at(1.0 / 3.0).inputs is between.at(1.0).inputs
-    assert held.over(between) is between
+    assert between.driven(held) is between
 
 
 def test_shortcuts_of_affine_models_do_not_change_the_numbers():

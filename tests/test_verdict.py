@@ -304,10 +304,11 @@ def test_directions_move_the_estimate_by_what_they_say():
     assert off.q[0] - plain.q[0] == pytest.approx(-moved, rel=1e-6)
 
 
-def fed(inputs: Any, *, hold: bool = False) -> lp.Estimate:
+def fed(inputs: Any, *, between: str = "line") -> lp.Estimate:
     """Return the last estimate of a run whose channel reads some values."""
     sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, hold=hold)
+    own = {"T_left": between}
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, between=own)
     z = shown() + errors()
     for k, t in enumerate(TIMES.tolist()):
         estimate = identifier.step(t, z[k], {"T_left": inputs[k]})
@@ -315,8 +316,9 @@ def fed(inputs: Any, *, hold: bool = False) -> lp.Estimate:
 
 
 @pytest.mark.long
-def test_readings_that_are_held_as_settings_are_told():
-    straight, held = fed(driven(TIMES)), fed(driven(TIMES), hold=True)
+@pytest.mark.parametrize("between", ["hold", "next"])
+def test_readings_that_are_held_as_settings_are_told(between: str):
+    straight, held = fed(driven(TIMES)), fed(driven(TIMES), between=between)
     (found,) = [f for f in held.verdict.findings if f.what == "hold"]
     assert found.severity == "caution"
     shift = held.q[0] - straight.q[0]
@@ -324,7 +326,7 @@ def test_readings_that_are_held_as_settings_are_told():
     assert found.evidence == pytest.approx(abs(shift) / held.q_std[0], rel=0.4)
     assert "hold" not in straight.diagnostics.shifts.sizes
     steps = np.repeat(driven(TIMES[::10]), 10)[: len(TIMES)]  # what an actuator does
-    assert fed(steps, hold=True).diagnostics.shifts.sizes["hold"] == 0.0
+    assert fed(steps, between=between).diagnostics.shifts.sizes["hold"] == 0.0
 
 
 @pytest.mark.long

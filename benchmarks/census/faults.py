@@ -39,7 +39,7 @@ class Scene:
         Which sensor is the faulty one.
     rng
         For what is drawn.
-    points, model, u0, scheme, hold
+    points, model, u0, scheme, held
         What livepde is told.
     subject
         What is wrong, by name; empty for the process.
@@ -59,7 +59,7 @@ class Scene:
     model: Callable[[], lp.Model]
     u0: float
     scheme: Any = None
-    hold: bool = False
+    held: bool = False
     subject: str = ""
     told: Problem | None = None
 
@@ -354,7 +354,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "held": Fault(
         "channels are held, not straight",
-        lambda s: replace(s, hold=True),
+        lambda s: replace(s, held=True),
         channels=True,
         traced=False,
     ),

@@ -160,7 +160,8 @@ def _judged(scene: Scene, score: Score) -> Score:
     sensors = lp.Points(scene.points, noise=scene.noise * score.stated, direct=direct)
     u0 = None if model.form_initial is not None else scene.u0
     law = lp.SensitivityLaw()
-    identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, hold=scene.hold, u0=u0)
+    between = dict.fromkeys(problem.channels, "next") if scene.held else None
+    identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, between=between, u0=u0)
     z = scene.z + scene.noise * scene.errors
     names, half = tuple(problem.channels), int(HALF * scene.length)
     about = FAULTS.get(score.fault)

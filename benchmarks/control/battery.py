@@ -111,7 +111,7 @@ def battery(seed: int = 0) -> Problem:
             model, fillings(), ["I"], sensors=voltage, modes=2, rates=(1.0 / PERIOD,), u=start
         ),
         identifier=lambda: Identifier(
-            model, voltage, SensitivityLaw(), u0=start, scheme=Alexander2(), hold=True
+            model, voltage, SensitivityLaw(), u0=start, scheme=Alexander2(), between={"I": "next"}
         ),
         goal=Goal(
             track={"mean": 1.0},

@@ -91,7 +91,14 @@ def rod(seed: int = 0) -> Problem:
         name="rod",
         title="A heated rod whose conductivity is unknown and jumps",
         reduced=reduce(model, outputs, ["heater"], sensors=sensors, u=ROOM, modes=MODES),
-        identifier=lambda: Identifier(model, sensors, law, u0=ROOM, scheme=Alexander2(), hold=True),
+        identifier=lambda: Identifier(
+            model,
+            sensors,
+            law,
+            u0=ROOM,
+            scheme=Alexander2(),
+            between={"heater": "next", "room": "next"},
+        ),
         goal=Goal(
             track={"tip": 1.0},
             move={"heater": 500.0},

@@ -135,7 +135,12 @@ def wall(seed: int = 0) -> Problem:
         title="A room behind a wall whose layers are unknown",
         reduced=reduce(model, outputs, ["heater"], sensors=sensors, modes=4, u=COLD),
         identifier=lambda: Identifier(
-            model, sensors, SensitivityLaw(), u0=COLD, scheme=Alexander2(), hold=True
+            model,
+            sensors,
+            SensitivityLaw(),
+            u0=COLD,
+            scheme=Alexander2(),
+            between={"heater": "next", "outside": "next"},
         ),
         goal=Goal(
             track={},

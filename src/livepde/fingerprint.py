@@ -30,7 +30,7 @@ PREFIX = "built."  # of the leaves of a checkpoint
 
 NAMES = {
     "law": "option of the law",
-    "steps": "scheme, dt_max, halvings, hold or input_noise",
+    "steps": "scheme, dt_max, halvings, between or input_noise",
     "unknowns": "prior, evolution or bounds of an unknown",
     "start": "u0 or q0",
     "model": "model: its equation, mesh, source or boundary values",

@@ -46,7 +46,7 @@ from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
-from livepde.stepping import Advance, End, Interval, Scheme
+from livepde.stepping import Advance, Between, End, Held, Interval, Scheme
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 8  # of the checkpoint
+FORMAT = 9  # of the checkpoint
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -90,9 +90,11 @@ class Identifier:
         are the first ones graded then, as for laws with a covariance (`Advance.start`).
     assimilate_from
         Samples before this time drive inputs and are scored, but not assimilated.
-    hold
-        True: zero-order hold, inputs have the value of the later sample over the whole interval, as
-        for an actuator that is set anew at each sample; False: they change linearly.
+    between
+        Input channel -> how it behaves between two readings. "line", the default: it changes
+        linearly. "hold": a reading holds until the next one, such as the state of a switch. "next":
+        a reading is the mean since the last one, such as the mean power of an interval, or the
+        setting of an actuator that is reported with the sample after it.
     input_noise
         Channel of the model -> standard deviation of its noise, independent from sample to sample:
         it makes the state less certain, for laws that have a covariance.
@@ -122,7 +124,7 @@ class Identifier:
         dt_max: float = np.inf,
         halvings: int = Advance.halvings,
         assimilate_from: float = -np.inf,
-        hold: bool = False,
+        between: Mapping[str, Between] | None = None,
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | None = None,
     ) -> None:
@@ -139,13 +141,15 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
+        self._channels = Channels(model.channels, self.observed, self.withheld)
+        # Positions of moving sensors are no inputs of the process: they move on lines.
+        held = Held.of(between or {}, [c for c in self.inputs if c not in self.optional_inputs])
         # The first steps after the start are short where intervals have to hold their error.
         start = float(t0) if law.graded_start else math.nan
-        control = Advance(scheme or law.scheme, dt_max, halvings, hold, start=start)
+        control = Advance(scheme or law.scheme, dt_max, halvings, held, start=start)
         noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
         self.problem = Problem(model, self.observed, control, noise, readings, u0)
         self.assimilate_from = assimilate_from
-        self._channels = Channels(model.channels, self.observed, self.withheld)
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
         self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
@@ -313,7 +317,7 @@ class Identifier:
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         if noise is not None:
             self.check_weighs(noise)
-        values, held = self._channels.filled(named, self._inputs)
+        values, held = self._filled(named)
         unstated = self._begun_by(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
         used = measured if t >= self.assimilate_from else np.full_like(measured, np.nan)
@@ -336,6 +340,13 @@ class Identifier:
         held = (*held, *unstated)
         estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
         return estimate, interval
+
+    def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
+        """Return all inputs, and those whose missing value is replaced by the last one."""
+        values, missing = self._channels.filled(named, self._inputs)
+        # A value that holds until the next reading is not missing.
+        known = self.problem.control.held.last
+        return values, tuple(name for name in missing if name not in known) if known else missing
 
     @property
     def _last(self) -> End:
@@ -382,7 +393,9 @@ class Identifier:
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
         self._state, self._inputs = state, inputs
-        missing = [name for name in self.model.channels if name not in self._stated]
+        # The mean over the first interval comes with its end.
+        known = {*self._stated, *self.problem.control.held.next}
+        missing = [name for name in self.model.channels if name not in known]
         unstated = tuple(missing) if t > self._t else ()
         mask = np.array([name in unstated for name in self.inputs], dtype=float)
         self._gaps = replace(self._gaps, unstated=mask)

@@ -111,7 +111,8 @@ class Learned:
     Parameters
     ----------
     identifier
-        The identifier, built with `hold=True`; its model may have any size.
+        The identifier, built with `between={...: "next"}` for all of its inputs; its model may have
+        any size.
     nominal
         Kalman filter of the nominal model, updated with every sample.
     trust
@@ -124,17 +125,17 @@ class Learned:
     """
 
     def __init__(self, identifier: Identifier, nominal: Kalman, trust: Trust | None = None) -> None:
-        control = identifier.problem.control
-        if not control.hold:
-            raise ConfigurationError(
-                "Learned: inputs of a loop are held between samples: build the identifier with "
-                "hold=True."
-            )
         missing = [c for c in identifier.inputs if c not in nominal.model.channels]
         if missing:
             raise ConfigurationError(
                 f"Learned: the sensors of the identifier read {missing}, which the reduced model "
                 "does not have; give positions of sensors in another way."
+            )
+        lines = [c for c in identifier.inputs if c not in identifier.problem.control.held.next]
+        if lines:
+            raise ConfigurationError(
+                "Learned: a sample of a loop contains the inputs applied since the last one: build "
+                f"the identifier with between={dict.fromkeys(lines, 'next')}."
             )
         for what, mine, theirs in (
             ("sensors", identifier.observed.names, nominal.model.sensors.names),

@@ -32,11 +32,11 @@ from livepde.observation import Observation, Observed
 from livepde.records import STATUS_CODES
 from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
-from livepde.stepping import Advance, Scheme, Span, own_noise
+from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 8  # of the checkpoint
+FORMAT = 9  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -57,7 +57,7 @@ class Fleet:
         How many, or their names.
     q0, u0, u0_from
         As for `Identifier`, for all members; or a list with one for each.
-    t0, withheld, scheme, dt_max, halvings, assimilate_from, input_noise
+    t0, withheld, scheme, dt_max, halvings, assimilate_from, between, input_noise
         As for `Identifier`.
 
     Raises
@@ -90,6 +90,7 @@ class Fleet:
         dt_max: float = np.inf,
         halvings: int = Advance.halvings,
         assimilate_from: float = -np.inf,
+        between: Mapping[str, Between] | None = None,
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
     ) -> None:
@@ -110,6 +111,7 @@ class Fleet:
             dt_max=dt_max,
             halvings=halvings,
             assimilate_from=assimilate_from,
+            between=between,
             input_noise=input_noise,
             u0_from=max(made_of, key=len),
         )
@@ -293,7 +295,7 @@ class Fleet:
                 z1=used,
                 noise=noise,
                 gaps=some,
-            )
+            ).driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         codes = [STATUS_CODES.index(status.code) for status in report.statuses]
@@ -321,6 +323,8 @@ class Fleet:
         found = {}
         for k, name in enumerate(self.inputs):
             unknown = np.isnan(self._stated[:, k])
+            if name in self.problem.control.held.next:  # the mean comes with the end
+                continue
             if name in self.model.channels and unknown.any():
                 self._unstated[:, k] = unknown
                 found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
@@ -544,7 +548,8 @@ class Fleet:
                         f"input '{name}' of member '{member}' has no value in the first sample; "
                         "start the stream where every member has one."
                     )
-                held[name] = missing
+                if name not in self.problem.control.held.last:  # else its value is known
+                    held[name] = missing
             values[:, k] = column
         return values, held
 

@@ -134,7 +134,7 @@ class Filter:
 
     def span(self, interval: Interval) -> Span:
         """Return the interval of one process as that of its one member."""
-        return Span.of(self.problem.control.over(interval), self.problem.channels)
+        return Span.of(interval.driven(self.problem.control.held), self.problem.channels)
 
     def noise_of(self, x: FilterState, z: Span | Interval) -> Array:
         """Return the standard deviation of each reading at the end, shape (members, sensors).

@@ -217,7 +217,8 @@ class GradientLaw(Law[GradientParts, GradientState]):
         """Return the state at the end of an interval; with `frozen`, q is held."""
         model, n = work.problem.model, len(state.u)
         coupled = work.stage(interval.present)
-        forms, moment, length = coupled.terms.forms, interval.end, interval.t1 - interval.t0
+        forms, length = coupled.terms.forms, interval.t1 - interval.t0
+        moment = interval.at(interval.t1)
         R = forms.split.project
 
         # u_alpha, and the metric of Q in which A(w)^T r moves q
@@ -238,7 +239,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         y = np.concatenate([state.u, state.q])
         end, steps, failure = advance(work.problem.control, stages, y, interval.t0, interval.t1)
         if failure is not None:
-            predicted = work.problem.predict(state.u, state.q, moment)
+            predicted = work.problem.predict(state.u, state.q, interval.end)
             return state, Report(Status.of(failure), predicted)
 
         # Below, u - r is w = u_alpha + P u at the end; the metric learns from q before it is
@@ -273,7 +274,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
         def diagnosed() -> Diagnostics[float]:
             return replace(found, residual=model.X.norm(r))
 
-        predicted = work.problem.predict(u, q, moment)
+        predicted = work.problem.predict(u, q, interval.end)
         return new, Report(Status(), predicted, steps, cache(diagnosed))
 
     def belief(self, work: GradientParts, state: GradientState) -> Belief:

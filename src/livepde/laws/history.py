@@ -60,7 +60,7 @@ def added(log: Array, span: Span, taken: Mask) -> Array:
     row[:, 0] = span.t1
     row[:, 1 : 1 + sensors] = span.z1
     row[:, 1 + sensors : 1 + 2 * sensors] = np.nan if span.noise is None else span.noise
-    row[:, 1 + 2 * sensors :] = span.inputs1[:, : log.shape[2] - 1 - 2 * sensors]
+    row[:, 1 + 2 * sensors :] = span.stated[:, : log.shape[2] - 1 - 2 * sensors]
     if np.count_nonzero(taken) < len(taken):
         row[~taken] = np.nan
     return longer
@@ -168,11 +168,9 @@ def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span
     sensors = problem.observed.size
     first, last = log[np.arange(len(log)), rows], log[:, row]
     inputs0, inputs1 = first[:, 1 + 2 * sensors :], last[:, 1 + 2 * sensors :]
-    if problem.control.hold:
-        inputs0 = inputs1
     z0, z1 = first[:, 1 : 1 + sensors], last[:, 1 : 1 + sensors]
     noise = own_noise(last[:, 1 + sensors : 1 + 2 * sensors])
-    return Span(
+    span = Span(
         t0=first[:, 0],
         t1=float(last[0, 0]),
         channels=problem.channels,
@@ -182,3 +180,4 @@ def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span
         z1=z1,
         noise=noise,
     )
+    return span.driven(problem.control.held)

@@ -139,7 +139,7 @@ class Problem:
 
     def linear_readings(self, interval: Interval, u: Array) -> Interval:
         """Return an interval with its inputs as they are taken, and readings as linear sensors'."""
-        interval = self.control.over(interval)
+        interval = interval.driven(self.control.held)
         z0 = self.observed.linearised(interval.z0, u)
         z1 = self.observed.linearised(interval.z1, u)
         return interval if z1 is interval.z1 else replace(interval, z0=z0, z1=z1)

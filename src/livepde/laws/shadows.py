@@ -62,6 +62,7 @@ LATER = np.array([5, 11, 7, 9])
 MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
 KINDS = ("step", "mesh", "input")
 HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
+SHORT = 1.0 / 16.0  # of the interval before: a shorter one shows no curvature
 SMOOTH = 0.5  # differences of changes over changes, squared: below, an input changes smoothly
 
 
@@ -85,9 +86,9 @@ class Shadows:
         mean the same on every mesh.
     inputs
         The straight line between readings of a channel, by the curvature of three readings, and
-        values that were held in gaps, once the next one is known. Under zero-order hold of all
-        inputs, the shift of the estimates by straight lines instead is followed for the verdict
-        alone.
+        values that were held in gaps, once the next one is known. Of channels that are constant
+        between readings (`Identifier.between`), the shift of the estimates by straight lines
+        instead is followed for the verdict alone.
     largest
         Coefficients of the state on the halved mesh beyond which it is not followed, because that
         would cost more than the filter.
@@ -316,25 +317,26 @@ class InputShadow(Shadow):
     """The error of the straight line between two readings of a channel.
 
     The mean of a line misses that of a curve by h^2/12 times its second derivative, which the last
-    three readings tell. Second differences of noise add up to nothing.
+    three readings tell. Second differences of noise add up to nothing. A step that is written as
+    two rows a moment apart is no curve.
 
     Attributes
     ----------
     process
         The process itself.
-    channels
-        Number of channels.
+    signs
+        Sign of the error of each channel, shape (channels,): 1 for a line, 0 for none.
     """
 
     process: MeanProcess
-    channels: int
+    signs: Array
 
     kind = "input"
 
     def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        nothing = np.zeros((1, self.channels))
+        nothing = np.zeros((1, len(self.signs)))
         return changed(s, slope=nothing, bend=nothing, missed=nothing)
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
@@ -351,6 +353,10 @@ class InputShadow(Shadow):
         # The second derivative is 2 (slope - s.slope)/(h + s.length), and the line lies above the
         # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
+        # Across a moment the slope is a step, or noise: the next interval must not be compared.
+        short = length < SHORT * np.where(np.isfinite(s.length), s.length, 0.0)
+        if np.count_nonzero(short):
+            length, bend = np.where(short, np.inf, length), np.where(short[:, None], 0.0, bend)
         return {"slope": slope, "length": length, "bend": bend, "missed": s.missed + bend}
 
     @staticmethod
@@ -377,8 +383,7 @@ class InputShadow(Shadow):
         ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
         # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
         # this off again when they have been read.
-        missed = s.missed + ahead
-        missed = np.where(np.isfinite(missed), missed, 0.0)  # not so for positions of sensors
+        missed = self.signs * np.where(np.isfinite(s.missed + ahead), s.missed + ahead, 0.0)
         left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
         if not missed.any():
             return ErrorIncrement(np.zeros(len(missed), dtype=bool), left)
@@ -393,10 +398,11 @@ class InputShadow(Shadow):
 
 
 class HeldInputShadow(InputShadow):
-    """Shift of the estimates by straight lines in the place of the zero-order hold of inputs.
+    """Shift of the estimates by straight lines instead of inputs that are held between readings.
 
     Only inputs that change smoothly count: successive changes of measured inputs are alike, those
-    of set points are not.
+    of set points are not. The sign of a channel is that of its error if it were a line: 1 if it is
+    held at the next reading, -1 at the last one, 0 for lines.
     """
 
     kind = HELD
@@ -405,22 +411,24 @@ class HeldInputShadow(InputShadow):
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
         s = super().start(s, x, moment, given)
-        return changed(s, held=np.full((1, 4, self.channels), np.nan))
+        return changed(s, held=np.full((1, 4, len(self.signs)), np.nan))
 
     def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
-        """Return the difference of held inputs to straight lines."""
+        """Return the errors of lines, and the difference of held inputs to straight lines."""
+        parts = super().read(s, span)
         # Sums of squares of successive changes, and of differences of them: the ratio tells smooth
         # inputs from set points.
         last, before, changes, differences = s.held.transpose(1, 0, 2)
-        change = np.where(np.isfinite(last), span.inputs1 - last, 0.0)
+        change = np.where(np.isfinite(last), span.stated - last, 0.0)
         changes = np.nan_to_num(changes) + change**2
         differences = np.nan_to_num(differences) + (change - np.nan_to_num(before)) ** 2
-        smooth = differences < SMOOTH * changes
+        smooth = (differences < SMOOTH * changes) & (self.signs != 0.0)
         # The held later value exceeds the straight line by half of the change on average.
         missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
-        values = np.broadcast_to(span.inputs1, change.shape)
+        values = np.broadcast_to(span.stated, change.shape)
         held = np.stack([values, change, changes, differences], axis=1)
-        return {"held": held, "bend": missed, "missed": s.missed + missed}
+        both = {name: parts[name] + missed for name in ("bend", "missed")}
+        return parts | both | {"held": held}
 
 
 @dataclass(frozen=True, eq=False)
@@ -543,8 +551,14 @@ class ShadowSet:
             except LivepdeError as error:
                 refused = f"on the halved mesh: {error}"
         if options.inputs and problem.model.channels:
-            kind = HeldInputShadow if problem.control.hold else InputShadow
-            found.append(kind(process, len(problem.channels)))
+            held, own = problem.control.held, problem.model.channels
+            signs = {name: 1.0 if name in held.next else -1.0 for name in (*held.next, *held.last)}
+            of_held = np.array([signs.get(name, 0.0) for name in problem.channels])
+            lines = np.array([float(name in own and name not in held) for name in problem.channels])
+            if lines.any():
+                found.append(InputShadow(process, lines))
+            if of_held.any():
+                found.append(HeldInputShadow(process, of_held))
         return cls(problem, reduction, rows, tuple(found), refused)
 
     @cached_property
@@ -591,6 +605,10 @@ class ShadowSet:
         s = changed(s, **parts)
         # After a jump of the drive the error of the step is another one at once.
         due = (s.count >= s.due) | jumps
+        # A switch after a rest ends a block, which is one line: not from before it to after it.
+        if span.row is not None and s.held.size:
+            switches = (span.row != span.inputs1) & np.isfinite(span.row) & (s.held[:, 1] == 0.0)
+            due = due | switches.any(axis=1)
         # What gaps miss counts at once: later it might cancel with that of the next one.
         if span.gaps is not None:
             due = due | (span.gaps > 0.0).any(axis=(1, 2))

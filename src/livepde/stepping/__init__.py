@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livepde.stepping.banded_stage import BandedStage, member_stage
+from livepde.stepping.between import Between, Held
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import End, Interval, Moments, Span, own_noise
 from livepde.stepping.member_stage import KeptFactors, MemberStage, StageOfMembers
@@ -16,8 +17,10 @@ __all__ = [
     "Advance",
     "Alexander2",
     "BandedStage",
+    "Between",
     "End",
     "ForwardStage",
+    "Held",
     "ImplicitEuler",
     "Interval",
     "Kept",

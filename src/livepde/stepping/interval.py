@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping.between import Held
 
 __all__ = ["End", "Interval", "Moments", "Span", "own_noise"]
 
@@ -45,7 +46,7 @@ class Interval:
     t0, t1
         Times of the last accepted sample and of this one.
     inputs0, inputs1
-        Input channels at both ends.
+        Input channels at both ends, as they act on the process inside the interval.
     z0, z1
         Measurements at both ends, shape (sensors,), NaN where missing.
     noise
@@ -53,6 +54,9 @@ class Interval:
         None if all are defaults.
     gaps
         Channel held at either end -> duration of the gap before, and whether it lasts at the end.
+    row
+        Inputs of the sample at the end, which sensors read and the next interval begins with; None
+        if they are `inputs1`. They differ where a channel switches at the end (`driven`).
     """
 
     t0: float
@@ -63,6 +67,7 @@ class Interval:
     z1: Array
     noise: Array | None = None
     gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
+    row: Mapping[str, float] | None = None
 
     @classmethod
     def between(cls, start: End, stop: End) -> Interval:
@@ -78,23 +83,45 @@ class Interval:
             gaps=stop.gaps,
         )
 
+    def driven(self, held: Held) -> Interval:
+        """Return the interval with some channels constant inside it; once more changes nothing."""
+        first, last = self.inputs0, self.inputs1
+        if first is last or not held:
+            return self
+        if all(name in held.next for name in last):
+            return replace(self, inputs0=last)
+        row = last if self.row is None else self.row
+        if all(name in held.last for name in first):
+            return replace(self, inputs1=first, row=row)
+        first = {name: row[name] if name in held.next else x for name, x in first.items()}
+        last = {name: first[name] if name in held.last else x for name, x in last.items()}
+        return replace(self, inputs0=Inputs(first), inputs1=Inputs(last), row=row)
+
     def _weight(self, t: float) -> float:
         return (t - self.t0) / (self.t1 - self.t0)
 
     def at(self, t: float) -> Moment:
-        """Return time and inputs at t."""
+        """Return time and inputs at t; at the end those before a switch."""
         if t == self.t1:
-            return self.end
+            return self._last
         if self.inputs0 is self.inputs1:
-            return Moment(t, self.end.inputs)
+            return Moment(t, self._last.inputs)
         s = self._weight(t)
-        mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
+        # A channel that is held keeps its value to the last digit.
+        mixed = {
+            k: v if (x := self.inputs0[k]) == v else (1 - s) * x + s * v
+            for k, v in self.inputs1.items()
+        }
         return Moment(t, Inputs(mixed))
 
     @cached_property
-    def end(self) -> Moment:
-        """Time and inputs at the end."""
+    def _last(self) -> Moment:
         return Moment(self.t1, Inputs(self.inputs1))
+
+    @property
+    def end(self) -> Moment:
+        """Time and inputs of the sample at the end."""
+        return self._last if self.row is None else Moment(self.t1, Inputs(self.row))
 
     @property
     def silent(self) -> Interval:
@@ -120,6 +147,11 @@ class Interval:
         change: Array = share * (self.z1 - self.z0)
         change[np.isnan(change)] = 0.0
         return change
+
+
+def _values(inputs: Mapping[str, float], channels: tuple[str, ...]) -> Array:
+    """Return the values of channels, shape (1, channels)."""
+    return np.array([list(map(inputs.__getitem__, channels))])
 
 
 def own_noise(noise: ArrayLike) -> Array | None:
@@ -168,7 +200,8 @@ class Span:
     channels
         Names of the input channels.
     inputs0, inputs1
-        Their values at both ends, shape (members, channels), or (1, channels) if the same for all.
+        Their values at both ends, shape (members, channels), or (1, channels) if the same for all,
+        as they act on the process inside the interval.
     z0, z1
         Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
     interval
@@ -179,6 +212,9 @@ class Span:
     gaps
         Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
         shape (members, 2, channels) or (1, 2, channels); None without a gap.
+    row
+        Inputs of the sample at the end, of the shape of `inputs1`, as of an `Interval`; None if
+        they are `inputs1`.
     """
 
     t0: Array
@@ -191,16 +227,16 @@ class Span:
     interval: Interval | None = None
     noise: Array | None = None
     gaps: Array | None = None
+    row: Array | None = None
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
         """Return the span of one interval, common to all members."""
         first = last = NO_INPUTS
         if channels:
-            last = np.array([list(map(interval.inputs1.__getitem__, channels))])
-            first = last
+            first = last = _values(interval.inputs1, channels)
             if interval.inputs0 is not interval.inputs1:
-                first = np.array([list(map(interval.inputs0.__getitem__, channels))])
+                first = _values(interval.inputs0, channels)
         gaps = None
         if interval.gaps:
             gaps = np.array([interval.gaps.get(name, (0.0, False)) for name in channels]).T[None]
@@ -215,7 +251,32 @@ class Span:
             interval=interval,
             noise=None if interval.noise is None else interval.noise[None],
             gaps=gaps,
+            row=None if interval.row is None else _values(interval.row, channels),
         )
+
+    def driven(self, held: Held) -> Span:
+        """Return the span with some channels constant inside it; once more changes nothing."""
+        first, last = self.inputs0, self.inputs1
+        if first is last or not held:
+            return self
+        to_next = np.array([name in held.next for name in self.channels], dtype=bool)
+        if to_next.all():
+            return replace(self, inputs0=last)
+        to_last = np.array([name in held.last for name in self.channels], dtype=bool)
+        row = last if self.row is None else self.row
+        if to_last.all():
+            return replace(self, inputs1=first, row=row)
+        return replace(
+            self,
+            inputs0=np.where(to_next, row, first),
+            inputs1=np.where(to_last, first, last),
+            row=row,
+        )
+
+    @property
+    def stated(self) -> Array:
+        """Inputs of the sample at the end, as it states them."""
+        return self.inputs1 if self.row is None else self.row
 
     def __len__(self) -> int:
         return len(self.t0)
@@ -244,20 +305,22 @@ class Span:
         return np.asarray(given.any(axis=1))
 
     def at(self, t: float) -> Moments:
-        """Return time and inputs at t of members with a common start."""
-        mixed = self.inputs1
+        """Return time and inputs at t of members with a common start; at the end before a switch."""
+        mixed = last = self.inputs1
         # The same object at both ends says that inputs are held: no interpolation.
-        if t != self.t1 and self.inputs0 is not mixed:
+        if t != self.t1 and self.inputs0 is not last:
             s = (t - self.start) / (self.t1 - self.start)
-            mixed = (1 - s) * self.inputs0 + s * mixed
+            mixed = (1 - s) * self.inputs0 + s * last
+            # A channel that is held keeps its value to the last digit.
+            mixed = np.where(self.inputs0 == last, last, mixed)
         return Moments(t=t, channels=self.channels, inputs=mixed, interval=self.interval)
 
     @property
     def end(self) -> Moments:
-        """Time and inputs at the end."""
-        return Moments(
-            t=self.t1, channels=self.channels, inputs=self.inputs1, interval=self.interval
-        )
+        """Time and inputs of the sample at the end."""
+        # The interval knows the inputs that act at its end; those of the sample may differ.
+        interval = self.interval if self.row is None else None
+        return Moments(t=self.t1, channels=self.channels, inputs=self.stated, interval=interval)
 
     def part(self, group: IntArray) -> Span:
         """Return the span of some members."""
@@ -275,9 +338,9 @@ class Span:
         """Return the interval of one member."""
         if self.interval is not None:
             return self.interval
-        first, last = (
+        first, last, row = (
             Inputs(dict(zip(self.channels, inputs[k].tolist(), strict=True)))
-            for inputs in (self.inputs0, self.inputs1)
+            for inputs in (self.inputs0, self.inputs1, self.stated)
         )
         gaps = {}
         if self.gaps is not None:
@@ -292,4 +355,5 @@ class Span:
             z1=self.z1[k],
             noise=None if self.noise is None else self.noise[k],
             gaps=gaps,
+            row=None if self.row is None else row,
         )

@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.stepping.interval import Interval
+from livepde.stepping.between import Held
 from livepde.stepping.newton import StepFailed
 
 __all__ = ["Advance", "Alexander2", "ImplicitEuler", "Scheme", "Stage", "advance"]
@@ -94,9 +94,8 @@ class Advance:
         Longest substep; a longer interval is divided evenly.
     halvings
         Maximum number of successive halvings of a failed substep; 0: no retry.
-    hold
-        True for zero-order hold: inputs have the value of the later sample over the whole interval,
-        as with an actuator that is set at each sample. False for linear interpolation.
+    held
+        Input channels that are constant between two readings; the others change linearly.
     parts
         Number of parts of every substep, to repeat an interval with shorter steps.
     start
@@ -109,7 +108,7 @@ class Advance:
     scheme: Scheme
     dt_max: float = np.inf
     halvings: int = 8
-    hold: bool = False
+    held: Held = Held()
     parts: int = 1
     start: float = math.nan
 
@@ -120,12 +119,6 @@ class Advance:
             raise ConfigurationError(
                 f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
             )
-
-    def over(self, interval: Interval) -> Interval:
-        """Return an interval with inputs held or interpolated, as configured."""
-        if not self.hold or interval.inputs0 is interval.inputs1:
-            return interval
-        return replace(interval, inputs0=interval.inputs1)
 
     def count(self, length: float) -> int:
         """Return the number of equal substeps of an interval of that length."""

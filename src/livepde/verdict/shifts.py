@@ -102,17 +102,17 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
 
 
 def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
-    """Return whether inputs that are held as settings would matter if they were readings."""
+    """Return whether inputs that are constant between readings would matter as straight lines."""
     total = abs(shifts.sizes.get(HOLD, math.nan))
     if not total > SETTING:
         return
     moved = {label: -shift for label, shift in shifts.by(HOLD).items()}
     text = (
-        "Inputs are held from sample to sample (hold), but change as smoothly as readings do: as "
-        f"straight lines they would move the unknowns by {total:.1f} standard "
-        f"deviations{_listed(moved)}. The intervals do not hold that."
+        'Inputs are held between their readings (`between = "hold"` or `"next"`), but change as '
+        f"smoothly as measured values do: as straight lines they would move the unknowns by "
+        f"{total:.1f} standard deviations{_listed(moved)}. The intervals do not contain that."
     )
-    remedy = "Leave out hold, unless these inputs are settings that change in steps."
+    remedy = 'If these inputs are measured at single moments, use `between = "line"`.'
     yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
 
 
