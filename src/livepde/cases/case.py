@@ -15,6 +15,7 @@ import numpy as np
 import tomlkit
 
 from livepde.cases.case_channels import (
+    between_of,
     columns_of,
     expanded,
     initial_of,
@@ -93,6 +94,7 @@ class Prepared:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=self.assimilate_from,
+            between=between_of(case),
             **self.uncertain(law),
         )
 

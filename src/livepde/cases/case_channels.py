@@ -33,12 +33,14 @@ from livepde.observation import (
 )
 from livepde.observation.placed import POSITION, shift_names
 from livepde.samples import by_name, noise_channel
+from livepde.stepping import Between
 from livepde.streams import Column
 
 if TYPE_CHECKING:
     import pandas as pd
 
 __all__ = [
+    "between_of",
     "columns_of",
     "expanded",
     "initial_of",
@@ -75,6 +77,7 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
             valid,
             needed,
             decimal=case.spec.data.decimal,
+            between=channel.between,
         )
         if channel.noise_column is not None:
             found[noise_channel(name)] = _noise_column(case, name, channel, rule.factor)
@@ -279,6 +282,12 @@ def noise_of(case: CaseContent, role: str) -> dict[str, float] | None:
 def input_noise_of(case: CaseContent) -> dict[str, float]:
     """Return the noise of the boundary and input channels that state one."""
     return _stated(case, "noise", "boundary", "input")
+
+
+def between_of(case: CaseContent) -> dict[str, Between]:
+    """Return channel -> how it behaves between two readings, of those that are no lines."""
+    channels = case.roles("boundary", "input")
+    return {name: item.between for name, item in channels.items() if item.between != "line"}
 
 
 def initial_of(case: CaseContent, first: Sample) -> Any:

@@ -178,7 +178,8 @@ def _joined(
     second = clock_of(case).second
     sensors = case.roles("sensor", "withheld")
     needed = [name for name, column in columns.items() if column.needed]
-    return join_tables(tables, second, sensors, needed, case.where("data.file"))
+    between = {name: column.between for name, column in columns.items()}
+    return join_tables(tables, second, sensors, needed, case.where("data.file"), between)
 
 
 def _owner(
@@ -252,7 +253,10 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
     groups: dict[str | None, list[int]] = {}
     for k, name in enumerate(names):
         channel = case.spec.channels.get(name)
-        if channel is not None and channel.role in ("boundary", "sensor", "withheld"):
+        # A channel that is held may leap at any time.
+        if channel is None or channel.between != "line":
+            continue
+        if channel.role in ("boundary", "sensor", "withheld"):
             groups.setdefault(channel.of, []).append(k)
     return [*groups.values()]
 
@@ -267,8 +271,9 @@ def without_gaps(case: CaseContent, table: DataTable) -> DataTable:
     """Return a finished record without gaps and spikes of the channels that drive the model."""
     table, channels = without_wild_start(case, table), case.spec.channels
     interpolated = [name for name, item in channels.items() if item.gaps == "interpolate"]
+    means = [name for name in interpolated if channels[name].between == "next"]
     screened = [name for name, item in channels.items() if item.screened]
-    return fill_table(table, interpolated, screened)
+    return fill_table(table, interpolated, screened, means=means)
 
 
 def reader_of(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Any:
@@ -494,7 +499,9 @@ def policy_of(case: CaseContent) -> Policy:
     for name, channel in case.spec.channels.items():
         wait = duration(channel.wait or 0.0, f"channels.{name}.wait")
         interpolated = channel.gaps == "interpolate"
-        habits[name] = Habit(wait, channel.repeated, interpolated, channel.screened)
+        habits[name] = Habit(
+            wait, channel.repeated, interpolated, channel.screened, channel.between
+        )
     # Without a unit of time 30 days cannot be converted: then any pause is accepted.
     leap = case.convert(LEAP, unit, "intake.leap") if unit else math.inf
     leap = case.positive(spec.leap, unit, "intake.leap", leap)

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from livepde.cases.case import Case, Prepared
+from livepde.cases.case_channels import between_of
 from livepde.errors import DataError, LivepdeError, RunError
 from livepde.fleet import Fleet, FleetRecords
 from livepde.identifier import Identifier
@@ -130,6 +131,7 @@ class MemberBlock:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=one.assimilate_from,
+            between=between_of(case),
             input_noise=one.uncertain(case.law).get("input_noise"),
             u0_from=[member.uncertain(case.law).get("u0_from", {}) for member in self._each],
         )

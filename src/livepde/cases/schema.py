@@ -23,6 +23,7 @@ from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shad
 from livepde.observation import Discrepancy
 from livepde.runs.live_loop import Backlog, Retention
 from livepde.runs.outcome import Bound, Sense
+from livepde.stepping import Between
 from livepde.streams.csvfile import UTF_8
 from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
@@ -416,6 +417,7 @@ class ChannelSpec(Spec):
     valid: Pair | None = None
     missing: Literal["interpolate", "hold", "skip"] | None = None
     spikes: Literal["refuse", "keep"] | None = None
+    between: Between = "line"
 
     @property
     def is_point(self) -> bool:
@@ -430,12 +432,13 @@ class ChannelSpec(Spec):
     @property
     def gaps(self) -> Literal["interpolate", "hold", "skip"]:
         """Treatment of gaps."""
-        return self.missing or ("interpolate" if self.drives else "hold")
+        bridged = self.drives and self.between != "hold"
+        return self.missing or ("interpolate" if bridged else "hold")
 
     @property
     def screened(self) -> bool:
         """Whether spikes are refused."""
-        return self.drives and self.spikes != "keep"
+        return self.drives and self.between == "line" and self.spikes != "keep"
 
     @model_validator(mode="after")
     def _one_column(self) -> ChannelSpec:
@@ -482,6 +485,14 @@ class ChannelSpec(Spec):
             raise ValueError(
                 'missing = "interpolate" and spikes belong to boundary and input channels; '
                 "values of sensors that are far off are refused by law.gate"
+            )
+        if not self.drives and "between" in self.model_fields_set:
+            raise ValueError("between requires a boundary or input channel: leave it out")
+        if self.between != "line" and self.spikes == "refuse":
+            raise ValueError('spikes = "refuse" requires between = "line": leave it out')
+        if self.between == "hold" and self.missing is not None:
+            raise ValueError(
+                'a value with between = "hold" is never missing: leave out the key missing'
             )
         if self.noise_column is not None and not sensor:
             raise ValueError("noise_column belongs to sensors: leave it out")

@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from livepde.errors import ConfigurationError
 
-__all__ = ["Between", "Held"]
+__all__ = ["LINES", "Between", "Held"]
 
 Between: TypeAlias = Literal["line", "hold", "next"]
 """A straight line; the last reading until the next one; or the next reading since the last one."""
@@ -68,3 +68,6 @@ class Held:
 
     def __contains__(self, name: object) -> bool:
         return name in self.last or name in self.next
+
+
+LINES = Held()

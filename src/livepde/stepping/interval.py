@@ -305,7 +305,7 @@ class Span:
         return np.asarray(given.any(axis=1))
 
     def at(self, t: float) -> Moments:
-        """Return time and inputs at t of members with a common start; at the end before a switch."""
+        """Return time and inputs at t of members with one start; at the end before a switch."""
         mixed = last = self.inputs1
         # The same object at both ends says that inputs are held: no interpolation.
         if t != self.t1 and self.inputs0 is not last:

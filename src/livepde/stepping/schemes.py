@@ -16,7 +16,7 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.stepping.between import Held
+from livepde.stepping.between import LINES, Held
 from livepde.stepping.newton import StepFailed
 
 __all__ = ["Advance", "Alexander2", "ImplicitEuler", "Scheme", "Stage", "advance"]
@@ -108,7 +108,7 @@ class Advance:
     scheme: Scheme
     dt_max: float = np.inf
     halvings: int = 8
-    held: Held = Held()
+    held: Held = LINES
     parts: int = 1
     start: float = math.nan
 

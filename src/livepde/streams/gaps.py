@@ -6,7 +6,11 @@ identifier holds the last value and says so.
 
 A spike is a single value far off the cubic through two neighbours on each side of it. It is refused
 and leaves a gap. If leaving out one value does not remove the large residuals, the channel has
-really changed, as an actuator does, and all values stay.
+really changed, as an actuator does, and all values stay. A step that is written as two rows, a
+moment apart beside the usual interval, ends one curve and begins another.
+
+Of channels that are constant between two readings nothing is refused. A value that holds until the
+next reading is never missing; a missing mean is part of the next one.
 """
 
 from __future__ import annotations
@@ -14,15 +18,16 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
 
 from livepde.errors import ConfigurationError, SampleError
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.samples import Sample, number, sample_of
+from livepde.stepping import Between, Held
 from livepde.streams.table import DataTable
 
 __all__ = ["RECENT", "FillGaps", "Filled", "Series", "bridged", "fill_table", "find_spikes"]
@@ -35,6 +40,8 @@ FEWEST = 8  # residuals from which a scale is taken
 RECENT = 64  # values of a channel that are kept to tell the scale of the next ones
 CENTRE, NEIGHBOURS = 2, 5  # of the five values that make a residual
 LEFT = 0.2  # share of a residual that may remain without a spike; of a step's 0.3 remains
+SHORT = 1.0 / 16.0  # of the usual interval: two rows nearer than this may write a step
+STAYS = 0.5  # of a step: what the values before and after it may change
 ROUNDING = 1e-12  # of the largest value of a channel: less is no residual
 ABOUT = 3  # values on each side that have to be plausible without a spike
 GAUSS = 1.4826  # standard deviation over median absolute deviation of Gaussian noise
@@ -76,6 +83,14 @@ def _residuals(t: Array, x: Array) -> _Residuals:
     return _Residuals((weights * values).sum(axis=1), weights)
 
 
+def _curves(t: Array, x: Array) -> IntArray:
+    """Return the number of the curve that each value is part of: steps of two rows part them."""
+    steps, change = np.diff(t), np.abs(np.diff(x))
+    near = np.maximum(np.append(0.0, change[:-1]), np.append(change[1:], 0.0))
+    parts = (steps < SHORT * np.median(steps)) & (near < STAYS * change)
+    return np.append(0, np.cumsum(parts))
+
+
 def _threshold(x: Array, size: Array, beyond: float) -> Array:
     """Return the size above which residuals are implausible, from their global and local scale."""
     absolute = np.abs(size)
@@ -113,14 +128,24 @@ def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     # Weighted sums of very large values would overflow.
     x = x / (np.abs(x).max() or 1.0)
     size, weights = _residuals(t, x)
-    threshold = np.maximum(_threshold(x, size, beyond), ROUNDING)
-    excess = np.abs(size) / threshold
+    curve = _curves(t, x)
+    whole = np.flatnonzero(curve[NEIGHBOURS - 1 :] == curve[: 1 - NEIGHBOURS])
+    if len(whole) < FEWEST:
+        return spikes
+    across = np.ones(len(size), dtype=bool)
+    across[whole] = False
+    size[across], weights[across] = 0.0, 0.0
+    excess = np.zeros(len(size))
+    threshold = np.maximum(_threshold(x, size[whole], beyond), ROUNDING)
+    excess[whole] = np.abs(size[whole]) / threshold
     # The largest residual comes first, because a spike raises the residuals of its neighbours, too.
     for row in np.argsort(-excess)[: int((excess > 1.0).sum())].tolist():
         if excess[row] <= 1.0:  # explained by a suspect before
             continue
         suspect = _suspect(size, weights, row)
-        spikes[suspect] = _explains(t, x, suspect, LEFT * float(abs(size[row])))
+        (own,) = np.nonzero(curve == curve[suspect])
+        limit = LEFT * float(abs(size[row]))
+        spikes[suspect] = _explains(t[own], x[own], suspect - int(own[0]), limit)
         excess[max(suspect - NEIGHBOURS + 1, 0) : suspect + 1] = 0.0
         excess[row] = 0.0
     return spikes
@@ -202,8 +227,24 @@ def filled_column(t: Array, x: Array, beyond: float = BEYOND) -> tuple[Array, Ma
     return new, gaps, spikes
 
 
+def _from_next(x: Array) -> tuple[Array, Mask]:
+    """Return a channel whose missing values are the next known ones, and where they were missing.
+
+    Gaps after the last value stay.
+    """
+    known = np.flatnonzero(np.isfinite(x))
+    later = np.searchsorted(known, np.arange(len(x)))
+    found = np.where(later < len(known), x[known[np.minimum(later, len(known) - 1)]], math.nan)
+    return found, np.isnan(x) & np.isfinite(found)
+
+
 def fill_table(
-    table: DataTable, interpolated: Iterable[str], screened: Iterable[str], beyond: float = BEYOND
+    table: DataTable,
+    interpolated: Iterable[str],
+    screened: Iterable[str],
+    beyond: float = BEYOND,
+    *,
+    means: Iterable[str] = (),
 ) -> DataTable:
     """Return a finished record without gaps between known values, and without spikes.
 
@@ -214,14 +255,20 @@ def fill_table(
     ----------
     interpolated, screened
         Channels whose gaps are filled, and those whose spikes are refused.
+    means
+        Channels whose readings are means since the last one: a gap is part of the next mean.
     """
     values, remarks = table.values.copy(), dict(table.remarks)
-    fills, screens = set(interpolated), set(screened)
+    fills, screens, of_means = set(interpolated), set(screened), set(means)
     for k, name in enumerate(table.names):
-        if name not in fills | screens:
+        if name not in fills | screens | of_means:
             continue
-        limit = beyond if name in screens else math.inf
-        column, gaps, spikes = filled_column(table.t, values[:, k], limit)
+        if name in of_means and np.isfinite(values[:, k]).any():
+            column, gaps = _from_next(values[:, k])
+            spikes, fills = np.zeros_like(gaps), fills | {name}
+        else:
+            limit = beyond if name in screens else math.inf
+            column, gaps, spikes = filled_column(table.t, values[:, k], limit)
         if name not in fills:
             column[gaps], gaps = math.nan, np.zeros_like(gaps)
         values[:, k] = column
@@ -250,6 +297,10 @@ class FillGaps:
     spikes
         Distance from its neighbours above which a value is refused, in robust standard deviations;
         infinity: no spikes are sought, and only samples with gaps wait.
+    between
+        Channel -> how it behaves between two readings, as for `Identifier`. Nothing is refused of a
+        channel that is not a "line"; a "hold" value is never missing, and a missing "next" value is
+        the next one.
 
     Examples
     --------
@@ -263,6 +314,7 @@ class FillGaps:
     wait: float = math.inf
     samples: int | None = None
     spikes: float = BEYOND
+    between: Mapping[str, Between] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if isinstance(self.channels, str) or not self.channels:
@@ -275,6 +327,7 @@ class FillGaps:
             raise ConfigurationError(f"FillGaps: samples must be >= 0; got {self.samples}.")
         if not self.spikes > 0.0:
             raise ConfigurationError(f"FillGaps: spikes must be positive; got {self.spikes}.")
+        Held.of(self.between, self.channels)  # raises for another channel or behaviour
 
     def __call__(self, stream: Iterable[Any]) -> Filled:
         """Return the stream without gaps; items are `Sample`, (t, z) or (t, z, inputs)."""
@@ -336,8 +389,9 @@ class Filled(Iterable[Sample]):
             return True
         screens = math.isfinite(stage.spikes)
         for name in stage.channels:
-            needed = CENTRE if screens else int(math.isnan(values[name]))
-            if len(self._later(waiting, name)) < needed:
+            own = stage.between.get(name, "line")
+            needed = CENTRE if screens and own == "line" else int(math.isnan(values[name]))
+            if own != "hold" and len(self._later(waiting, name)) < needed:
                 return False
         return True
 
@@ -351,7 +405,8 @@ class Filled(Iterable[Sample]):
         t, changed = float(sample.t), {}
         for name in self.stage.channels:
             later, past = self._later(waiting, name), recent[name]
-            value, kind = decided(t, values[name], list(past), later, self.stage.spikes)
+            own = self.stage.between.get(name, "line")
+            value, kind = decided(t, values[name], list(past), later, self.stage.spikes, own)
             for each in kind:
                 self.counts[each, name] += 1
             # The decided value, not the given one: a refused spike must not judge later values.
@@ -364,7 +419,12 @@ class Filled(Iterable[Sample]):
 
 
 def decided(
-    t: float, value: float, past: Series, later: Series, beyond: float = BEYOND
+    t: float,
+    value: float,
+    past: Series,
+    later: Series,
+    beyond: float = BEYOND,
+    between: Between = "line",
 ) -> tuple[float, tuple[str, ...]]:
     """Return the value of a channel for a sample, and the kinds of remarks on it.
 
@@ -376,8 +436,16 @@ def decided(
         Known values before and after.
     beyond
         As for `find_spikes`; infinity: spikes stay.
+    between
+        How the channel behaves between two readings.
     """
     kinds: tuple[str, ...] = ()
+    if between == "hold":
+        return value, kinds
+    if between == "next":
+        if math.isfinite(value):
+            return value, kinds
+        return (later[0][1], ("interpolated",)) if later else (value, ("missing",))
     if math.isfinite(value):
         if not is_spike(past, (t, value), later, beyond):
             return value, ()

@@ -16,6 +16,7 @@ from itertools import chain, pairwise
 from typing import Any, Literal, Protocol, TypeAlias
 
 from livepde.errors import DataError, SampleError
+from livepde.stepping import Between
 from livepde.streams.channel_times import FAR, ChannelTimes, present, usual_of
 from livepde.streams.clock import Clock, is_naive, origin_at, since_1970
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
@@ -39,12 +40,15 @@ class Habit:
         while the sample waits; it waits no longer then.
     screened
         A spike is refused, if two later values have come while the sample waited.
+    between
+        How the channel behaves between two readings.
     """
 
     wait: float = 0.0
     repeated: Literal["first", "last"] | None = None
     interpolated: bool = False
     screened: bool = False
+    between: Between = "line"
 
 
 @dataclass(frozen=True)
@@ -592,8 +596,10 @@ class Intake:
         needed = [channel for channel in lacking if self.columns[channel].needed]
         if needed:
             found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
-            found.spent += sample.tokens
-            return
+            sample.values = self._held(sample.values) if self._recent else {}
+            if not sample.values:
+                found.spent += sample.tokens
+                return
         self._recent.append((t, sample.values))
         self._remember(t, came)
         found.ready.append(Ready(t=t, values=sample.values, tokens=tuple(sample.tokens)))
@@ -606,8 +612,18 @@ class Intake:
             while len(self._accepted) > REMEMBERED and self._accepted[0][0] <= kept:
                 self._accepted.popleft()
 
+    def _held(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return what a sample that is left out states of inputs that are held."""
+        return {
+            channel: value
+            for channel, value in values.items()
+            if self.policy.habit(channel).between != "line" and not math.isnan(value)
+        }
+
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""
+        if self.policy.habit(channel).between == "hold" and self._recent:  # it holds until the next
+            return False
         of = self.columns[channel].noise_of
         absent = math.isnan(values.get(channel, NAN))
         return absent and not (of and math.isnan(values.get(of, NAN)))
@@ -623,7 +639,7 @@ class Intake:
         past = [(s, v[channel]) for s, v in self._recent if math.isfinite(v.get(channel, NAN))]
         given = sample.values.get(channel, NAN)
         beyond = BEYOND if habit.screened else math.inf
-        value, kinds = decided(t, given, past, later, beyond)
+        value, kinds = decided(t, given, past, later, beyond, habit.between)
         if not kinds:
             return
         if "spike" in kinds:

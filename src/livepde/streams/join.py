@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 
 from livepde.errors import DataError
 from livepde.linalg import Array
+from livepde.stepping import Between
 from livepde.streams.clock import origin_at, since_1970
 from livepde.streams.table import DataTable
 
@@ -24,12 +25,13 @@ def join_tables(
     sensors: Collection[str],
     needed: Collection[str],
     where: str,
+    between: Mapping[str, Between] | None = None,
 ) -> DataTable:
     """Merge the rows of several tables in order of time; absent channels are missing values.
 
     The result begins with the first row in which a sensor has a value and before which every
-    table has begun. Other channels without a value in that row have the one that a line between
-    their neighbours gives.
+    table has begun. Other channels without a value in that row have the one that their neighbours
+    give: on a line, or the last or the next one.
 
     Parameters
     ----------
@@ -41,6 +43,8 @@ def join_tables(
         Channels without which a row is left out.
     where
         Name of the data, for messages.
+    between
+        Channel -> how it behaves between two readings; a line if it is left out.
 
     Raises
     ------
@@ -62,15 +66,20 @@ def join_tables(
         raise DataError(
             f"{where}: no sensor has a value where all files have one; check the times."
         )
-    begin = int(usable.argmax())
+    begin, behaviour = int(usable.argmax()), between or {}
     # A run needs each input at its start, where a slower logger may have no row.
     for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
-        at = known[:, k]
-        values[begin, k] = np.interp(t[begin], t[at], values[at, k])
+        at, own = known[:, k], behaviour.get(names[k], "line")
+        values[begin, k] = _opening(t[begin], t[at], values[at, k], own)
     inputs = values[begin:, [names.index(name) for name in needed]]
     kept = np.isfinite(inputs).all(axis=1)
     if not kept.any():
         raise DataError(f"{where}: no row has all channels that it needs.")
+    # A row that is left out keeps what it states of inputs that are held.
+    held = np.array([behaviour.get(name, "line") != "line" for name in names], dtype=bool)
+    states = known[begin:, held].any(axis=1) & (np.cumsum(kept) > 0) & ~kept
+    values[begin:][np.ix_(states, ~held)] = np.nan
+    kept |= states
     t, values = t[begin:][kept], values[begin:][kept]
     lacking = np.isnan(inputs).sum(axis=0).tolist()
     remarks = Counter({("skipped", name): n for name, n in zip(needed, lacking, strict=True)})
@@ -80,6 +89,16 @@ def join_tables(
     return DataTable(
         t - t[0], values, tuple(names), origin=origin_at(first + t[0] / second), remarks=remarks
     )
+
+
+def _opening(t: float, times: Array, values: Array, between: Between) -> float:
+    """Return the value of a channel at a time where it has none."""
+    if between == "line":
+        return float(np.interp(t, times, values))
+    k = int(np.searchsorted(times, t))  # the first one later
+    if between == "hold":
+        return float(values[k - 1]) if k else np.nan
+    return float(values[k]) if k < len(values) else np.nan
 
 
 def _on_one_clock(

@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import datetime
 from itertools import chain, islice
@@ -17,7 +17,8 @@ import numpy as np
 
 from livepde.errors import DataError, SampleError, TimeOrderError
 from livepde.identifier import Sample
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import Between
 from livepde.streams.clock import (
     COMMA,
     NO_POINT,
@@ -27,6 +28,7 @@ from livepde.streams.clock import (
     origin_at,
     read_times,
 )
+from livepde.streams.thinned import Thinned
 
 __all__ = [
     "JSON_LINES",
@@ -71,6 +73,9 @@ class Column:
     noise_of
         Channel whose readings have this standard deviation; "": none. A value that is not
         positive makes the reading missing; a missing one is replaced by that of the sensor.
+    between
+        How the channel behaves between two readings; rows that are left out keep what they state
+        of a channel that is no "line".
     """
 
     names: tuple[str, ...]
@@ -80,6 +85,7 @@ class Column:
     needed: bool = False
     decimal: str = "."
     noise_of: str = ""
+    between: Between = "line"
 
 
 def decimal_marks(columns: Mapping[str, Column]) -> dict[str, str]:
@@ -240,7 +246,10 @@ def to_table(
 
     `numbers` gives the chosen rows of a column; `where` names the data and a row, for messages.
     """
-    use = _chosen(times, dates, clock, every, where)
+    between = [column.between for column in columns.values()]
+    held = np.array([one != "line" for one in between], dtype=bool)
+    # Rows that are left out may hold a switch, or a part of a mean.
+    use = _chosen(times, dates, clock, 1 if held.any() else every, where)
     holes = tuple(float(number) for number in missing)
     found = {}
     for name in decimal_marks(columns):
@@ -255,7 +264,9 @@ def to_table(
         or [np.zeros((len(use), 0))]
     )
     remarks = Counter(_noise_remarks(columns, values))
-    kept = np.full(len(use), True)
+    kept = np.zeros(len(use), dtype=bool)
+    kept[:: every if held.any() else 1] = True
+    chosen = kept.copy()
     # A value that is not valid is missing; a sample is left out for its first missing channel only.
     for k, (name, channel) in enumerate(columns.items()):
         low, high = channel.valid
@@ -263,10 +274,13 @@ def to_table(
         values[wrong, k] = np.nan
         lacking = kept & np.isnan(values[:, k]) & channel.needed
         kept &= ~lacking
-        remarks["invalid", name] += int(wrong.sum())
+        remarks["invalid", name] += int((wrong & chosen).sum())
         remarks["skipped", name] = int(lacking.sum())
     if not kept.any():
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
+    if held.any():
+        before = _known_before(int(use[0]), numbers, columns, holes)
+        values, kept = _with_held(times[use], values, between, chosen, kept, before)
     t, values, origin = times[use][kept], values[kept], None
     if dates:
         origin = origin_at(float(t[0]) / clock.second)
@@ -291,6 +305,54 @@ def _chosen(
         last, t = times[use[late[0] : late[0] + 2]]
         raise _disorder(row(int(use[late[0] + 1])), bool(t == last), dates and clock.set_back(t))
     return use
+
+
+def _known_before(
+    first: int,
+    numbers: Callable[[str, Any], Array],
+    columns: Mapping[str, Column],
+    holes: tuple[float, ...],
+) -> Array:
+    """Return the last value of each "hold" channel before a row, NaN of others, (channels,)."""
+    found = np.full(len(columns), math.nan)
+    for k, column in enumerate(columns.values()):
+        if column.between != "hold" or not first:
+            continue
+        parts = [numbers(name, np.arange(first)) for name in column.names]
+        parts = [np.where(np.isin(part, holes), math.nan, part) for part in parts]
+        values = column.factor * np.mean(parts, axis=0) + column.offset
+        low, high = column.valid
+        known = values[(values >= low) & (values <= high)]
+        found[k] = known[-1] if len(known) else math.nan
+    return found
+
+
+def _with_held(
+    t: Array, values: Array, between: Sequence[Between], chosen: Mask, kept: Mask, before: Array
+) -> tuple[Array, Mask]:
+    """Return the rows of a table, and which stay, with what all rows state of held inputs.
+
+    Parameters
+    ----------
+    chosen, kept
+        Rows that `every` leaves, and those of them in which no channel is missing that they need.
+    before
+        Values of held inputs before the first row.
+    """
+    held = np.array([one != "line" for one in between])
+    rows, found, stays = Thinned(between), values.copy(), np.zeros(len(t), dtype=bool)
+    rows.take(-math.inf, before, False)
+    begun = False
+    for k in range(len(t)):
+        begun = begun or bool(kept[k])
+        # A row without a channel that it needs stays as one of its held inputs.
+        needed = bool(kept[k]) or (
+            begun and bool(chosen[k]) and bool(np.isfinite(values[k, held]).any())
+        )
+        row = rows.take(float(t[k]), values[k], needed)
+        if row is not None:
+            found[k], stays[k] = row if kept[k] else np.where(held, row, math.nan), True
+    return found, stays
 
 
 def _noise_remarks(columns: Mapping[str, Column], values: Array) -> dict[tuple[str, str], int]:
@@ -340,7 +402,11 @@ class JsonLines:
     def __iter__(self) -> Iterator[Sample]:
         clock, last, zero = self._clock, -math.inf, 0.0
         needed = [channel for channel, column in self._columns.items() if column.needed]
-        for where, row, t, dates in islice(self._timed_rows(), None, None, self._every):
+        between = [column.between for column in self._columns.values()]
+        held = np.array([one != "line" for one in between], dtype=bool)
+        thinned, begun = Thinned(between), False
+        step = 1 if held.any() else self._every
+        for k, (where, row, t, dates) in enumerate(islice(self._timed_rows(), None, None, step)):
             if t <= last:
                 raise _disorder(where, t == last, dates and clock.set_back(t))
             if dates and math.isinf(last):  # the first sample is t = 0
@@ -348,8 +414,19 @@ class JsonLines:
                 self.origin = origin_at(t / clock.second)
             last = t
             values = self._values(row, where)
-            if not any(math.isnan(values[channel]) for channel in needed):
-                yield Sample(t=t - zero, z=values)
+            whole = not any(math.isnan(values[channel]) for channel in needed)
+            if not held.any():
+                if whole:
+                    yield Sample(t=t - zero, z=values)
+                continue
+            array, chosen = np.array(list(values.values())), k % self._every == 0
+            kept = chosen and whole
+            begun = begun or kept
+            states = begun and chosen and bool(np.isfinite(array[held]).any())
+            left = thinned.take(t, array, kept or states)
+            if left is not None:
+                left = left if kept else np.where(held, left, math.nan)
+                yield Sample(t=t - zero, z=dict(zip(values, left.tolist(), strict=True)))
 
     def _values(self, row: Mapping[str, Any], where: str) -> dict[str, float]:
         """Return the values of the channels in a row, NaN where they are missing or not valid."""

@@ -1,0 +1,96 @@
+"""Rows that are left out by `every`: what they state of inputs that are held is kept."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from livepde.linalg import Array
+from livepde.stepping import Between
+
+__all__ = ["Thinned"]
+
+
+class Thinned:
+    """Every n-th row of a stream, without the loss of a switch or of a share of a mean.
+
+    A row that would be left out stays as a row of its held inputs alone where one of them
+    (`between = "hold"`) changes. The reading of a `"next"` channel becomes the mean, weighted by
+    time, since the last row that stays.
+
+    Parameters
+    ----------
+    between
+        Behaviour of each column between two readings.
+
+    Examples
+    --------
+    >>> rows = Thinned(["line", "hold"])
+    >>> rows.take(0.0, np.array([20.0, 1.0]), True)
+    array([20.,  1.])
+    >>> rows.take(1.0, np.array([21.0, 0.0]), False)
+    array([nan,  0.])
+    """
+
+    def __init__(self, between: Sequence[Between]) -> None:
+        self._hold = [k for k, one in enumerate(between) if one == "hold"]
+        self._means = {k: _Mean() for k, one in enumerate(between) if one == "next"}
+        self._last = np.full(len(between), math.nan)
+        self._begun = False
+
+    def take(self, t: float, row: Array, stays: bool) -> Array | None:
+        """Return what is left of a row; None if nothing.
+
+        Parameters
+        ----------
+        t, row
+            Time and values, NaN where missing, shape (columns,).
+        stays
+            Whether the row stays as it is.
+        """
+        for k, mean in self._means.items():
+            mean.add(t, float(row[k]))
+        changed = [k for k in self._hold if math.isfinite(row[k]) and row[k] != self._last[k]]
+        for k in changed:
+            self._last[k] = row[k]
+        # Before the first row that stays, values are remembered for it.
+        if not (stays or (changed and self._begun)):
+            return None
+        found = np.full(len(row), math.nan)
+        if stays:
+            found = row.copy()
+            if not self._begun:
+                for k in self._hold:
+                    found[k] = self._last[k]
+            self._begun = True
+        else:
+            found[self._hold] = row[self._hold]
+        for k, mean in self._means.items():
+            found[k] = mean.taken() if math.isfinite(row[k]) else math.nan
+        return found
+
+
+class _Mean:
+    """Mean of the readings since it was last taken, each weighted by the time since the one before.
+
+    A missing reading leaves its time to the next one.
+    """
+
+    def __init__(self) -> None:
+        self._t = math.nan
+        self._parts: list[tuple[float, float]] = []  # time and value
+
+    def add(self, t: float, value: float) -> None:
+        if math.isfinite(value):
+            time = 0.0 if math.isnan(self._t) else t - self._t
+            self._t = t
+            self._parts.append((time, value))
+
+    def taken(self) -> float:
+        parts, self._parts = self._parts, []
+        whole = sum(time for time, _ in parts)
+        if len(parts) == 1 or whole == 0.0:
+            return parts[-1][1]
+        return sum(time * value for time, value in parts) / whole
