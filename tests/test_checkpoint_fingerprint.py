@@ -31,7 +31,6 @@ CASES: dict[str, tuple[dict[str, Any], str]] = {
     "refit": ({"law": lp.SensitivityLaw(refit=None)}, "another option of the law"),
     "dt_max": ({"dt_max": 0.1}, "another scheme, dt_max"),
     "scheme": ({"scheme": lp.ImplicitEuler()}, "another scheme, dt_max"),
-    "hold": ({"hold": True}, "another scheme, dt_max"),
     "initial state": ({"u0": 0.1}, "another u0 or q0"),
     "initial parameter": ({"q0": {"k": 0.11}}, "another u0 or q0"),
 }
@@ -52,7 +51,7 @@ def parts(**changed: Any) -> tuple[Any, dict[str, Any]]:
     )
     sensors = lp.Points({"T": given["place"]}, noise=given["noise"])
     law = given.get("law", lp.SensitivityLaw())
-    keywords = {name: given[name] for name in ("q0", "scheme", "hold") if name in given}
+    keywords = {name: given[name] for name in ("q0", "scheme") if name in given}
     return (model, sensors, law), {**STEPS, **keywords} | {
         name: given[name] for name in STEPS if name in given
     }

@@ -20,6 +20,7 @@ from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams.sentinels import sentinels
+from livepde.streams.switches import switches
 
 __all__ = [
     "PLACES",
@@ -346,12 +347,22 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
         if entry := _input_of(name, inputs):
             unit = _stated(name, inputs.pop(entry).unit)
             given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
-            found.append(FoundChannel(entry, given, (name,), _range(values)))
+            told = _range(values)
+            if _switches(table, name):
+                given["between"] = "hold"
+                told += ", constant stretches with jumps"
+            found.append(FoundChannel(entry, given, (name,), told))
         else:
             label = key if key and keys.count(key) == 1 else name
             found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
     return [*_in_families(equation, found), *_lacking(equation, inputs, there)]
+
+
+def _switches(table: Measured, name: str) -> bool:
+    """Return whether a column has constant stretches with jumps."""
+    samples = next(one.samples for one in table.tables if name in one.samples.names)
+    return switches(samples.t, samples.values[:, samples.names.index(name)])
 
 
 def _lacking(

@@ -14,6 +14,7 @@ from rich.markup import escape
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
 from livepde.streams.sentinels import sentinels
+from livepde.streams.switches import switches
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
@@ -56,6 +57,7 @@ def check(
         *loaded.notes,
         *_refused(prepared),
         *_sentinels(loaded, samples),
+        *_switching(loaded, samples),
         *_show_preview(console, prepared),
     ]
     if advise:
@@ -98,6 +100,21 @@ def _sentinels(case: Case, samples: DataTable) -> list[str]:
             for found in sentinels(np.round((values - column.offset) / column.factor, 9))
         ]
     return said
+
+
+def _switching(case: Case, samples: DataTable) -> list[str]:
+    """Return sentences on inputs that switch, of which the case does not state what lies between.
+
+    A stated `between` is the user's answer.
+    """
+    return [
+        f"{name}: constant stretches with jumps. If a value holds until the next reading, add "
+        f'`between = "hold"` to `[channels.{name}]`; if it is the mean since the last reading, '
+        '`"next"`; `"line"`, the default, makes a ramp of each jump.'
+        for name, channel in case.roles("input").items()
+        if "between" not in channel.model_fields_set
+        and switches(samples.t, samples.values[:, samples.names.index(name)])
+    ]
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
@@ -175,9 +192,10 @@ def _show_wiring(console: Console, case: Case) -> None:
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
                 "skip" if column.needed else spec.gaps if spec.drives else "go on",
+                spec.between if spec.drives and not column.noise_of else "",
             )
         )
-    columns = ("channel", "role", "column", "valid", "waits", "of two", "missing")
+    columns = ("channel", "role", "column", "valid", "waits", "of two", "missing", "between")
     print_table(console, Table(f"Channels from {source_text(case)}", columns, rows))
     console.print(
         "Add --data FILE, a recording with the same columns, to see what its sensors can identify.",

@@ -27,7 +27,7 @@ KNOWN += (999.0, 9999.0, 99999.0, 99.9, 999.9, 9999.9, 6999.0, 7999.0, 32767.0, 
 REPEATED = 3  # times that another constant occurs
 NEAR = 0.5  # of the range of the rest: a known sentinel lies farther outside
 FAR = 1.0  # another constant lies farther outside than this
-FEWEST = 8  # other values that show the range
+FEWEST = 8  # other values that show the range, and other levels of a constant
 MOST = 4  # sentinels of a column
 
 
@@ -71,6 +71,9 @@ def _at(values: Array, end: float) -> Sentinel | None:
     count = len(values) - len(rest)
     known = end in KNOWN
     if len(rest) < FEWEST or not (known or count >= REPEATED):
+        return None
+    # Of a few levels, such as those of a pump, each is a constant.
+    if not known and len(np.unique(rest)) < FEWEST:
         return None
     low, high = float(rest.min()), float(rest.max())
     beyond = max(low - end, end - high)

@@ -1,0 +1,531 @@
+"""How inputs behave between two readings: lines, values that hold, and means since the last one."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from live_rod import CLOCK
+
+import livepde as lp
+from livepde import cases
+from livepde.cases.measured import measured
+from livepde.cases.new_case import files_for
+from livepde.errors import CaseError, ConfigurationError, RunError
+from livepde.fleet import Fleet
+from livepde.laws import shadows
+from livepde.models import EQUATIONS
+from livepde.streams import FillGaps
+from livepde.streams.clock import Clock
+from livepde.streams.csvfile import read_csv
+from livepde.streams.gaps import fill_table, find_spikes
+from livepde.streams.intake import Habit, Intake, Policy
+from livepde.streams.sentinels import sentinels
+from livepde.streams.switches import switches
+from livepde.streams.table import Column, JsonLines, tabulated
+from livepde.streams.thinned import Thinned
+
+REPORTS = Path(__file__).parent / "reports"
+NAN = math.nan
+PERIOD = 0.1
+TIMES = PERIOD * np.arange(1, 25)
+CHANNELS = ("T_0", "Q")
+
+
+def rod() -> lp.Model:
+    mesh = lp.interval(0.0, 1.0, 12)
+    return lp.Model(
+        lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T_0")}),
+        {"k": lp.Scalar(lp.LogNormal(0.4, std=0.2))},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+        f=lambda x, _: x.inputs["Q"] + 0.0 * x[0],
+        inputs=["Q"],
+    )
+
+
+SENSORS = lp.Points({"a": 0.4, "b": 0.9}, noise=0.02)
+LAWS = {
+    "kalman": lp.SensitivityLaw(shadows=None, verdict=False),
+    "refit": lp.SensitivityLaw(refit=lp.laws.Refit(start=8), shadows=None, verdict=False),
+    "gradient": lp.GradientLaw(gain=20.0),
+}
+
+
+def identifier(law: Any = LAWS["kalman"], **options: Any) -> lp.Identifier:
+    given: dict[str, Any] = {"u0": 0.0, "scheme": lp.ImplicitEuler(), "dt_max": 0.025, **options}
+    return lp.Identifier(rod(), SENSORS, law, **given)
+
+
+def drives(times: np.ndarray) -> np.ndarray:
+    """Return values of T_0 and Q: levels that switch now and then."""
+    k = np.rint(times / PERIOD).astype(int)
+    return np.column_stack([1.0 + 0.5 * (k // 5 % 2), 2.0 * (k // 3 % 2)])
+
+
+@cache
+def readings() -> np.ndarray:
+    """Return what a rod with k = 0.5 shows whose inputs hold until the next reading."""
+    truth = identifier(q0={"k": 0.5}, between=dict.fromkeys(CHANNELS, "hold"))
+    truth.step(0.0, np.full(2, NAN), row(drives(np.zeros(1))[0]))
+    planned = dict(zip(CHANNELS, drives(TIMES).T, strict=True))
+    clean = truth.forecast(TIMES, planned).z
+    return clean + 0.02 * np.random.default_rng(4).standard_normal(clean.shape)
+
+
+def row(values: np.ndarray) -> dict[str, float]:
+    return dict(zip(CHANNELS, values.tolist(), strict=True))
+
+
+def close(one: lp.Estimate, other: lp.Estimate, rtol: float = 1e-9) -> None:
+    for a, b in ((one.q, other.q), (one.u, other.u), (one.q_std, other.q_std)):
+        if a is not None and b is not None:
+            np.testing.assert_allclose(a, b, rtol=rtol, atol=rtol)
+
+
+# --- in the steps of an identifier -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("law", ["kalman", "refit"])
+def test_held_inputs_equal_dense_rows_that_repeat_the_value(law: str) -> None:
+    """Rows of the inputs alone at every substep, as straight lines that end in a switch."""
+    between = dict.fromkeys(CHANNELS, "hold")
+    sparse, dense = identifier(LAWS[law], between=between), identifier(LAWS[law], between=between)
+    z, values, last = readings(), drives(TIMES), drives(np.zeros(1))[0]
+    nothing = np.full(2, NAN)
+    for who in (sparse, dense):
+        who.step(0.0, nothing, row(last))
+    for k, t in enumerate(TIMES.tolist()):
+        for part in (1, 2, 3):
+            dense.step(t - PERIOD + part * 0.025, nothing, row(last))
+        found = dense.step(t, z[k], row(values[k]))
+        last = values[k]
+        expected = sparse.step(t, z[k], row(values[k]))
+        close(expected, found)
+    low, high = found["k"].interval()
+    assert low < 0.5 < high
+
+
+def test_a_held_value_is_that_of_two_rows_with_lines() -> None:
+    """The step of the other spelling: the old value a moment before the new one."""
+    held = identifier(between=dict.fromkeys(CHANNELS, "hold"), scheme=lp.Alexander2())
+    lines = identifier(scheme=lp.Alexander2())
+    z, values, last = readings(), drives(TIMES), drives(np.zeros(1))[0]
+    for who in (held, lines):
+        who.step(0.0, np.full(2, NAN), row(last))
+    for k, t in enumerate(TIMES.tolist()):
+        expected = held.step(t, z[k], row(values[k]))
+        lines.step(t - 1e-9, np.full(2, NAN), row(last))
+        found, last = lines.step(t, z[k], row(values[k])), values[k]
+    assert found.q == pytest.approx(expected.q, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_next_is_hold_of_the_shifted_column(law: str) -> None:
+    held = identifier(LAWS[law], between=dict.fromkeys(CHANNELS, "hold"))
+    means = identifier(LAWS[law], between=dict.fromkeys(CHANNELS, "next"))
+    z, values = readings(), drives(np.append(0.0, TIMES))
+    held.step(0.0, np.full(2, NAN), row(values[0]))
+    means.step(0.0, np.full(2, NAN), row(values[0]))
+    for k, t in enumerate(TIMES.tolist()):
+        # The value that holds from the last reading on is that of the row that ends the interval.
+        close(held.step(t, z[k], row(values[k + 1])), means.step(t, z[k], row(values[k])))
+
+
+def test_a_mean_needs_no_reading_before_its_interval() -> None:
+    """The first row after the start states the first interval: nothing was held backwards."""
+    z, values = readings(), drives(TIMES)
+    for between, held in (("next", ()), ("line", ("Q",)), ("hold", ("Q",))):
+        who = identifier(between={"Q": between})
+        assert who.step(TIMES[0], z[0], row(values[0])).held == held
+
+
+def test_a_missing_value_that_holds_is_no_gap() -> None:
+    dense, sparse = (identifier(between=dict.fromkeys(CHANNELS, "hold")) for _ in range(2))
+    z, values, last = readings(), drives(TIMES), {}
+    for k, t in enumerate(TIMES.tolist()):
+        new = {name: x for name, x in row(values[k]).items() if last.get(name) != x}
+        last |= new
+        found = sparse.step(t, z[k], new)
+        close(dense.step(t, z[k], row(values[k])), found)
+        assert not k or found.held == ()
+    mean = identifier(between=dict.fromkeys(CHANNELS, "next"))
+    mean.step(TIMES[0], z[0], row(values[0]))
+    assert mean.step(TIMES[1], z[1], {"T_0": 1.0}).held == ("Q",)
+
+
+def test_a_sensor_reads_the_input_of_its_row() -> None:
+    """A voltage with a drop that is proportional to the current, which switches at a sample."""
+    sensor = lp.observation.Calibrated(
+        lp.Points({"V": 0.9}), lambda c, q, x: c + 10.0 * x.inputs["Q"], inputs=("Q",), noise=0.1
+    )
+    for between in ("hold", "next", "line"):
+        who = lp.Identifier(rod(), sensor, LAWS["kalman"], u0=0.0, between={"Q": between})
+        who.step(0.0, [NAN], {"T_0": 0.0, "Q": 0.0})
+        found = who.forecast([1e-6], {"T_0": [0.0], "Q": [3.0]})
+        assert found["V"][0] == pytest.approx(30.0, abs=1e-3)
+
+
+def test_a_forecast_holds_the_value_until_the_next_time() -> None:
+    for between, rises in (("hold", False), ("next", True), ("line", True)):
+        who = identifier(between={"Q": between})
+        who.step(0.0, np.full(2, NAN), {"T_0": 0.0, "Q": 0.0})
+        found = who.forecast([0.5, 1.0], {"T_0": 0.0, "Q": [2.0, 2.0]})
+        assert (found["b"][0] > 0.1) == rises
+        assert found["b"][1] > 0.1
+
+
+def test_a_fleet_has_the_behaviour_of_its_members() -> None:
+    between = {"T_0": "hold", "Q": "next"}
+    options = {"u0": 0.0, "scheme": lp.Alexander2(), "dt_max": 0.05, "between": between}
+    fleet = Fleet(rod(), SENSORS, lp.SensitivityLaw(), 2, **options)
+    singles = [identifier(lp.SensitivityLaw(verdict=False), **options) for _ in range(2)]
+    z, values = readings(), drives(TIMES)
+    assert fleet.together
+    for k, t in enumerate(TIMES.tolist()):
+        each = [row(values[k]), row(values[k] * np.array([1.0, 3.0]))]
+        inputs = {name: [one[name] for one in each] for name in CHANNELS}
+        if k % 4 == 3:
+            inputs["T_0"] = [NAN, NAN]
+            each = [{"Q": one["Q"]} for one in each]
+        found = fleet.step(t, [z[k], z[k]], inputs)
+        for m, who in enumerate(singles):
+            close(found.member(m), who.step(t, z[k], each[m]))
+
+
+def test_a_checkpoint_continues_the_same_behaviour_and_no_other() -> None:
+    between = {"T_0": "hold", "Q": "next"}
+    who, z, values = identifier(between=between), readings(), drives(TIMES)
+    for k in range(10):
+        who.step(TIMES[k], z[k], row(values[k]))
+    again, other = identifier(between=between), identifier(between={"T_0": "hold"})
+    again.restore(who.dump())
+    for k in range(10, 20):
+        expected = who.step(TIMES[k], z[k], row(values[k]))
+        found = again.step(TIMES[k], z[k], row(values[k]))
+        np.testing.assert_array_equal(found.q, expected.q)
+    with pytest.raises(RunError, match="another scheme, dt_max, halvings, between"):
+        other.restore(who.dump())
+
+
+def test_behaviours_that_are_none_are_refused() -> None:
+    with pytest.raises(ConfigurationError, match="'heat' is not an input of this model"):
+        identifier(between={"heat": "hold"})
+    with pytest.raises(ConfigurationError, match="got 'step'; expected 'line', 'hold' or 'next'"):
+        identifier(between={"Q": "step"})
+    with pytest.raises(ConfigurationError, match="expected a mapping from input channel"):
+        identifier(between="hold")
+    with pytest.raises(TypeError, match="unexpected keyword argument 'hold'"):
+        identifier(hold=True)
+    with pytest.raises(ConfigurationError, match="'a' is not an input"):
+        identifier(between={"a": "hold"})
+
+
+# --- the error of straight lines ---------------------------------------------------------------
+
+
+def shifted(times: np.ndarray, values: np.ndarray, between: str) -> dict[str, float]:
+    """Return the shifts of k, in standard deviations, after rows of an input."""
+    law = lp.SensitivityLaw(shadows=lp.laws.Shadows(step=False, mesh=False))
+    who = identifier(law, between={"Q": between}, dt_max=np.inf)
+    truth = identifier(q0={"k": 0.5}, between={"Q": "hold"})
+    truth.step(0.0, np.full(2, NAN), {"T_0": 0.0, "Q": values[0]})
+    z = truth.forecast(times[1:], {"T_0": 0.0, "Q": values[1:]}).z
+    estimate = who.step(0.0, np.full(2, NAN), {"T_0": 0.0, "Q": values[0]})
+    for t, shown, q in zip(times[1:].tolist(), z, values[1:].tolist(), strict=True):
+        estimate = who.step(t, shown, {"T_0": 0.0, "Q": q})
+    return {kind: abs(size) for kind, size in estimate.diagnostics.shifts.sizes.items()}
+
+
+def test_a_step_in_two_rows_has_no_curvature(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = np.arange(0.0, 4.0, PERIOD)
+    whole, before = 5.0 * (times > 2.0), 2.1 - 1e-3
+    k = int(np.searchsorted(times, before))
+    rows = np.insert(times, k, before), np.insert(whole, k, 0.0)
+    assert shifted(*rows, "line")["input"] < 0.02
+    monkeypatch.setattr(shadows, "SHORT", 0.0)
+    assert shifted(*rows, "line")["input"] > 1.0  # that of a curve with this slope
+
+
+def test_held_inputs_have_no_curvature() -> None:
+    times = np.arange(0.0, 4.0, PERIOD)
+    for between in ("hold", "next"):
+        sizes = shifted(times, 5.0 * (times > 2.0), between)
+        # T_0 is a line, and constant.
+        assert sizes["input"] == 0.0
+        assert sizes["hold"] == 0.0
+
+
+# --- spikes and gaps ---------------------------------------------------------------------------
+
+
+def two_rows() -> tuple[np.ndarray, np.ndarray]:
+    """Return a rate that switches each 20 min, with the old rate one second before."""
+    t = 60.0 * np.arange(200)
+    x = np.array([0.0, 8.0, 12.0, 15.5])[np.arange(200) // 20 % 4]
+    at = np.flatnonzero(np.diff(x)) + 1
+    return np.insert(t, at, t[at] - 1.0), np.insert(x, at, x[at - 1])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_a_step_in_two_rows_is_no_spike_and_a_spike_beside_it_is_one(noise: float) -> None:
+    t, x = two_rows()
+    x = x + noise * np.random.default_rng(1).standard_normal(len(x))
+    assert not find_spikes(t, x).any()
+    wild = 70
+    x[wild] += 50.0
+    assert np.flatnonzero(find_spikes(t, x)).tolist() == [wild]
+
+
+def test_a_value_between_two_near_rows_that_does_not_stay_is_a_spike() -> None:
+    t = np.sort(np.append(60.0 * np.arange(60), 1801.0))
+    x = np.sin(t / 600.0)
+    k = int(np.searchsorted(t, 1801.0))
+    assert not find_spikes(t, x).any()
+    x[k] += 30.0
+    assert np.flatnonzero(find_spikes(t, x)).tolist() == [k]
+
+
+HELD = {"hold": Column(("h",), between="hold"), "mean": Column(("m",), between="next")}
+COLUMNS = {"a": Column(("a",)), **HELD}
+
+
+def test_held_channels_are_not_screened_and_gaps_are_what_they_are() -> None:
+    t = np.arange(40.0)
+    h, m = np.full(40, 1.0), np.full(40, 2.0)
+    h[20], m[20], h[10:13], m[10:13] = 90.0, 90.0, NAN, NAN
+    m[13] = 5.0
+    table = tabulated(t, {"a": t, "h": h, "m": m}, COLUMNS, Clock("t"))
+    filled = fill_table(table, ["mean"], [], means=["mean"])
+    np.testing.assert_array_equal(filled.values[:, 1], h)
+    np.testing.assert_array_equal(filled.values[9:15, 2], [2.0, 5.0, 5.0, 5.0, 5.0, 2.0])
+    assert filled.values[20, 2] == 90.0
+    assert dict(filled.remarks) == {("interpolated", "mean"): 3}
+    stage = FillGaps(["hold", "mean"], between={"hold": "hold", "mean": "next"})
+    rows = [(sample.t, dict(sample.z)) for sample in table]
+    found = np.array([[s.z["hold"], s.z["mean"]] for s in stage(rows)])
+    np.testing.assert_array_equal(found, filled.values[:, 1:])
+    with pytest.raises(ConfigurationError, match="expected 'line', 'hold' or 'next'"):
+        FillGaps(["hold"], between={"hold": "linear"})  # type: ignore[dict-item]
+
+
+def test_rows_that_are_left_out_keep_switches_and_means() -> None:
+    t = np.arange(12.0)
+    h = np.array([1.0, NAN, NAN, NAN, 0.0, NAN, NAN, 1.0, NAN, NAN, NAN, NAN])
+    m = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, NAN, 7.0, 8.0, 9.0, 10.0, 11.0])
+    columns = {"a": t, "h": h, "m": m}
+    table = tabulated(t, columns, COLUMNS, Clock("t"), every=5)
+    np.testing.assert_array_equal(table.t, [0.0, 4.0, 5.0, 7.0, 10.0])
+    np.testing.assert_array_equal(table.values[:, 0], [0.0, NAN, 5.0, NAN, 10.0])
+    np.testing.assert_array_equal(table.values[:, 1], [1.0, 0.0, NAN, 1.0, NAN])
+    # Means since the row before that stays: of 1 to 4, 5, twice 7 (one was missing), 8 to 10.
+    np.testing.assert_array_equal(table.values[:, 2], [0.0, 2.5, 5.0, 7.0, 9.0])
+    lines = [
+        json.dumps({"t": s, "a": s, "h": None if x != x else x, "m": None if y != y else y})
+        for s, x, y in zip(t.tolist(), h.tolist(), m.tolist(), strict=True)
+    ]
+    each = list(JsonLines(lines, COLUMNS, Clock("t"), every=5))
+    np.testing.assert_array_equal([one.t for one in each], table.t)
+    np.testing.assert_array_equal([list(one.z.values()) for one in each], table.values)
+    plain = {name: Column(column.names) for name, column in COLUMNS.items()}
+    assert len(tabulated(t, columns, plain, Clock("t"), every=5)) == 3
+
+
+def test_every_nth_row_has_the_integral_of_all(tmp_path: Path) -> None:
+    """The drive of a thinned table is that of the whole one, whatever its spelling."""
+    rng = np.random.default_rng(3)
+    t = np.cumsum(rng.uniform(0.5, 1.5, 200))
+    x = rng.integers(0, 2, 200).astype(float)
+    for between in ("hold", "next"):
+        rows, integral = Thinned([between]), 0.0
+        last_t, last = NAN, NAN
+        for k in range(200):
+            found = rows.take(float(t[k]), x[k : k + 1], k % 7 == 0 or k == 199)
+            if found is None:
+                continue
+            if k:
+                integral += (t[k] - last_t) * (last if between == "hold" else found[0])
+            last_t, last = float(t[k]), float(found[0])
+        held = x[:-1] if between == "hold" else x[1:]
+        assert integral == pytest.approx(float(np.diff(t) @ held), rel=1e-12)
+
+
+def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
+    needed = {"a": Column(("a",), needed=True), "h": Column(("h",), between="hold")}
+    t, a = np.arange(6.0), np.array([NAN, 1.0, NAN, 1.0, 1.0, NAN])
+    h = np.array([5.0, NAN, 7.0, NAN, NAN, NAN])
+    table = tabulated(t, {"a": a, "h": h}, needed, Clock("t"))
+    np.testing.assert_array_equal(table.t, [1.0, 2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(table.values[:, 1], [5.0, 7.0, NAN, NAN])
+    assert dict(table.remarks) == {("skipped", "a"): 3}
+    late = tabulated(t, {"a": a, "h": h}, needed, Clock("t", start=2.5))
+    np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # as it was before the start
+
+
+def test_a_live_intake_has_the_samples_of_the_table() -> None:
+    """A controller writes its heater at changes only, between the rows of the sensor."""
+    rng = np.random.default_rng(8)
+    rows: list[dict[str, float]] = [{"t": float(k), "a": float(k)} for k in range(60)]
+    rows[0] |= {"h": 0.0, "m": 0.0}
+    state = 0.0
+    for at in np.sort(rng.uniform(0.0, 58.0, 7)):
+        state = 1.0 - state
+        rows.append({"t": float(at), "h": state})
+    rows[-1]["m"] = 4.0
+    rows.sort(key=lambda one: one["t"])
+    rows[-1]["m"] = 6.0
+    habits = {
+        "hold": Habit(0.0, None, False, False, "hold"),
+        "mean": Habit(100.0, None, True, False, "next"),
+    }
+    sink = Intake(COLUMNS, CLOCK, Policy(channels=habits))
+    outcomes = [sink.take(one, one["t"]) for one in rows] + [sink.flush()]
+    ready = [one for outcome in outcomes for one in outcome.ready]
+    kinds = {(r.kind, r.channel) for outcome in outcomes for r in outcome.remarks}
+    columns = {n: [one.get(n, NAN) for one in rows] for n in ("a", "h", "m")}
+    table = tabulated([one["t"] for one in rows], columns, COLUMNS, CLOCK)
+    filled = fill_table(table, ["mean"], [], means=["mean"])
+    assert [one.t for one in ready] == filled.t.tolist()
+    live = [[one.values.get(name, NAN) for name in COLUMNS] for one in ready]
+    np.testing.assert_array_equal(live, filled.values)
+    assert ("missing", "hold") not in kinds
+    assert ("interpolated", "mean") in kinds
+
+
+# --- in cases ----------------------------------------------------------------------------------
+
+
+def test_switches_are_recognised_and_measured_values_are_not() -> None:
+    t, rng = np.arange(200.0), np.random.default_rng(2)
+    pump = np.array([0.0, 8.0, 12.0, 15.5])[np.arange(200) // 20 % 4]
+    heater = 500.0 * (np.arange(200) // 11 % 2)
+    only_changes = np.where(np.diff(heater, prepend=-1.0) != 0.0, heater, NAN)
+    coarse = np.round(20.0 + 3.0 * np.sin(t / 30.0), 1)
+    for values, expected in (
+        (pump, True),
+        (heater, True),
+        (only_changes, True),
+        (coarse, False),
+        (pump + 0.01 * rng.standard_normal(200), False),
+        (np.full(200, 7.0), False),
+        (np.full(200, NAN), False),
+    ):
+        assert switches(t, values) == expected
+    assert not switches(*two_rows())  # the rows state the steps
+    assert sentinels(pump) == []  # no level of a pump stands for a missing reading
+    assert [one.value for one in sentinels(np.append(pump, 9999.0))] == [9999.0]
+
+
+def test_init_proposes_what_the_table_shows(tmp_path: Path) -> None:
+    text = (REPORTS / "pumping_steps.csv").read_text().replace("pump rate [L/s]", "Q [L/s]")
+    (tmp_path / "well.csv").write_text(text)
+    equation = EQUATIONS["pumping_test"]
+    table = measured(tmp_path / "well.csv", equation.time_unit)
+    case = files_for(table, tmp_path / "new", equation)["case.toml"]
+    assert 'column = "Q [L/s]", unit = "L/s", between = "hold" }' in case
+    assert "missing = [9999.0]" in case
+
+
+def pumping(tmp_path: Path, more: str = "", data: str = "pumping_steps.csv") -> Path:
+    text = (REPORTS / "pumping_steps.toml").read_text()
+    text = text.replace('unit = "L/s"', f'unit = "L/s"{more}').replace("pumping_steps.csv", data)
+    path = tmp_path / "case.toml"
+    path.write_text(text)
+    for file in REPORTS.glob("*.csv"):
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (', between = "step"', "channels.Q.between"),
+        (', between = "hold", missing = "interpolate"', "is never missing"),
+        (', between = "next", spikes = "refuse"', 'requires between = "line"'),
+    ],
+)
+def test_keys_that_contradict_each_other_are_refused(tmp_path: Path, more: str, message: str):
+    with pytest.raises(CaseError, match=message):
+        cases.load(pumping(tmp_path, more))
+
+
+def test_a_sensor_has_nothing_between_its_readings(tmp_path: Path) -> None:
+    path = pumping(tmp_path)
+    path.write_text(path.read_text().replace('at = "18 m"', 'at = "18 m", between = "hold"'))
+    with pytest.raises(CaseError, match="between requires a boundary or input channel"):
+        cases.load(path)
+
+
+# --- reports of users --------------------------------------------------------------------------
+
+
+def run(path: Path, **settings: Any) -> lp.Estimate:
+    prepared = cases.load(path, settings=settings).prepare() if settings else None
+    prepared = prepared or cases.load(path).prepare()
+    result = prepared.identifier.run(prepared.stream)
+    assert result.last is not None
+    return result.last
+
+
+def holds(estimate: lp.Estimate, **truths: float) -> None:
+    assert estimate.verdict.level == "trusted"
+    for name, truth in truths.items():
+        low, high = estimate[name].interval()
+        assert low <= truth <= high, (name, low, high)
+        assert high - low < 0.15 * truth, (name, low, high)
+
+
+def with_two_rows(source: Path, target: Path) -> None:
+    """Write the table as its user did: the old rate in a row one second before each step."""
+    header, *lines = source.read_text().splitlines()
+    rows, before = [], None
+    for line in lines:
+        date, rate, s1, s2 = line.split(",")
+        if before is not None and rate != before:
+            day, clock = date.split()
+            hour, minute = map(int, clock.split(":"))
+            hour, minute = (hour, minute - 1) if minute else (hour - 1, 59)
+            rows.append(f"{day} {hour:02d}:{minute:02d}:59,{before},,")
+        rows.append(f"{date}:00,{rate},{s1},{s2}")
+        before = rate
+    target.write_text("\n".join([header, *rows]) + "\n")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("table", ["held", "two rows"])
+def test_a_pumping_test_with_rate_steps(tmp_path: Path, table: str) -> None:
+    """Truths of finite volumes, with Theis: T 4.2e-3 m^2/s, S 3.1e-4; b = 1 m."""
+    path = pumping(tmp_path, ', between = "hold"' if table == "held" else "")
+    if table != "held":
+        source = tmp_path / "pumping_steps.csv"
+        with_two_rows(source, source)
+        path.write_text(path.read_text().replace("%H:%M", "%H:%M:%S"))
+    holds(run(path), k=4.2e-3, Ss=3.1e-4)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("between", ["line", "hold"])
+def test_a_tracer_pulse_through_a_column(tmp_path: Path, between: str) -> None:
+    """Truths of the analytic solution: v 27 cm/h, D 16.2 cm^2/h."""
+    text = (REPORTS / "column_pulse.toml").read_text()
+    path = tmp_path / "case.toml"
+    path.write_text(text.replace('"c_in" }', f'"c_in", between = "{between}" }}'))
+    (tmp_path / "column_pulse.csv").write_bytes((REPORTS / "column_pulse.csv").read_bytes())
+    estimate = run(path)
+    holds(estimate, v=27.0, D=16.2)
+    low, high = estimate["v"].interval()
+    assert high - low < 0.5  # as the data allow: +- 0.19
+
+
+def test_a_table_of_two_rows_reads_as_it_is_written(tmp_path: Path) -> None:
+    with_two_rows(REPORTS / "pumping_steps.csv", tmp_path / "well.csv")
+    columns = {"Q": Column(("pump rate [L/s]",))}
+    table = read_csv(tmp_path / "well.csv", columns, Clock("date", format="%d/%m/%Y %H:%M:%S"))
+    assert len(table) == 1415
+    filled = fill_table(table, ["Q"], ["Q"])
+    assert filled.remarks == table.remarks  # nothing is refused
+    np.testing.assert_array_equal(filled.values, table.values)
