@@ -1,13 +1,15 @@
 """The walks of docs/first-hour.md with data of other truths: how often their intervals hold.
 
-Truths come from codes of their own: finite volumes with exponentials in time for the wall and the
-ground, finite differences with small steps for the plate. Nothing is shared with livepde but the
-priors that they are drawn from. `write` makes the tables of examples/first_hour.
+Truths come from codes of their own: finite volumes with exponentials in time for the walls, the
+ground and the aquifer, finite differences with small steps for the plate, and the solution of Ogata
+and Banks (1961) for the column. Nothing is shared with livepde but the priors that they are drawn
+from. `write` makes the tables of examples/first_hour.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import runpy
 import shutil
 import tempfile
@@ -19,10 +21,11 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
+from scipy.special import erfc, erfcx
 
 import livepde as lp
 from benchmarks import ROOT
-from benchmarks.honest.linear import diffusion, fine_times
+from benchmarks.honest.linear import Linear, diffusion, fine_times
 from benchmarks.honest.problems.borehole import Borehole
 from benchmarks.jobs import each
 from livepde.cases import load
@@ -32,7 +35,7 @@ __all__ = ["FOLDER", "first_hour", "write"]
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"
-WALKS = ("furnace", "borehole", "plate")
+WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater")
 WRITTEN = 0  # seed of the tables in the examples
 SHARE = 0.9  # of the vertices of a field whose interval has to hold
 HELD = 0.9  # of the seeds: 18 of 20
@@ -47,6 +50,20 @@ SIDE = 60  # cells of the truth along 1 m
 SENSORS = 30
 PLATE_NOISE = 0.2
 ALPHA, ALPHA_STD, LENGTH = 1e-4, 4e-5, 0.3  # prior of its diffusivity
+
+# The aquifer: a well, and two observation wells.
+WELLS = (18.0, 63.0)  # m from the pumped one
+WELL, FAR = 0.1, 5000.0  # m
+DRAWDOWN = 0.01  # m, noise of its loggers
+
+# The column.
+OUTLET = 10.0  # cm, place of its probe
+CONCENTRATION = 0.01  # noise of the probe
+
+# The heated wall, with a heater that a controller switches.
+BRICK, BRICK_CAPACITY, BRICK_DEPTHS = 0.1, 1.4e6, (0.01, 0.03, 0.06)
+POWER = 800.0  # W/m^2
+BRICK_KELVIN = 0.2
 
 
 def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
@@ -86,6 +103,106 @@ def borehole(seed: int) -> tuple[list[str], Array, dict[str, float]]:
         name: float(np.exp(item.value(theta, 0)[0])) for name, item in problem.latents.items()
     }
     return ["time_s", "T_fluid", "Q_W"], table, truths
+
+
+def held(system: Linear, times: Array, g: Array) -> Array:
+    """Return z at times of a system with diagonal A, whose inputs hold from each time to the next.
+
+    Parameters
+    ----------
+    times, g
+        Shapes (times,) and (times, inputs); the state is zero at the first time.
+    """
+    y, shown = np.zeros(len(system.A)), []
+    for k, t in enumerate(times):
+        if k:
+            z = system.A * (t - times[k - 1])
+            share = np.where(np.abs(z) < 1e-12, 1.0, np.expm1(z) / np.where(z == 0.0, 1.0, z))
+            y = np.exp(z) * y + (t - times[k - 1]) * share * (system.B @ g[k - 1])
+        shown.append(system.C @ y)
+    return np.array(shown)
+
+
+def aquifer(T: float, S: float, times: Array, rate: Array) -> Array:
+    """Return the drawdown in the observation wells, shape (times, wells); rates hold, in m^3/s."""
+    cells = 400
+    faces = np.linspace(np.log(WELL), np.log(FAR), cells + 1)
+    middles, width = 0.5 * (faces[1:] + faces[:-1]), faces[1] - faces[0]
+    between = np.full(cells, 2.0 * np.pi * T / width)
+    loss, B = np.zeros(cells), np.zeros((cells, 1))
+    loss[-1], B[0, 0] = 2.0 * between[-1], 1.0
+    C = np.array([[np.interp(np.log(r), middles, row) for row in np.eye(cells)] for r in WELLS])
+    capacity = S * np.pi * np.diff(np.exp(2.0 * faces))
+    system = diffusion(between[:-1], capacity, loss, B, C, np.zeros((len(WELLS), 1)))
+    return held(system, times, rate[:, None])
+
+
+def pumping(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+    """Return the table of a pumping test with three rates and a recovery, and its truths."""
+    rng = np.random.default_rng([seed, 5])
+    T, S = 4e-3 * np.exp(0.4 * rng.standard_normal()), 3e-4 * np.exp(0.4 * rng.standard_normal())
+    minutes = np.arange(0.0, 901.0)
+    rates = np.array([0.0, *np.round(np.sort(rng.uniform(5.0, 18.0, 3)), 1), 0.0])  # L/s
+    rate = rates[np.searchsorted([10.0, 160.0, 340.0, 540.0], minutes, side="right")]
+    shown = aquifer(T, S, 60.0 * minutes, 1e-3 * rate)
+    shown += DRAWDOWN * rng.standard_normal(shown.shape)
+    header = ["time_min", "Q_L_s", *(f"s_{r:g}m" for r in WELLS)]
+    return header, np.column_stack([minutes, rate, shown]), {"k": float(T), "Ss": float(S)}
+
+
+def breakthrough(v: float, D: float, hours: Array) -> Array:
+    """Return the concentration at the probe after a step at the inlet, of Ogata and Banks."""
+    t = np.where(hours > 0.0, hours, np.nan)
+    a, b = ((OUTLET + sign * v * t) / (2.0 * np.sqrt(D * t)) for sign in (-1.0, 1.0))
+    # exp(v x/D) erfc(b) without the overflow of the first factor: v x/D - b^2 = -a^2.
+    found = 0.5 * (erfc(a) + np.exp(-(a**2)) * erfcx(b))
+    return np.where(hours > 0.0, found, 0.0)
+
+
+def column(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+    """Return the table of a tracer pulse through a column, and its truths."""
+    rng = np.random.default_rng([seed, 6])
+    v, D = 27.0 * np.exp(0.2 * rng.standard_normal()), 16.0 * np.exp(0.4 * rng.standard_normal())
+    minutes = np.arange(0.0, 181.0, 4.0)
+    stop = 4.0 * rng.integers(15, 26)  # where the pulse ends
+    c = breakthrough(v, D, minutes / 60.0) - breakthrough(v, D, (minutes - stop) / 60.0)
+    c += CONCENTRATION * rng.standard_normal(len(c))
+    table = np.column_stack([minutes, np.where(minutes < stop, 1.0, 0.0), c])
+    return ["time_min", "c_in", "c"], table, {"v": float(v), "D": float(D)}
+
+
+def heater(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+    """Return the table of a wall whose heater a controller switches, and its truths.
+
+    The heater has a value at its changes only, between the readings of the thermometers.
+    """
+    rng = np.random.default_rng([seed, 7])
+    k, h = 0.8 * np.exp(0.3 * rng.standard_normal()), 10.0 * np.exp(0.3 * rng.standard_normal())
+    read = np.arange(0.0, 8 * 3600.0 + 1.0, 60.0)
+    stretches = rng.uniform(300.0, 2400.0, 200)
+    changes = np.round(np.append(0.0, np.cumsum(stretches)), 1)
+    changes = np.append(0.0, changes[1:][changes[1:] < read[-1]])
+    states = np.arange(len(changes)) % 2 * POWER
+    times = np.union1d(read, changes)
+    power = states[np.searchsorted(changes, times, side="right") - 1]
+    cells = 200
+    width = BRICK / cells
+    middles = width * (np.arange(cells) + 0.5)
+    between = np.full(cells, k / width)
+    loss, B = np.zeros(cells), np.zeros((cells, 1))
+    loss[-1], B[0, 0] = 1.0 / (1.0 / h + 0.5 / between[-1]), 1.0
+    seen = [[np.interp(x, middles, row) for row in np.eye(cells)] for x in BRICK_DEPTHS]
+    nothing = np.zeros((len(BRICK_DEPTHS), 1))
+    system = diffusion(
+        between[:-1], np.full(cells, BRICK_CAPACITY * width), loss, B, np.array(seen), nothing
+    )
+    shown = 20.0 + held(system, times, power[:, None])
+    shown += BRICK_KELVIN * rng.standard_normal(shown.shape)
+    shown[~np.isin(times, read)] = np.nan
+    logged = np.where(np.isin(times, changes), power, np.nan)
+    header = ["time_s", "heater_W_m2", *(f"T_{1e3 * x:g}mm" for x in BRICK_DEPTHS)]
+    truths = {"k": float(k), "h": float(h)}
+    return header, np.column_stack([times, logged, shown]), truths
 
 
 def diffusivity(seed: int) -> Any:
@@ -165,6 +282,19 @@ def _places() -> Array:
     return np.array(found)
 
 
+TABLES = {
+    "furnace": furnace,
+    "borehole": borehole,
+    "pumping": pumping,
+    "column": column,
+    "heater": heater,
+}
+
+
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.6g}"
+
+
 def write(folder: Path, walk: str, seed: int = WRITTEN) -> dict[str, float]:
     """Write the tables of a walk into a folder, and return the truths of its numbers."""
     truths: dict[str, float] = {}
@@ -173,8 +303,8 @@ def write(folder: Path, walk: str, seed: int = WRITTEN) -> dict[str, float]:
         lines = [f"T_{k},{x:.5f},{y:.5f}" for k, (x, y) in enumerate(places.tolist())]
         (folder / "places.csv").write_text("\n".join(["name,x,y", *lines]) + "\n")
     else:
-        header, table, truths = {"furnace": furnace, "borehole": borehole}[walk](seed)
-    rows = [",".join(f"{value:.6g}" for value in row) for row in table.tolist()]
+        header, table, truths = TABLES[walk](seed)
+    rows = [",".join(map(_cell, row)) for row in table.tolist()]
     (folder / f"{walk}.csv").write_text("\n".join([",".join(header), *rows]) + "\n")
     return truths
 
