@@ -908,7 +908,7 @@ def test_references_and_forecasts_are_checked():
         ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"heater": np.inf})
     with pytest.raises(lp.errors.SampleError, match="unknown input 'wind'"):
         loop.step(0.0, z, {"wind": ROOM}, reference={"tip": 45.0})
-    with pytest.raises(lp.errors.ConfigurationError, match="between={'room': 'next'}"):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"between=\{'room': 'next'\}"):
         ct.Loop(identifier(between={"heater": "next"}), ct.LQ(reduced(), GOAL, PERIOD))
 
 
