@@ -337,14 +337,19 @@ def silent(
 
 
 @program.command(name="first-hour", quick="Two truths of each walk.")
-def first_hour(seeds: Annotated[int, Count(20, 2, "Truths of each walk.")]) -> Outcome:
+def first_hour(
+    *,
+    seeds: Annotated[int, Count(20, 2, "Truths of each walk.")],
+    only: Annotated[list[str] | None, several("Only this walk.")] = None,
+) -> Outcome:
     """Count how often the walks of docs/first-hour.md find truths of another code.
 
-    Example:  python -m benchmarks first-hour --seeds 4
+    Example:  python -m benchmarks first-hour --only pumping --seeds 4
     """
+    from benchmarks.first_hour import WALKS
     from benchmarks.first_hour import first_hour as benchmark
 
-    return benchmark(seeds=seeds, progress=True)
+    return benchmark(tuple(chosen(only, WALKS, "walk", WALKS)), seeds=seeds, progress=True)
 
 
 @program.command(

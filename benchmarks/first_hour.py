@@ -31,7 +31,7 @@ from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.runs.outcome import Check, Outcome, Table
 
-__all__ = ["FOLDER", "first_hour", "write"]
+__all__ = ["FOLDER", "WALKS", "first_hour", "write"]
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"

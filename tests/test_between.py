@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import deque
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,9 @@ from live_rod import CLOCK
 
 import livepde as lp
 from livepde import cases
+from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
+from livepde.cases.member_blocks import MemberBlock
 from livepde.cases.new_case import files_for
 from livepde.errors import CaseError, ConfigurationError, RunError
 from livepde.fleet import Fleet
@@ -25,7 +28,9 @@ from livepde.streams.clock import Clock
 from livepde.streams.csvfile import read_csv
 from livepde.streams.gaps import fill_table, find_spikes
 from livepde.streams.intake import Habit, Intake, Policy
+from livepde.streams.join import join_tables
 from livepde.streams.sentinels import sentinels
+from livepde.streams.sources import Rows
 from livepde.streams.switches import switches
 from livepde.streams.table import Column, JsonLines, tabulated
 from livepde.streams.thinned import Thinned
@@ -396,6 +401,20 @@ def test_a_live_intake_has_the_samples_of_the_table() -> None:
     assert ("interpolated", "mean") in kinds
 
 
+def test_a_log_of_changes_is_joined_with_what_held_before() -> None:
+    sensors = tabulated(10.0 + np.arange(6.0), {"a": np.arange(6.0)}, {"a": COLUMNS["a"]}, CLOCK)
+    log = {"h": np.array([1.0, 0.0, 1.0]), "m": np.array([3.0, 4.0, 5.0])}
+    changes = tabulated(np.array([2.0, 12.5, 20.0]), log, HELD, CLOCK)
+    between = {"hold": "hold", "mean": "next"}
+    found = join_tables([sensors, changes], 1.0, ["a"], ["a"], "here", between)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(found.t, [10.0, 11.0, 12.0, 12.5, 13.0, 14.0, 15.0, 20.0])
+    k = [found.names.index(name) for name in ("a", "hold", "mean")]
+    np.testing.assert_array_equal(found.values[0, k], [0.0, 1.0, 4.0])
+    # The row of the log lacks the sensor that each sample needs, and keeps its inputs.
+    np.testing.assert_array_equal(found.values[3, k], [NAN, 0.0, 4.0])
+    np.testing.assert_array_equal(found.values[-1, k], [NAN, 1.0, 5.0])
+
+
 # --- in cases ----------------------------------------------------------------------------------
 
 
@@ -458,6 +477,58 @@ def test_a_sensor_has_nothing_between_its_readings(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('at = "18 m"', 'at = "18 m", between = "hold"'))
     with pytest.raises(CaseError, match="between requires a boundary or input channel"):
         cases.load(path)
+
+
+def switched(tmp_path: Path, name: str = "case.toml", factor: float = 1.0) -> Path:
+    """Write a case of a column whose inlet is logged at its changes only."""
+    lines = (REPORTS / "column_pulse.csv").read_text().splitlines()
+    rows, last = lines[:1], ""
+    for line in lines[1:]:
+        t, c, inlet = line.split(",")
+        c = str(factor * float(c)) if c else ""
+        rows.append(f"{t},{c},{inlet if inlet != last else ''}")
+        last = inlet
+    data = tmp_path / name.replace(".toml", ".csv")
+    data.write_text("\n".join(rows) + "\n")
+    text = (REPORTS / "column_pulse.toml").read_text().replace("column_pulse.csv", data.name)
+    text = text.replace('"c_in" }', '"c_in", between = "hold" }').replace(
+        "cells = 100", "cells = 30"
+    )
+    (tmp_path / name).write_text(text)
+    return tmp_path / name
+
+
+@pytest.mark.slow
+def test_a_live_run_of_a_log_of_changes_is_the_batch_run(tmp_path: Path) -> None:
+    path = switched(tmp_path)
+    prepared = cases.load(path).prepare()
+    (expected,) = deque(
+        (prepared.identifier.step(one.t, one.z, one.inputs) for one in prepared.stream), maxlen=1
+    )
+    header, *lines = (tmp_path / "case.csv").read_text().splitlines()
+    cells = [zip(header.split(","), line.split(","), strict=True) for line in lines]
+    rows = [{name: float(cell) for name, cell in row if cell} for row in cells]
+    with LiveCase(cases.load(path), Rows(rows), path=tmp_path / "journal.sqlite") as wiring:
+        live = wiring.live()
+        live.run()
+        found = live.identifier.estimate()
+    assert found.t == expected.t
+    np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
+    assert not any(finding.what == "input" for finding in expected.verdict.findings)
+
+
+@pytest.mark.slow
+def test_a_block_of_members_has_the_behaviour_of_the_case(tmp_path: Path) -> None:
+    paths = {name: switched(tmp_path, f"{name}.toml", x) for name, x in (("a", 1.0), ("b", 1.01))}
+    block = MemberBlock({name: cases.load(path).prepare() for name, path in paths.items()})
+    singles = {name: cases.load(path).prepare().identifier for name, path in paths.items()}
+    tables = {name: cases.load(path).prepare().stream for name, path in paths.items()}
+    for one, other in zip(*tables.values(), strict=True):
+        z = {name: [one.z[name], other.z[name]] for name in one.z}
+        found = block.fleet.step(one.t, z)
+        each = [singles["a"].step(one.t, one.z), singles["b"].step(other.t, other.z)]
+        for k, expected in enumerate(each):
+            np.testing.assert_allclose(found.q[k], expected.q, rtol=1e-6)
 
 
 # --- reports of users --------------------------------------------------------------------------
