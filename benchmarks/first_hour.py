@@ -176,7 +176,7 @@ def heater(seed: int) -> tuple[list[str], Array, dict[str, float]]:
 
     The heater has a value at its changes only, between the readings of the thermometers.
     """
-    rng = np.random.default_rng([seed, 7])
+    rng = np.random.default_rng([seed, 8])
     k, h = 0.8 * np.exp(0.3 * rng.standard_normal()), 10.0 * np.exp(0.3 * rng.standard_normal())
     read = np.arange(0.0, 8 * 3600.0 + 1.0, 60.0)
     stretches = rng.uniform(300.0, 2400.0, 200)

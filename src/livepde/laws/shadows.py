@@ -354,8 +354,9 @@ class InputShadow(Shadow):
         # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
         bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
         # Across a moment the slope is a step, or noise: the next interval must not be compared.
-        short = length < SHORT * np.where(np.isfinite(s.length), s.length, 0.0)
+        short = length < SHORT * s.length
         if np.count_nonzero(short):
+            short &= np.isfinite(s.length)  # infinite if no interval is known
             length, bend = np.where(short, np.inf, length), np.where(short[:, None], 0.0, bend)
         return {"slope": slope, "length": length, "bend": bend, "missed": s.missed + bend}
 

@@ -107,11 +107,9 @@ class Interval:
         if self.inputs0 is self.inputs1:
             return Moment(t, self._last.inputs)
         s = self._weight(t)
-        # A channel that is held keeps its value to the last digit.
-        mixed = {
-            k: v if (x := self.inputs0[k]) == v else (1 - s) * x + s * v
-            for k, v in self.inputs1.items()
-        }
+        mixed = {k: (1 - s) * self.inputs0[k] + s * v for k, v in self.inputs1.items()}
+        if self.row is not None:  # a channel that is held keeps its value to the last digit
+            mixed |= {k: v for k, v in self.inputs1.items() if v == self.inputs0[k]}
         return Moment(t, Inputs(mixed))
 
     @cached_property
@@ -311,8 +309,8 @@ class Span:
         if t != self.t1 and self.inputs0 is not last:
             s = (t - self.start) / (self.t1 - self.start)
             mixed = (1 - s) * self.inputs0 + s * last
-            # A channel that is held keeps its value to the last digit.
-            mixed = np.where(self.inputs0 == last, last, mixed)
+            if self.row is not None:  # a channel that is held keeps its value to the last digit
+                mixed = np.where(self.inputs0 == last, last, mixed)
         return Moments(t=t, channels=self.channels, inputs=mixed, interval=self.interval)
 
     @property

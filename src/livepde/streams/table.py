@@ -280,7 +280,11 @@ def to_table(
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
     if held.any():
         before = _known_before(int(use[0]), numbers, columns, holes)
-        values, kept = _with_held(times[use], values, between, chosen, kept, before)
+        if kept.all():
+            opens = np.isnan(values[0])
+            values[0, opens] = before[opens]
+        else:
+            values, kept = _with_held(times[use], values, between, chosen, kept, before)
     t, values, origin = times[use][kept], values[kept], None
     if dates:
         origin = origin_at(float(t[0]) / clock.second)
