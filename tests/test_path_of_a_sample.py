@@ -26,7 +26,7 @@ def documented() -> list[tuple[str, list[str]]]:
             continue
         _, what, where, _ = line.split("|")
         named = what.split(":")[0]
-        files = [name for name in re.findall(r"`([\w/]+\.py)`", where)]
+        files = list(re.findall(r"`([\w/]+\.py)`", where))
         found += [(name, files) for name in re.findall(r"`([\w.]+)`", named)]
     return found
 

@@ -326,21 +326,21 @@ def test_a_refit_apart_goes_on_from_where_one_at_once_would():
     samples = rod_samples()
     apart, at_once = insulated(apart=True), insulated()
     beside, direct = numbers_of(apart, samples), numbers_of(at_once, samples)
-    # The fit of 64 samples is used from sample 72 on, and the 8 since then are taken by sample 75.
-    assert beside[63, 0] == pytest.approx(direct[62, 0], rel=1e-2)
-    assert not np.array_equal(beside[73], direct[73])
-    # From the same fit of 64 samples on, both have taken the same samples: the noise of rounding,
+    assert np.array_equal(beside[:127], direct[:127])
+    # The fit of 128 samples is used from sample 144 on, and the 16 since are taken by sample 151.
+    assert not np.array_equal(beside[128:150], direct[128:150])
+    # From the same fit on, both have taken the same samples: the noise of rounding,
     # and that of fits that end within a tenth of a standard deviation.
-    assert np.abs(beside[76:126, 0] - direct[76:126, 0]).max() < 0.1 * direct[100, 1]
+    assert np.abs(beside[152:, 0] - direct[152:, 0]).max() < 0.1 * direct[100, 1]
     assert apart.refit().belief.q[0] == pytest.approx(
         at_once.refit().belief.q[0], abs=0.05 * direct[-1, 1]
     )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("at", [20, 66, 70, 73])
+@pytest.mark.parametrize("at", [130, 143, 147, 150])
 def test_a_refit_apart_survives_restarts_and_copies(at: int):
-    samples = rod_samples(count=100)
+    samples = rod_samples()
     whole = numbers_of(insulated(apart=True), samples)
     first, second = insulated(apart=True), insulated(apart=True)
     before = numbers_of(first, samples[:at])
@@ -360,10 +360,10 @@ def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatc
         return fit(*given)
 
     monkeypatch.setattr(refit_apart, "refitted_now", slowly)
-    identifier, samples = insulated(apart=True), rod_samples(count=40)
-    numbers_of(identifier, samples[:17])  # that of 16 samples is due with sample 18
+    identifier, samples = insulated(apart=True), rod_samples()
+    numbers_of(identifier, samples[:143])  # that of 128 samples is due with sample 144
     ends.set()
-    numbers_of(identifier, samples[17:])
+    numbers_of(identifier, samples[143:])
 
 
 @pytest.mark.slow
@@ -373,12 +373,12 @@ def test_an_error_in_a_refit_apart_reaches_who_steps(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(refit_apart, "refitted_now", broken)
     with pytest.raises(ValueError, match="of a form"):
-        numbers_of(insulated(apart=True), rod_samples(count=40))
+        numbers_of(insulated(apart=True), rod_samples())
 
 
 def test_readings_withdrawn_while_a_refit_is_under_way_are_not_in_it():
     """A sensor that is set aside meanwhile brings no reading, from its first misfit on."""
-    samples = rod_samples(count=120)
+    samples = rod_samples()
     broken = [
         (t, {**z, "b": z["b"] + (3.0 if k >= 60 else 0.0)}) for k, (t, z) in enumerate(samples)
     ]

@@ -35,7 +35,7 @@ class Refit:
     passes
         A search that takes more passes over the samples has not converged.
     apart
-        True: a fit of more than 8 samples runs in a thread, while samples continue. An eighth more
+        True: a fit of more than 64 samples runs in a thread, while samples continue. An eighth more
         samples later the filter goes over to it; then each call of `step` takes three of the
         samples in between, until all are taken. The numbers do not depend on the time that the fit
         takes: a call waits for it where it is due and not there yet. Members of a fleet are fitted
