@@ -1,4 +1,7 @@
-"""States of several members: dataclasses of arrays whose leading axis is the members."""
+"""States of several members: dataclasses of arrays whose leading axis is the members.
+
+Arrays without members hold what no member has, and stay so.
+"""
 
 from __future__ import annotations
 
@@ -50,7 +53,7 @@ def take(state: State, which: Any) -> State:
     if isinstance(which, int) and _members(state) == 1:
         return state
     index = [which] if isinstance(which, int) else which
-    taken: State = _each(lambda array: array[index], state)
+    taken: State = _each(lambda array: array[index] if len(array) else array, state)
     return taken
 
 
@@ -74,6 +77,8 @@ def put(state: State, which: Any, part: State) -> State:
     index = [which] if isinstance(which, int) else which
 
     def exchanged(array: Array, new: Array) -> Array:
+        if not len(array):
+            return array
         array, new = _widened((array, new))
         result = array.copy()
         result[index] = new
@@ -91,6 +96,8 @@ def where(chosen: Mask, state: State, other: State) -> State:
         return other
 
     def either(one: Array, two: Array) -> Array:
+        if not len(one):
+            return one
         one, two = _widened((one, two))
         return np.where(chosen.reshape(-1, *(1,) * (one.ndim - 1)), one, two)
 

@@ -33,11 +33,13 @@ from livepde.laws.member_arrays import changed, join, put, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
+from livepde.laws.refit_apart import go_on
 from livepde.laws.refit_options import Refit
 from livepde.laws.refits import refit_due, settle
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,
+    Fork,
     Scale,
     SensitivityState,
     SensitivityWork,
@@ -281,6 +283,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             assimilated=zero,
             due=np.array([1 if work.window else NEVER]),
             fit=FitState.none(),
+            fork=Fork.none(x),
             older=x,
             newer=x,
             since_older=zero,
@@ -397,6 +400,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 reports = reports.updated(
                     moved.each(lambda number: np.where(taken, number, np.nan))
                 )
+        if len(new.fork):
+            new = go_on(work, new)
         return shortened(work, new), reports
 
     def _together(
@@ -462,6 +467,11 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         else:
             new = join(*parts) if len(parts) > 1 else parts[0]
         return new, reports.with_members(alone)
+
+    def live(self) -> SensitivityLaw:
+        if self.refit is None or self.refit.apart is not None:
+            return self
+        return replace(self, refit=replace(self.refit, apart=True))
 
     def fit(self, work: SensitivityWork, state: SensitivityState) -> Fit | None:
         return state.fit.member(0)
