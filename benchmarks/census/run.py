@@ -160,8 +160,8 @@ def _judged(scene: Scene, score: Score) -> Score:
     sensors = lp.Points(scene.points, noise=scene.noise * score.stated, direct=direct)
     u0 = None if model.form_initial is not None else scene.u0
     law = lp.SensitivityLaw()
-    held: lp.stepping.Between = "next" if scene.held else "line"
-    between = dict.fromkeys(problem.channels, held)
+    held: dict[str, lp.stepping.Between] = dict.fromkeys(problem.channels, "next")
+    between = held if scene.held else None
     identifier = lp.Identifier(model, sensors, law, scheme=scene.scheme, between=between, u0=u0)
     z = scene.z + scene.noise * scene.errors
     names, half = tuple(problem.channels), int(HALF * scene.length)
