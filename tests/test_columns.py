@@ -65,7 +65,7 @@ def scaled(columns: dict[str, Any], name: str, factor: float, more: float = 0.0)
 
 FAULTS: dict[str, tuple[Any, str, str]] = {
     "input late": (lambda c: {**c, "TC5": late(c["TC5"], 60.0)}, "TC5", "input TC5 is 60 late"),
-    "sensor late": (lambda c: {**c, "TC3": late(c["TC3"], 60.0)}, "TC3", "sensor TC3 is "),
+    "sensor late": (lambda c: {**c, "TC3": late(c["TC3"], 60.0)}, "TC3", "sensor TC3 is 60 late"),
     "input scaled": (lambda c: scaled(c, "TC1", 1.15), "TC1", "the scale of input TC1 is 15"),
     "input off": (lambda c: scaled(c, "TC1", 1.0, 1.5), "TC1", "input TC1 reads 1.5 too much"),
     "input in degF": (lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5", "input TC5 are in degF"),
@@ -104,8 +104,6 @@ def test_the_wrong_column_is_named_first(fault: str):
     first = misfit.causes[0]
     assert first.subject == name
     assert words in first.text
-    if fault == "sensor late":
-        assert float(first.text.split()[3]) == pytest.approx(60.0, abs=3.0)
     assert first.share > 0.9
     assert first.text in verdict.sentences[0]
     assert len({(cause.kind, cause.subject) for cause in misfit.causes}) == len(misfit.causes)

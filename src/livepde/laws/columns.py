@@ -277,17 +277,23 @@ class _Search:
             slopes[kind] = g / step
             gained, theta = base.freed(slopes[kind])
             # Mending by theta changes the residuals by theta g: so the column is off by theta.
-            yield gained, Error(kind, (name,), self._bounded(kind, theta))
+            yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if "offset" in slopes and ("gain" in slopes or constant):
             yield from self._units(base, name, slopes)
 
-    def _bounded(self, kind: str, theta: float) -> float:
+    def _bounded(self, kind: str, name: str, theta: float) -> float:
+        """Return a size that is possible.
+
+        Readings between two samples have less noise than others: a sensor is late by whole samples.
+        """
         columns = self.columns
         if kind == "gain":
             return float(np.clip(theta, -0.9, 9.0))
         if kind == "lag":
             longest = LONGEST * columns.interval * columns.state.log.shape[1]
-            return float(np.clip(theta, -longest, longest))
+            lag = float(np.clip(theta, -longest, longest))
+            step = columns.interval
+            return lag if name in columns.inputs else step * round(lag / step)
         return theta
 
     def _units(
@@ -366,7 +372,7 @@ class _Search:
         if r is None:
             return None
         _, theta = fit.freed((r - fit.one.residuals) / h)
-        return replace(error, size=self._bounded(error.kind, error.size + theta))
+        return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
 
 
 def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:

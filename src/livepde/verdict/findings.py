@@ -300,7 +300,7 @@ class Verdict:
             causes=tuple(ranked),
             shift=misfit.shift if same else {},
         )
-        kept = [better if one is misfit else one for one in self.findings]
+        kept = [better, *(one for one in self.findings if one is not misfit)]
         return Verdict.of(kept, self.untested, self.unseen, judged=self.judged)
 
     @property
