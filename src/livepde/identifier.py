@@ -527,7 +527,7 @@ class Identifier:
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
-        latent, judge = self.law.deferred(self._work, state)
+        latent, judge = self.law.final(self._work, state)
 
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.

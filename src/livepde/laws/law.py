@@ -424,6 +424,10 @@ class Law(ABC, Generic[Work, State]):
         """Return the state after a fit of all stored samples; here the same state."""
         return state
 
+    def final(self, work: Work, state: State) -> Deferred:
+        """Return as `deferred` what is to be read at the end of a run; here the same."""
+        return self.deferred(work, state)
+
     def live(self) -> Law[Work, State]:
         """Return the law for a run that waits for its source; here the same.
 

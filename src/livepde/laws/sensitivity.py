@@ -18,6 +18,7 @@ from livepde.laws.assimilation import (
     assimilate,
     no_readings,
 )
+from livepde.laws.columns import Columns
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import NO_LEDGER, FilterState
@@ -53,7 +54,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import judge_of, judged, with_fit
+from livepde.laws.verdict import judge_of, judged, with_columns, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -512,6 +513,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         alone, fit = without_ledger(now), state.fit.member(0)
         judge = with_fit(judged(work.filter, now, 0), fit)
         return Deferred(lambda: self.member_belief(work, alone, 0), judge)
+
+    def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
+        found, columns = self.deferred(work, state), Columns.of(work, state)
+        if columns is None or not self.verdict:
+            return found
+        return found._replace(verdict=with_columns(found.verdict, columns))
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

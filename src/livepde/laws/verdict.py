@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from livepde.laws.columns import Columns, likely_columns
 from livepde.laws.covariance import reported_factors
 from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
@@ -16,6 +17,7 @@ from livepde.laws.member_arrays import changed, take
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
+    NOT_JUDGED,
     REFUSED,
     WINDOWS,
     Dictionary,
@@ -27,7 +29,7 @@ from livepde.verdict import (
     too_few,
 )
 
-__all__ = ["judge_of", "judged", "with_fit"]
+__all__ = ["judge_of", "judged", "with_columns", "with_fit"]
 
 
 def judge_of(
@@ -111,6 +113,21 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
         remedy = "Look at these readings, state a larger noise, or open the gate."
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
     return (lambda: judge().with_findings(found)) if found else judge
+
+
+def with_columns(judge: Callable[[], Verdict], columns: Columns) -> Callable[[], Verdict]:
+    """Return a verdict that names the columns of the data which explain a misfit.
+
+    They are looked for only where something speaks against the estimates.
+    """
+
+    def found() -> Verdict:
+        verdict = judge()
+        if verdict.level in ("trusted", NOT_JUDGED):
+            return verdict
+        return verdict.with_causes(likely_columns(columns))
+
+    return found
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

@@ -26,6 +26,7 @@ from livepde.verdict.evidence import (
 )
 from livepde.verdict.findings import (
     FEWEST,
+    NAMED,
     Cause,
     Finding,
     Severity,
@@ -50,7 +51,6 @@ EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is
 SEEN = 4.0  # standard errors of an amplitude from which it shows
 BEYOND = 2.0  # standard deviations of a shift beyond an interval
 UNSEEN = 3  # sentences on what is not seen
-NAMED = 4  # causes that are kept
 
 
 @dataclass(frozen=True, eq=False)

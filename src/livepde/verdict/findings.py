@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 __all__ = [
@@ -44,6 +44,8 @@ FEWEST = 20  # samples before which there is nothing to judge by
 FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
 TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
 MOST = 5  # findings that are said unasked
+NAMED = 4  # causes that are kept
+HALF = 0.5  # share of a misfit
 LARGEST = 1e99  # evidence beyond is written as that
 
 
@@ -55,7 +57,8 @@ class Cause:
     ----------
     kind, subject
         Kind of error ("offset", "lag", "position", "gain", "drift", "jump", "boundary", "source",
-        "loss", "flux", "initial"), and the sensor, channel, boundary or unknown that it concerns.
+        "loss", "flux", "initial", "unit", "exchange"), and the sensor, channel, boundary or
+        unknown that it concerns.
     text
         The cause in words, with its size.
     share
@@ -271,6 +274,34 @@ class Verdict:
         later = {(finding.what, finding.subject) for finding in new if finding.subject}
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
         return Verdict.of([*kept, *new], self.untested, self.unseen, judged=self.judged)
+
+    def with_causes(self, causes: Sequence[Cause]) -> Verdict:
+        """Return the verdict with other causes of its misfit, the likeliest first.
+
+        Without a misfit one is added if the first of them explains half of it.
+        """
+        misfit = next((one for one in self.findings if one.what == "misfit"), None)
+        if misfit is None:
+            if not causes or not causes[0].share >= HALF:
+                return self
+            text = "The data fit much better if one column is read otherwise."
+            found = Finding("misfit", "do not trust", text, causes[0].subject, causes=tuple(causes))
+            return self.with_findings([found])
+        said = {(cause.kind, cause.subject) for cause in causes}
+        # An offset or a gain of an input is that of a boundary value, or of a channel.
+        said |= {(kind, cause.subject) for cause in causes for kind in ("boundary", "channel")}
+        others = [one for one in misfit.causes if (one.kind, one.subject) not in said]
+        # Of the same share what was fitted counts more than what a linear model says.
+        ranked = sorted([*causes, *others], key=lambda one: -one.share)[:NAMED]
+        same = ranked[0] is misfit.causes[0] if misfit.causes else False
+        better = replace(
+            misfit,
+            subject=ranked[0].subject,
+            causes=tuple(ranked),
+            shift=misfit.shift if same else {},
+        )
+        kept = [better, *(one for one in self.findings if one is not misfit)]
+        return Verdict.of(kept, self.untested, self.unseen, judged=self.judged)
 
     @property
     def every_sentence(self) -> list[str]:

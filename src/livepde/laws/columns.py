@@ -1,0 +1,429 @@
+"""Whether one column of the data explains a misfit: late, scaled, off, in another unit, exchanged.
+
+An error of a column is tried on the stored samples themselves: the column is mended, and the model
+is fitted again. So inputs and sensors are compared alike, and a lag or a unit is taken as it is.
+An error of one size theta, which changes the residuals by g, first gets the size where the linear
+model of the samples has its minimum. With H = I + J^T J and h = J^T g at the best fit,
+
+    theta = -g r / (g g - h H^-1 h),
+
+and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors are fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from livepde.laws.gate import Gate
+from livepde.laws.member_arrays import changed
+from livepde.laws.outliers import near_most, near_neighbours
+from livepde.laws.refit import WILD, refitted
+from livepde.laws.refit_options import Refit
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.linalg import Array, nonfinite_allowed
+from livepde.verdict import Cause
+
+__all__ = ["Columns", "likely_columns"]
+
+MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
+FEWEST_ROWS = 40
+MOST_WORK = 4e8  # coefficients of states that all passes may compute
+PASSES = 6  # over the samples that a fit may take
+ROUNDS = 4  # fits of an error whose size changes from one to the next
+TRIED = {"unit": 1, "exchange": 2, "offset": 1, "gain": 1, "lag": 1}  # errors that are fitted
+STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
+LONGEST = 0.2  # of the samples, by which a column may be late
+PLAIN = 0.02  # range of a column over its size below which it is constant
+WHOLE = 0.95  # of the misfit
+SETTLED = 0.02  # relative change of a size that is none
+CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelier
+UNITS: tuple[tuple[str, float, float], ...] = (
+    ("are in degF where degC is expected", 1.0 / 1.8, -32.0 / 1.8),
+    ("are in degC where degF is expected", 1.8, 32.0),
+    ("are in K where degC is expected", 1.0, -273.15),
+    ("are in degC where K is expected", 1.0, 273.15),
+    *(
+        (f"are {factor:g} times too {word}, as in another unit", power, 0.0)
+        for factor in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
+        for word, power in (("large", 1.0 / factor), ("small", factor))
+    ),
+)
+"""What the values of a column look like, and factor and constant that mend them."""
+
+
+@dataclass(frozen=True)
+class Error:
+    """An error of a column, or of two.
+
+    Attributes
+    ----------
+    kind
+        "offset", "gain", "lag", "unit" or "exchange".
+    names
+        The columns.
+    size
+        Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
+    unit
+        Number in `UNITS`.
+    """
+
+    kind: str
+    names: tuple[str, ...]
+    size: float = 0.0
+    unit: int = 0
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers of it are free."""
+        return int(self.kind in ("offset", "gain", "lag"))
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """The stored samples of one member as columns that may be wrong.
+
+    Attributes
+    ----------
+    work, state
+        Parts of the law without gate, and the member with the first samples of its window.
+    places
+        Column of the log of each sensor and each input.
+    inputs
+        Names of the inputs.
+    options
+        Those of a fit.
+    """
+
+    work: SensitivityWork
+    state: SensitivityState
+    places: dict[str, int]
+    inputs: tuple[str, ...]
+    options: Refit
+
+    @classmethod
+    def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | None:
+        """Return the columns of one member; None if there are too few samples, or no fit."""
+        if not work.fits or work.refit is None or not state.log.shape[1]:
+            return None
+        problem = work.filter.problem
+        names, channels = problem.observed.names, problem.channels
+        inputs = tuple(name for name in channels if name in problem.model.channels)
+        places = {name: 1 + k for k, name in enumerate(names)}
+        first = 1 + 2 * len(names)
+        places |= {name: first + channels.index(name) for name in inputs}
+        log = state.log[:, int(state.window[0]) :]
+        log = log[:, np.isfinite(log[0, :, 0])]
+        passes = 6 * len(inputs) + 2 * len(inputs) * len(names) + 10 * sum(TRIED.values())
+        each = problem.model.X.dim * (1 + work.filter.reduction.size)
+        rows = min(log.shape[1], MOST_ROWS, int(MOST_WORK / (passes * each)))
+        if rows < FEWEST_ROWS:
+            return None
+        log = log[:, :rows].copy()
+        open_gate = replace(work.options, gate=Gate())
+        zero = np.zeros(1, dtype=np.int64)
+        begun = changed(state, log=log, window=zero)
+        return cls(
+            replace(work, options=open_gate), begun, places, inputs, work.refit
+        )._without_wild
+
+    @property
+    def _without_wild(self) -> Columns:
+        """The same without readings that are far off all others."""
+        samples = StoredSamples.of(self.work, self.state)
+        wild = ~(near_neighbours(samples.readings, WILD) & near_most(samples.readings, WILD))
+        log, first = self.state.log.copy(), self.state.log.shape[1] - len(wild)
+        log[0, first:, 1 : 1 + wild.shape[1]][wild] = np.nan
+        return replace(self, state=changed(self.state, log=log))
+
+    def samples(self, error: Error | None = None) -> StoredSamples:
+        """Return the samples, with the columns of an error mended.
+
+        A fit of those without an error that is small begins at the prior mean.
+        """
+        if error is None:
+            return StoredSamples.of(self.work, self.state)
+        begun = self.state if error.numbers else changed(self.state, now=self.state.start)
+        log = self.state.log.copy()
+        at = [self.places[name] for name in error.names]
+        values, t = log[0][:, at], log[0, :, 0]
+        if error.kind == "exchange":
+            values = values[:, ::-1]
+        elif error.kind == "offset":
+            values = values - error.size
+        elif error.kind == "gain":
+            values = values / (1.0 + error.size)
+        elif error.kind == "unit":
+            _, factor, constant = UNITS[error.unit]
+            values = factor * values + constant
+        else:
+            seen = np.isfinite(values[:, 0])
+            values = np.interp(t + error.size, t[seen], values[seen, 0])[:, None]
+            values[~seen] = np.nan
+        log[0][:, at] = values
+        return StoredSamples.of(self.work, changed(begun, log=log))
+
+    def column(self, name: str) -> Array:
+        """Return the values of a column that are there."""
+        values: Array = self.state.log[0, :, self.places[name]]
+        return values[np.isfinite(values)]
+
+    @property
+    def interval(self) -> float:
+        """The usual time between samples."""
+        return float(np.median(np.diff(self.state.log[0, :, 0])))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The quadratic model of the cost about a trajectory, and its minimum."""
+
+    one: Passed
+    columns: Array
+    inverse: Array
+    step: Array
+    cost: float
+
+    @classmethod
+    def about(cls, one: Passed) -> _Fit:
+        used = np.isfinite(one.residuals)
+        J, r = one.slopes[used], one.residuals[used]
+        inverse = np.linalg.inv(np.eye(len(one.xi)) + J.T @ J)
+        g = J.T @ r - one.xi
+        step = inverse @ g
+        cost = one.cost(used) - 0.5 * float(g @ step)
+        return cls(one, J, np.asarray(inverse), step, cost)
+
+    def freed(self, g: Array) -> tuple[float, float]:
+        """Return by how much the cost falls if residuals may change along g, and the size."""
+        there = np.isfinite(self.one.residuals)
+        along = np.where(np.isfinite(g), g, 0.0)[there]
+        r = self.one.residuals[there] - self.columns @ self.step
+        h = self.columns.T @ along
+        den = float(along @ along - h @ self.inverse @ h)
+        if not den > 1e-9 * float(along @ along):
+            return 0.0, 0.0
+        num = float(along @ r)
+        return 0.5 * num**2 / den, -num / den
+
+
+@nonfinite_allowed()  # such an error explains nothing
+def likely_columns(columns: Columns) -> list[Cause]:
+    """Return the errors of columns that explain most of the misfit, the likeliest first."""
+    samples, search = columns.samples(), _Search(columns)
+    found = refitted(samples, search.options, last=False)
+    if found is None:
+        return []
+    base, prior = _Fit.about(found.best), samples.about(0.0 * found.best.xi)
+    noise = _noise(found.best.residuals)
+    misfit = 2.0 * base.cost - noise
+    if not misfit > 0.0:
+        return []
+    # Where a column is grossly wrong the best fit is no place to ask what is.
+    places = [base] if prior is None else [base, _Fit.about(prior)]
+    promising = [item for at in places for item in search.promising(at, base.cost)]
+    tried = sorted(promising, key=lambda item: -item[0])
+    kept: list[tuple[float, Error]] = []
+    for error in _varied(tried):
+        if any(share >= WHOLE and other.numbers <= error.numbers for share, other in kept):
+            continue  # nothing is left to explain
+        end = search.fitted(error)
+        if end is not None:
+            share = 1.0 - (2.0 * end[0] - noise) / misfit
+            kept.append((share, end[1]))
+    # Within a small part of the misfit the error with fewer numbers is likelier.
+    kept.sort(key=lambda item: -(item[0] - CLOSE * item[1].numbers))
+    return [_cause(columns, error, share) for share, error in kept if share > 0.0]
+
+
+class _Search:
+    """The errors of some columns, and what they explain."""
+
+    def __init__(self, columns: Columns) -> None:
+        self.columns = columns
+        self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
+        self.base_readings = columns.samples().readings
+
+    def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
+        """Iterate over errors, and by how much they lower a cost, as the model about a fit has it.
+
+        An error that is the same wherever it is asked for is asked for everywhere.
+        """
+        for name in self.columns.places:
+            yield from (
+                (cost - at.cost + gained, error) for gained, error in self._of_one(at, name)
+            )
+        yield from ((cost - at.cost + gained, error) for gained, error in self._exchanged(at))
+
+    def _of_one(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
+        """Iterate over errors of one column."""
+        columns, values = self.columns, self.columns.column(name)
+        if len(values) < FEWEST_ROWS // 2:
+            return
+        span, size = float(np.ptp(values)), float(np.abs(values).max())
+        constant = span <= PLAIN * size
+        each = [("offset", STEP * (span if span > 0.0 else max(size, 1.0)))]
+        if not constant:
+            each += [("gain", STEP), ("lag", columns.interval)]
+        slopes: dict[str, Array] = {}
+        for kind, step in each:
+            g = self._change(base, Error(kind, (name,), step))
+            if g is None:
+                continue
+            slopes[kind] = g / step
+            gained, theta = base.freed(slopes[kind])
+            # Mending by theta changes the residuals by theta g: so the column is off by theta.
+            yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
+        if "offset" in slopes and ("gain" in slopes or constant):
+            yield from self._units(base, name, slopes)
+
+    def _bounded(self, kind: str, name: str, theta: float) -> float:
+        """Return a size that is possible.
+
+        Readings between two samples have less noise than others: a sensor is late by whole samples.
+        """
+        columns = self.columns
+        if kind == "gain":
+            return float(np.clip(theta, -0.9, 9.0))
+        if kind == "lag":
+            longest = LONGEST * columns.interval * columns.state.log.shape[1]
+            lag = float(np.clip(theta, -longest, longest))
+            step = columns.interval
+            return lag if name in columns.inputs else step * round(lag / step)
+        return theta
+
+    def _units(
+        self, base: _Fit, name: str, slopes: dict[str, Array]
+    ) -> Iterator[tuple[float, Error]]:
+        """Iterate over units that a column may be in, by the linear model of offset and gain."""
+        values = self.columns.column(name)
+        middle = float(values.mean())
+        there = np.isfinite(base.one.residuals)
+        for number, (_, factor, constant) in enumerate(UNITS):
+            # values - offset, then divided by 1 + gain: to first order in the change of the column.
+            change = (factor * middle + constant) - middle
+            g = -change * slopes["offset"]
+            if "gain" in slopes:
+                # slopes["gain"] is the change by -values; about the middle it is that of the rest.
+                about_middle = slopes["gain"] - middle * slopes["offset"]
+                g = g - (factor - 1.0) * about_middle
+            r = (base.one.residuals + np.where(np.isfinite(g), g, 0.0))[there]
+            J, xi = base.columns, base.one.xi
+            slope = J.T @ r - xi
+            cost = 0.5 * float(r @ r + xi @ xi - slope @ base.inverse @ slope)
+            yield base.cost - cost, Error("unit", (name,), unit=number)
+
+    def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
+        """Iterate over pairs of columns that may be exchanged."""
+        columns = self.columns
+        for pair in combinations(columns.places, 2):
+            first, second = (columns.column(name) for name in pair)
+            if not len(first) or not len(second):
+                continue
+            # Columns of another kind have nothing in common.
+            if first.min() > second.max() or second.min() > first.max():
+                continue
+            error = Error("exchange", pair)
+            change = self._change(base, error) if self._only_sensors(error) else None
+            if change is not None:  # the trajectory is the same
+                one: Passed | None = replace(base.one, residuals=base.one.residuals + change)
+            else:
+                one = columns.samples(error).about(base.one.xi)
+            if one is not None:
+                yield base.cost - _Fit.about(one).cost, error
+
+    def _change(self, base: _Fit, error: Error) -> Array | None:
+        """Return by how much an error of a column, mended, changes the residuals."""
+        if self._only_sensors(error):  # it is that of the readings
+            return self.columns.samples(error).readings - self.base_readings
+        r = self.columns.samples(error).residuals(base.one.xi)
+        return None if r is None else r - base.one.residuals
+
+    def _only_sensors(self, error: Error) -> bool:
+        return not set(error.names) & set(self.columns.inputs)
+
+    def fitted(self, error: Error) -> tuple[float, Error] | None:
+        """Return the cost of a fit with a column mended, and the error, its size improved."""
+        for _ in range(ROUNDS):
+            found = refitted(self.columns.samples(error), self.options, last=False)
+            if found is None:
+                return None
+            fit = _Fit.about(found.best)
+            cost, used = fit.cost, error
+            if not error.numbers:
+                break
+            again = self._improved(fit, error)
+            if again is None or abs(again.size - error.size) <= SETTLED * abs(again.size):
+                break
+            error = again
+        return cost, used
+
+    def _improved(self, fit: _Fit, error: Error) -> Error | None:
+        """Return an error with the size where the linear model about it has its minimum."""
+        columns, values = self.columns, self.columns.column(error.names[0])
+        step = {"offset": STEP * max(float(np.ptp(values)), 1e-12), "gain": STEP}
+        h = step.get(error.kind, columns.interval)
+        more = replace(error, size=error.size + h)
+        r = columns.samples(more).residuals(fit.one.xi)
+        if r is None:
+            return None
+        _, theta = fit.freed((r - fit.one.residuals) / h)
+        return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
+
+
+def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:
+    """Return the most promising errors of each kind, those without free numbers first."""
+    kept: list[Error] = []
+    for gained, error in tried:
+        same = [other for other in kept if other.kind == error.kind]
+        new = all((one.names, one.unit) != (error.names, error.unit) for one in same)
+        if gained > 0.0 and new and len(same) < TRIED[error.kind]:
+            kept.append(error)
+    return sorted(kept, key=lambda error: error.numbers)
+
+
+def _noise(residuals: Array) -> float:
+    """Return the sum of squares of the noise, as successive differences show it."""
+    total = 0.0
+    for column in residuals.T:
+        r = column[np.isfinite(column)]
+        if len(r) > 1:
+            total += len(r) * 0.5 * float((np.diff(r) ** 2).mean())
+    return total
+
+
+def _cause(columns: Columns, error: Error, share: float) -> Cause:
+    """Return an error as a cause."""
+    first, size = error.names[0], error.size
+    problem = columns.work.filter.problem
+    what = "input" if first in columns.inputs else "sensor"
+    time = f" {problem.model.time_unit}" if problem.model.time_unit else ""
+    words: dict[str, Callable[[], tuple[str, str]]] = {
+        "offset": lambda: (
+            f"{what} {first} reads {abs(size):.2g} too {'much' if size > 0 else 'little'}",
+            f"Check the offset and the place of {first}.",
+        ),
+        "gain": lambda: (
+            f"the scale of {what} {first} is {abs(100.0 * size):.2g} % too "
+            f"{'large' if size > 0 else 'small'}",
+            f"Check the scale and the unit of {first}.",
+        ),
+        "lag": lambda: (
+            f"{what} {first} is {abs(size):.2g}{time} {'late' if size > 0 else 'early'}",
+            f"Check the clock, the averaging and the response time of {first}.",
+        ),
+        "unit": lambda: (
+            f"the values of {what} {first} {UNITS[error.unit][0]}",
+            f"State the unit of {first}: channels.{first}.unit.",
+        ),
+        "exchange": lambda: (
+            f"the columns of {first} and {error.names[-1]} are exchanged",
+            f"Exchange the columns of {first} and {error.names[-1]}.",
+        ),
+    }
+    text, remedy = words[error.kind]()
+    return Cause(error.kind, first, text, float(min(share, 1.0)), remedy)

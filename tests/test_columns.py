@@ -1,0 +1,161 @@
+"""One wrong column of the data, late, scaled, off, in another unit or exchanged, is named first."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+import livepde as lp
+from livepde.verdict import Cause, Finding, Verdict
+
+LENGTH, CELLS, FINE = 0.1, 120, 10
+STEP, COUNT, NOISE = 20.0, 300, 0.1
+PLACES = {"TC2": 0.02, "TC3": 0.05, "TC4": 0.08}
+
+
+@cache
+def bar(seed: int) -> tuple[float, dict[str, Any]]:
+    """Return the diffusivity of a bar, and its five columns: finite volumes, Crank-Nicolson."""
+    rng = np.random.default_rng(seed)
+    alpha = 1e-6 * np.exp(0.4 * rng.standard_normal())
+    periods, sizes = rng.uniform(900.0, 2500.0, 2), rng.uniform(5.0, 15.0, 2)
+    phases = rng.uniform(0.0, 6.0, 2)
+
+    def end(k: int, t: Any) -> Any:
+        wave = np.sin(2 * np.pi * t / periods[k] + phases[k]) - np.sin(phases[k])
+        return 20.0 + sizes[k] * wave + (10.0 * (1.0 - np.exp(-t / 1500.0)) if k == 0 else 0.0)
+
+    width = LENGTH / CELLS
+    x = width * (np.arange(CELLS) + 0.5)
+    diagonal = np.full(CELLS, -2.0)
+    diagonal[[0, -1]] = -3.0  # half a cell to the ends
+    ones = np.ones(CELLS - 1)
+    A = alpha / width**2 * sp.diags_array([ones, diagonal, ones], offsets=[-1, 0, 1])
+    h, one = STEP / FINE, sp.eye_array(CELLS)
+    solver, right = splu(sp.csc_array(one - 0.5 * h * A)), one + 0.5 * h * A
+    u, shown, times = np.full(CELLS, 20.0), [], STEP * np.arange(COUNT)
+    for t in h * np.arange(FINE * (COUNT - 1) + 1):
+        if len(shown) * STEP <= t + 1e-9:
+            shown.append(np.interp(list(PLACES.values()), x, u))
+        b = np.zeros(CELLS)
+        b[0], b[-1] = (2 * alpha / width**2 * end(k, t + 0.5 * h) for k in range(2))
+        u = solver.solve(right @ u + h * b)
+    noisy = np.array(shown) + NOISE * rng.standard_normal((COUNT, 3))
+    columns = dict(zip(PLACES, noisy.T, strict=True))
+    return float(alpha), columns | {"TC1": end(0, times), "TC5": end(1, times), "t": times}
+
+
+def late(values: Any, by: float) -> Any:
+    times = STEP * np.arange(COUNT)
+    return np.interp(times - by, times, values)
+
+
+def exchanged(columns: dict[str, Any], first: str, second: str) -> dict[str, Any]:
+    return {**columns, first: columns[second], second: columns[first]}
+
+
+def scaled(columns: dict[str, Any], name: str, factor: float, more: float = 0.0) -> dict[str, Any]:
+    return {**columns, name: factor * columns[name] + more}
+
+
+FAULTS: dict[str, tuple[Any, str, str]] = {
+    "input late": (lambda c: {**c, "TC5": late(c["TC5"], 60.0)}, "TC5", "input TC5 is 60 late"),
+    "sensor late": (lambda c: {**c, "TC3": late(c["TC3"], 60.0)}, "TC3", "sensor TC3 is 60 late"),
+    "input scaled": (lambda c: scaled(c, "TC1", 1.15), "TC1", "the scale of input TC1 is 15"),
+    "input off": (lambda c: scaled(c, "TC1", 1.0, 1.5), "TC1", "input TC1 reads 1.5 too much"),
+    "input in degF": (lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5", "input TC5 are in degF"),
+    "sensor in degF": (lambda c: scaled(c, "TC3", 1.8, 32.0), "TC3", "sensor TC3 are in degF"),
+    "sensors exchanged": (lambda c: exchanged(c, "TC2", "TC3"), "TC2", "TC2 and TC3 are exchanged"),
+    "input and sensor exchanged": (lambda c: exchanged(c, "TC1", "TC2"), "TC2", "are exchanged"),
+}
+
+
+def run(columns: dict[str, Any], **options: Any) -> lp.Result:
+    mesh = lp.interval(0.0, LENGTH, 40)
+    ends = {"left": lp.Channel("TC1"), "right": lp.Channel("TC5")}
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh), dirichlet=ends),
+        lp.LogNormal(1e-6, std=6e-7),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+    )
+    sensors = lp.Points(PLACES, noise=NOISE)
+    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(**options), u0=20.0)
+    names = ("TC1", "TC5")
+    samples = [
+        (float(t), {name: columns[name][k] for name in PLACES}, {n: columns[n][k] for n in names})
+        for k, t in enumerate(columns["t"])
+    ]
+    return identifier.run(samples)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+def test_the_wrong_column_is_named_first(fault: str):
+    change, name, words = FAULTS[fault]
+    _, columns = bar(1)
+    verdict = run(change(columns)).last.verdict
+    (misfit,) = (finding for finding in verdict.findings if finding.what == "misfit")
+    assert verdict.level != "trusted"
+    first = misfit.causes[0]
+    assert first.subject == name
+    assert words in first.text
+    assert first.share > 0.9
+    assert first.text in verdict.sentences[0]
+    assert len({(cause.kind, cause.subject) for cause in misfit.causes}) == len(misfit.causes)
+
+
+def test_columns_that_are_right_are_not_looked_at(monkeypatch: pytest.MonkeyPatch):
+    def refused(*_: Any) -> None:
+        raise AssertionError("nothing speaks against this run")
+
+    monkeypatch.setattr("livepde.laws.verdict.likely_columns", refused)
+    alpha, columns = bar(5)
+    estimate = run(columns).last
+    assert estimate.verdict.level == "trusted"
+    assert abs(estimate.belief.q[0] - alpha) < 3.0 * estimate.belief.q_std[0]
+
+
+@pytest.mark.slow
+def test_a_fault_that_is_in_no_column_is_not_put_on_one():
+    """A loss over the whole bar: no column explains more than what the model lacks."""
+    _, columns = bar(7)
+    times = columns["t"]
+    lost = {name: columns[name] - 3.0 * (1.0 - np.exp(-times / 2000.0)) for name in PLACES}
+    verdict = run({**columns, **lost}).last.verdict
+    assert verdict.level == "do not trust"
+    columns_named = [
+        c for f in verdict.findings for c in f.causes if c.kind in ("unit", "exchange")
+    ]
+    assert not any(cause.share > 0.9 for cause in columns_named)
+
+
+@pytest.mark.parametrize("options", [{"refit": None}, {"drift": 1e-6}, {"verdict": False}])
+def test_laws_without_a_fit_have_the_causes_that_they_had(options: dict[str, Any]):
+    _, columns = bar(5)
+    wrong = {**columns, "TC5": late(columns["TC5"], 60.0)}
+    verdict = run(wrong, **options).last.verdict
+    assert all(
+        cause.kind not in ("unit", "exchange") for f in verdict.findings for cause in f.causes
+    )
+
+
+def test_causes_are_merged_by_what_they_explain():
+    first = Cause("offset", "a", "a reads 1 too much", 0.4)
+    second = Cause("boundary", "b", "boundary value b is high by 2", 0.8)
+    verdict = Verdict.of(
+        [Finding("misfit", "do not trust", "It misfits.", "a", causes=(second, first))]
+    )
+    better = Cause("offset", "b", "input b reads 2 too much", 0.9)
+    (misfit,) = verdict.with_causes([better]).findings
+    assert misfit.causes == (better, first)
+    assert misfit.subject == "b"
+    # Without a misfit that is known, only a cause of at least half of it is one.
+    plain = Verdict.of([])
+    assert plain.with_causes([Cause("lag", "c", "c is 3 late", 0.4)]) is plain
+    (found,) = plain.with_causes([better]).findings
+    assert found.severity == "do not trust"
