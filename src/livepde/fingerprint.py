@@ -32,7 +32,7 @@ NAMES = {
     "law": "option of the law",
     "steps": "scheme, dt_max, halvings, hold or input_noise",
     "unknowns": "prior, evolution or bounds of an unknown",
-    "start": "u0, u0_errors or q0",
+    "start": "u0 or q0",
     "model": "model: its equation, mesh, source or boundary values",
     "sensors": "sensor: its place, function or noise",
 }
