@@ -209,7 +209,8 @@ def test_each_share_of_a_shift_is_named_with_its_own_remedy():
     (found,) = discretised(shifts)
     step, mesh = "the time step by 4.0 (k by -0.2)", "the mesh by 2.5 (k by +0.1)"
     assert f"by 3.0 standard deviations: {step}, {mesh}. " in found.text
-    assert "steps.dt_max" in found.remedy and "mesh.cells" in found.remedy
+    assert "steps.dt_max" in found.remedy
+    assert "mesh.cells" in found.remedy
     assert "channels" not in found.sentence
     small = Shifts(2.2, {"step": 0.9, "mesh": 0.8, "input": 0.5})
     (found,) = discretised(small)

@@ -85,9 +85,9 @@ def initial_rows(
     """Return the uncertainty of u0: rows of U and of C.
 
     The errors of u0 itself (`Problem.initial_errors`) are rows of their own. For a u0 made of
-    readings, with u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise of each
-    reading is a row of its own, and the effect of the unknowns on the sensors, an offset say,
-    stands in the rows of those unknowns. So the readings tell nothing more of them.
+    readings, with u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise
+    of each reading is a row of its own, and the effect of the unknowns on the sensors, an offset
+    say, stands in the rows of those unknowns. So the readings tell nothing more of them.
 
     Parameters
     ----------
