@@ -1,6 +1,6 @@
 """The walks of docs/first-hour.md with data of other truths: how often their intervals hold.
 
-Truths come from codes of their own: finite volumes with exponentials in time for the wall and the
+Truths come from codes of their own: finite volumes with exponentials in time for the walls and the
 ground, finite differences with small steps for the plate. Nothing is shared with livepde but the
 priors that they are drawn from. `write` makes the tables of examples/first_hour.
 """
