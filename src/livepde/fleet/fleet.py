@@ -101,6 +101,7 @@ class Fleet:
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         made_of = [one or {} for one in self._each("u0_from", u0_from)]
         off = [tuple(one) for one in self._each("u0_errors", u0_errors)]
+        most: tuple[Any, ...] = max(off, key=len)
         self._one = Identifier(
             model,
             observation,
@@ -115,7 +116,7 @@ class Fleet:
             assimilate_from=assimilate_from,
             input_noise=input_noise,
             u0_from=max(made_of, key=len),
-            u0_errors=max(off, key=lambda one: len(one)),
+            u0_errors=most,
         )
         self.model = model = self._one.model
         self.law = law
