@@ -74,12 +74,18 @@ def errors(seed: int = 1) -> Any:
 
 
 def run(
-    z: Any, *, stated: float = 1.0, law: Any = None, places: Any = None, withheld: Any = None
+    z: Any,
+    *,
+    stated: float = 1.0,
+    law: Any = None,
+    places: Any = None,
+    withheld: Any = None,
+    u0: float = 0.0,
 ) -> tuple[lp.Identifier, lp.Estimate]:
     """Return identifier and last estimate of a run with some readings."""
     sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
     law = law or lp.SensitivityLaw()
-    identifier = lp.Identifier(rod(), sensors, law, u0=0.0, withheld=withheld)
+    identifier = lp.Identifier(rod(), sensors, law, u0=u0, withheld=withheld)
     estimate: Any = None
     for k, t in enumerate(TIMES.tolist()):
         readings = z[k] if not isinstance(z, dict) else {name: z[name][k] for name in z}

@@ -172,26 +172,26 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
     grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
-    what: str = "misfit"
-    severity: Severity = "caution" if understood and not grave else "do not trust"
-    text = (
-        "The model does not explain the data: what is left of the readings is not noise (one such "
-        f"run in {_many(evidence.whitened)} would look so by chance)."
-    )
+    chance_of = f"(one such run in {_many(evidence.whitened)} would look so by chance)"
+    evident = math.exp(min(evidence.whitened, 700.0))
     # The state forgets where it began: later readings determine the unknowns without it.
     if causes[0].kind == "initial" and not grave and (recent or understood):
-        what, severity = "start", "note"
         text = (
-            "The readings do not fit the initial state (one such run in "
-            f"{_many(evidence.whitened)} would look so by chance), which moves no unknown by a "
+            f"The readings do not fit the initial state {chance_of}, which moves no unknown by a "
             "standard deviation."
         )
+        yield Finding("start", "note", text, "", evident, "e-value", causes, shift=shift)
+        return
+    text = (
+        "The model does not explain the data: what is left of the readings is not noise "
+        f"{chance_of}."
+    )
     yield Finding(
-        what,
-        severity,
+        "misfit",
+        "do not trust" if grave or not understood else "caution",
         text,
         subject=causes[0].subject,
-        evidence=math.exp(min(evidence.whitened, 700.0)),
+        evidence=evident,
         measure="e-value",
         causes=causes,
         shift=shift,
