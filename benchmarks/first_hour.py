@@ -35,7 +35,7 @@ __all__ = ["FOLDER", "WALKS", "first_hour", "write"]
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"
-WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater")
+WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater", "wall")
 WRITTEN = 0  # seed of the tables in the examples
 SHARE = 0.9  # of the vertices of a field whose interval has to hold
 HELD = 0.9  # of the seeds: 18 of 20
@@ -44,6 +44,11 @@ HELD = 0.9  # of the seeds: 18 of 20
 THICK, CAPACITY = 0.1, 3.7e6
 DEPTHS = (0.005, 0.02, 0.04, 0.07)
 KELVIN = 0.3  # noise of its thermocouples
+
+# The outer wall of a house.
+WALL = 0.24
+WALL_KELVIN, WALL_FLUX = 0.1, 0.3  # noise of its surface thermometers and its heat-flux plate
+BEFORE = 3 * 86400.0  # the wall was heated and cooled before its table begins
 
 # The plate: an L of squares, sides of 1 m.
 SIDE = 60  # cells of the truth along 1 m
@@ -91,6 +96,44 @@ def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
     header = ["time_s", *(f"T_{n}" for n in range(1, len(DEPTHS) + 1)), "T_cold"]
     table = np.column_stack([times, shown, np.interp(times, fine, cold)])
     return header, table, {"k": float(k), "J": float(flux[-1])}
+
+
+def wall(seed: int, days: float = 3.0) -> tuple[list[str], Array, dict[str, float]]:
+    """Return the table of a wall that begins in a curved profile, and its truths."""
+    rng = np.random.default_rng([seed, 5])
+    k, capacity = (
+        0.8 * np.exp(0.5 * rng.standard_normal()),
+        1.5e6 * np.exp(rng.standard_normal() / 3.0),
+    )
+    times = np.arange(-BEFORE, 86400.0 * days + 1.0, 600.0)
+    fine = fine_times(times)
+    phases = 2.0 * np.pi * rng.uniform(size=5)
+    outside = 4.0 + 4.0 * np.sin(2 * np.pi * fine / 86400.0 + phases[0])
+    outside += np.sin(2 * np.pi * fine / 40000.0 + phases[1])
+    # A cold front, two hours before the table begins: the wall is curved then.
+    outside -= 3.0 * (1.0 + np.tanh((fine + 7200.0) / 1800.0))
+    # Of 16 K across the wall, and a heating that is switched by day and night.
+    flux = 16.0 * k / WALL * (1.0 + 0.25 * np.tanh(3.0 * np.sin(2 * np.pi * fine / 86400.0)))
+    for phase, period in zip(phases[2:], (20000.0, 33000.0, 60000.0), strict=True):
+        flux += 2.0 * np.sin(2 * np.pi * fine / period + phase)
+    cells = 200
+    width = WALL / cells
+    between = np.full(cells, k / width)
+    loss, B = np.zeros(cells), np.zeros((cells, 2))
+    loss[-1], B[0, 0], B[-1, 1] = 2.0 * between[-1], 1.0, 2.0 * between[-1]
+    # The inner face is half a volume away from the first middle.
+    C, D = np.eye(1, cells), np.array([[0.5 * width / k, 0.0]])
+    system = diffusion(between[:-1], np.full(cells, capacity * width), loss, B, C, D)
+    inside = system.respond(np.column_stack([flux, outside]), 600.0)[:, 0]
+    begins = times >= 0.0
+    t = times[begins]
+    shown = [inside[begins], np.interp(t, fine, outside), np.interp(t, fine, flux)]
+    noise = WALL_KELVIN, WALL_KELVIN, WALL_FLUX
+    columns = [
+        values + std * rng.standard_normal(len(t)) for values, std in zip(shown, noise, strict=True)
+    ]
+    header = ["time_s", "T_inside", "T_outside", "q_inside"]
+    return header, np.column_stack([t, *columns]), {"k": float(k), "C": float(capacity)}
 
 
 def borehole(seed: int) -> tuple[list[str], Array, dict[str, float]]:
@@ -288,6 +331,7 @@ TABLES = {
     "pumping": pumping,
     "column": column,
     "heater": heater,
+    "wall": wall,
 }
 
 

@@ -329,3 +329,89 @@ def test_a_constant_input_that_nothing_reads_is_refused(tmp_path: Path) -> None:
     text = "inputs.ambient: the equation does not read it with these unknowns"
     with pytest.raises(CaseError, match=text):
         load(changed(tmp_path, ("[boundary]", 'inputs.ambient = "12 degC"\n[boundary]')))
+
+
+# --- an unknown heat capacity --------------------------------------------------------------------
+
+
+def divided(**options: Any) -> lp.Model:
+    return conduction(
+        lp.interval(0.0, LENGTH, 40),
+        lp.Normal(K, 1.0),
+        {"right": 0.0},
+        C=lp.Normal(C, 1.0),
+        **options,
+    )
+
+
+@pytest.mark.parametrize(
+    "conditions",
+    [
+        {"boundary": {"left": Flux(6.0)}},
+        {"boundary": {"left": Flux(lp.Channel("J"))}},
+        {"boundary": {"left": [Flux("J"), Exchange(3.0, 50.0)]}},
+        {"sources": {"heater": Source(6.0, lambda x: x[0] < 0.3)}},
+    ],
+)
+@pytest.mark.parametrize(
+    "own", [{}, {"source": lp.Normal(2.0, 1.0)}, {"loss": lp.Normal(2.0, 1.0)}]
+)
+def test_an_unknown_heat_capacity_is_as_the_known_one_of_its_value(conditions, own) -> None:
+    """The divided equation and that with C in the mass matrix are one at the same value of C."""
+    unknowns = {"J": lp.Normal(6.0, 1.0)} if "[Flux" in str(conditions) else {}
+    inputs = {name: 6.0 for name in ("J",) if "Channel" in str(conditions)}
+    inputs |= {"ambient": 5.0} if "loss" in own else {}
+    known = conduction(lp.interval(0.0, LENGTH, 40), lp.Normal(K, 1.0), {"right": 0.0}, C=C, **own)
+    models = (
+        with_conditions(known, **conditions, unknowns=unknowns),
+        with_conditions(divided(**own), **conditions, unknowns=unknowns, per="C"),
+    )
+    states = []
+    for model in models:
+        q, drive = model.initial_parameter(), (lambda t: inputs) if inputs else None
+        *_, (_, u) = simulate(model, q, 0.0, [0.0, 0.2, 0.4], Advance(Alexander2(), 0.02), drive)
+        states.append(model.state_block.at_vertices @ u)
+    assert np.abs(states[0]).max() > 0.1
+    assert states[1] == pytest.approx(states[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("C", [lp.Scalars(["a", "b"], lp.Normal(1.0, 0.1))])
+def test_an_unknown_heat_capacity_is_one_number(C: Any) -> None:
+    with pytest.raises(ModelError, match="an unknown C must be one number"):
+        conduction(lp.interval(0.0, 1.0, 8), lp.Normal(K, 1.0), C=C)
+
+
+WALL = """
+equation = "conduction"
+initial = 20
+mesh = { from = 0, to = 1, cells = 8 }
+data = { file = "wall.csv", time = "t", time_unit = "s" }
+CONDITION
+[unknowns]
+k = { prior = 2, std = 1 }
+C = { prior = 4, std = 1 }
+[channels]
+T = { role = "sensor", column = "T", at = 0, noise = 0.1 }
+right = { role = "boundary", column = "T", at = "right" }
+q = { role = "input", column = "q" }
+"""
+
+
+@pytest.mark.parametrize(
+    ("condition", "text"),
+    [
+        ("", "unknowns.C: temperatures alone do not determine 'C'"),
+        ("boundary.left = { flux = 0 }", "needs a known flux, exchange or source"),
+        ('boundary.left = { flux = "q" }\noptions.C = 3', "options.C: unknowns.C is stated, too"),
+    ],
+)
+def test_what_is_missing_for_an_unknown_heat_capacity_is_said(tmp_path, condition, text) -> None:
+    (tmp_path / "case.toml").write_text(WALL.replace("CONDITION", condition))
+    with pytest.raises(CaseError, match=text):
+        load(tmp_path / "case.toml")
+
+
+def test_a_measured_flux_determines_it(tmp_path) -> None:
+    path = tmp_path / "case.toml"
+    path.write_text(WALL.replace("CONDITION", 'boundary.left = { flux = "q" }'))
+    assert list(load(path).model.parameter_space.labels) == ["k", "C"]

@@ -239,6 +239,7 @@ def missing(loss: float) -> list[str]:
 RUNS = {
     "assess: misfit": Pair(partial(rod, "offset"), rod),
     "assess: following": Pair(partial(rod, "slow noise"), rod),
+    "assess: start": Pair(partial(rod, u0=0.06), rod),
     "assess: past": Pair(partial(mended, fault=True), partial(mended, fault=False)),
     "assess: constancy": Pair(partial(rod, "drifting unknown"), rod),
     "assess: disagreement": Pair(partial(rod, "another k at one sensor"), rod),

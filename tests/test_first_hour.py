@@ -18,7 +18,9 @@ from benchmarks.first_hour import FOLDER, WALKS, WELLS, WRITTEN, aquifer, first_
 PAGE = (ROOT / "docs" / "first-hour.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("name", ["furnace.toml", "borehole.toml", "pumping.toml", "plate.py"])
+@pytest.mark.parametrize(
+    "name", ["furnace.toml", "borehole.toml", "pumping.toml", "wall.toml", "plate.py"]
+)
 def test_the_page_shows_the_files(name: str) -> None:
     shown = (FOLDER / name).read_text(encoding="utf-8")
     assert shown in PAGE
@@ -34,7 +36,7 @@ def test_the_tables_are_those_of_another_code(walk: str, tmp_path) -> None:
         assert file.read_text() == (FOLDER / file.name).read_text()
 
 
-@pytest.mark.parametrize("walk", ["furnace", "borehole", "pumping"])
+@pytest.mark.parametrize("walk", ["furnace", "borehole", "pumping", "wall"])
 def test_the_page_tells_the_truths(walk: str, tmp_path) -> None:
     for name, truth in write(tmp_path, walk, WRITTEN).items():
         told = re.findall(rf"\b{name} = ([\d.]+)", PAGE)
@@ -56,13 +58,14 @@ def test_a_tracer_pulse_is_found() -> None:
 
 
 def test_each_case_is_one_file_without_a_law() -> None:
-    for name in ("furnace.toml", "borehole.toml", "pumping.toml"):
+    for name in ("furnace.toml", "borehole.toml", "pumping.toml", "wall.toml"):
         case = tomllib.loads((FOLDER / name).read_text(encoding="utf-8"))
         assert not {"law", "steps", "intake"} & set(case)
 
 
 @pytest.mark.study
 def test_intervals_of_the_walks_hold_the_truth() -> None:
-    for walk, seeds in (("furnace", 1), ("borehole", 10), ("pumping", 4), ("column", 20)):
+    walks = (("furnace", 1), ("borehole", 10), ("pumping", 4), ("column", 20), ("wall", 4))
+    for walk, seeds in walks:
         outcome = first_hour((walk,), seeds=seeds)
         assert outcome.ok, outcome.checks

@@ -63,13 +63,14 @@ class Server:
             self.nodes[name] = await self.server.nodes.objects.add_variable(node, name, 0.0)
         await self.server.start()
 
-    def write(self, name: str, value, *, moment=None, status=0) -> None:
+    def write(self, name: str, value, *, moment=None, status=0, dated=True) -> None:
         from asyncua import ua
 
         found = ua.DataValue(
             ua.Variant(value),
             StatusCode=ua.StatusCode(status),
-            SourceTimestamp=moment or datetime.now(UTC),
+            SourceTimestamp=(moment or datetime.now(UTC)) if dated else None,
+            ServerTimestamp=None if dated else datetime.now(UTC),
         )
         self._do(self.nodes[name].write_value(found))
 
@@ -139,6 +140,22 @@ def test_changes_are_rows_with_the_time_of_their_source(server):
     (row,) = [r for r in listen(heard, lambda r: r.values.get("a") == 1.5) if r.values.get("a")]
     heard.close()
     assert row.values == {"t": "2026-01-02T03:04:05+00:00", "a": 1.5}
+
+
+def test_values_without_a_source_time_are_counted_and_told_once(server, caplog):
+    heard = source(server)
+    listen(heard, lambda row: "left" in row.values)
+    assert heard.undated == 0
+    with caplog.at_level(logging.WARNING, "livepde.opcua"):
+        for value in (3.5, 4.5):
+            server.write("a", value, dated=False)
+            rows = listen(heard, lambda row, value=value: row.values.get("a") == value)
+    heard.close()
+    assert heard.undated == 2
+    assert rows[-1].values["t"]
+    told = [record.message for record in caplog.records if "source time" in record.message]
+    assert len(told) == 1
+    assert "'a' has no source time" in told[0]
 
 
 def test_a_status_that_is_not_good_is_a_broken_row(server):

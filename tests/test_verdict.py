@@ -74,12 +74,18 @@ def errors(seed: int = 1) -> Any:
 
 
 def run(
-    z: Any, *, stated: float = 1.0, law: Any = None, places: Any = None, withheld: Any = None
+    z: Any,
+    *,
+    stated: float = 1.0,
+    law: Any = None,
+    places: Any = None,
+    withheld: Any = None,
+    u0: float = 0.0,
 ) -> tuple[lp.Identifier, lp.Estimate]:
     """Return identifier and last estimate of a run with some readings."""
     sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
     law = law or lp.SensitivityLaw()
-    identifier = lp.Identifier(rod(), sensors, law, u0=0.0, withheld=withheld)
+    identifier = lp.Identifier(rod(), sensors, law, u0=u0, withheld=withheld)
     estimate: Any = None
     for k, t in enumerate(TIMES.tolist()):
         readings = z[k] if not isinstance(z, dict) else {name: z[name][k] for name in z}
@@ -203,11 +209,25 @@ def test_readings_that_the_gate_refuses_are_a_finding():
     assert not [f for f in quiet.findings if f.what == "refused"]
 
 
+def test_each_share_of_a_shift_is_named_with_its_own_remedy():
+    sizes = {"step": -4.0, "mesh": 2.5, "input": 0.4}
+    shifts = Shifts(3.0, sizes, {("k", "step"): -0.2, ("k", "mesh"): 0.1, ("k", "input"): 0.0})
+    (found,) = discretised(shifts)
+    step, mesh = "the time step by 4.0 (k by -0.2)", "the mesh by 2.5 (k by +0.1)"
+    assert f"by 3.0 standard deviations: {step}, {mesh}. " in found.text
+    assert "steps.dt_max" in found.remedy
+    assert "mesh.cells" in found.remedy
+    assert "channels" not in found.sentence
+    small = Shifts(2.2, {"step": 0.9, "mesh": 0.8, "input": 0.5})
+    (found,) = discretised(small)
+    assert "the time step by 0.9." in found.text
+
+
 def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
     shifts = Shifts(2.5, {"step": -0.5, "mesh": 3.0}, {("k", "mesh"): 0.2})
     (found,) = discretised(shifts)
     assert "2.5 standard deviations" in found.text
-    assert "the mesh (k by +0.2)" in found.text
+    assert "the mesh by 3.0 (k by +0.2)" in found.text
     assert "more elements" in found.sentence
     assert list(discretised(replace(shifts, largest=1.9))) == []
     assert list(discretised(Shifts())) == []

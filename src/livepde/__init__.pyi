@@ -39,6 +39,7 @@ from .fem import (
     grad,
     interval,
     linear,
+    random_field,
     read_mesh,
     rectangle,
 )
@@ -105,6 +106,7 @@ __all__ = [
     "paper",
     "petsc",
     "plots",
+    "random_field",
     "read_mesh",
     "rectangle",
     "reproduce",

@@ -69,9 +69,18 @@ class Fingerprint:
             differ = [part for part in differ if part not in EVALUATED]
         return ", and another ".join(NAMES[part] for part in differ)
 
-    def of_members(self, q0: Sequence[Array], u0: Sequence[Array]) -> Fingerprint:
-        """Return the fingerprint of members that begin at these parameters and states."""
-        start = np.concatenate([_sums(np.concatenate(q0)), _sums(np.concatenate(u0))])
+    def of_members(
+        self, q0: Sequence[Array], u0: Sequence[Array], errors: Sequence[Array]
+    ) -> Fingerprint:
+        """Return the fingerprint of members that begin at these parameters and states.
+
+        Parameters
+        ----------
+        errors
+            Those of each state, each of shape (errors, n).
+        """
+        whole = [np.concatenate([np.ravel(one) for one in each]) for each in (q0, u0, errors)]
+        start = np.concatenate(_start(*whole))
         return replace(self, numbers={**self.numbers, "start": start})
 
     def _same(self, part: str, leaves: Mapping[str, Array]) -> bool:
@@ -114,7 +123,7 @@ def fingerprint(
         "sensors": ([one.names for one in sensors], shown),
         "law": (law, ()),
         "steps": ((control, problem.input_noise), ()),
-        "start": ((), (_sums(q0), _sums(u0))),
+        "start": ((), _start(q0, u0, problem.initial_errors)),
     }
     texts, numbers = {}, {}
     for part, (options, sums) in own.items():
@@ -123,6 +132,11 @@ def fingerprint(
         stated = np.array([(value, abs(value)) for value in told]).reshape(-1, 2)
         numbers[part] = np.concatenate([stated, *sums])
     return Fingerprint(texts, numbers)
+
+
+def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
+    """Return sums of what a run begins with; none of errors of u0 where there are none."""
+    return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
 
 
 def _unknowns(model: Model) -> list[Any]:

@@ -103,6 +103,10 @@ class Identifier:
         say): for a u0 that was made of readings. Their noise becomes the uncertainty of u0, and
         they are not assimilated once more. A pair (derivative, standard deviation) states the noise
         of this reading.
+    u0_errors
+        Independent errors of u0 itself, each one standard deviation, in forms as that of u0: the
+        functions of `random_field`, say. They are learned with the unknowns, for laws that have a
+        covariance.
 
     Raises
     ------
@@ -127,11 +131,13 @@ class Identifier:
         between: Mapping[str, Between] | None = None,
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | None = None,
+        u0_errors: Iterable[Any] = (),
     ) -> None:
         _check_parts(model, observation, law)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
-        _check_start(model, t0, u0, u0_from)
+        u0_errors = tuple(u0_errors)
+        _check_start(model, t0, u0, {"u0_from": u0_from, "u0_errors": u0_errors})
         # Unknowns of the sensors, as an offset, join those of the model: laws treat both alike.
         known = model.parameter_space.unknowns
         own = {name: item for name, item in observation.unknowns.items() if name not in known}
@@ -148,7 +154,8 @@ class Identifier:
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, held, start=start)
         noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
-        self.problem = Problem(model, self.observed, control, noise, readings, u0)
+        errors = self.initial_errors(u0_errors)
+        self.problem = Problem(model, self.observed, control, noise, readings, errors, u0)
         self.assimilate_from = assimilate_from
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
@@ -172,16 +179,17 @@ class Identifier:
         parts = self.law, self.problem, self.withheld
         return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
 
-    def started(self, q0: Array, u0: Array) -> Identifier:
+    def started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
         """Return an identifier of the same parts with another start; for `Fleet.identifier`.
 
         Parameters
         ----------
-        q0, u0
-            Latent parameter and state, shapes (m,) and (n,).
+        q0, u0, errors
+            Latent parameter, state and its own errors, shapes (m,), (n,) and (errors, n).
         """
         other = copy.copy(self)
         other._q0, other._u0 = q0, u0
+        other.problem = replace(self.problem, initial_errors=errors)
         other._fingerprint = other._lazy_fingerprint()
         return other
 
@@ -238,6 +246,15 @@ class Identifier:
         for name, given in u0_from.items():
             weight, noise = given if isinstance(given, tuple) else (given, math.nan)
             found[name] = InitialReading(space.interpolate(weight), check_noise(name, noise))
+        return found
+
+    def initial_errors(self, u0_errors: Iterable[Any]) -> Array:
+        """Return coefficients of the errors of u0, shape (errors, n)."""
+        space = self.model.state_space
+        found = np.array([space.interpolate(error) for error in u0_errors])
+        found = found.reshape(-1, self.model.X.dim)
+        if not np.isfinite(found).all():
+            raise ConfigurationError("u0_errors: an error of u0 is not finite; give finite values.")
         return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
@@ -817,12 +834,13 @@ def _check_parts(*parts: object) -> None:
             )
 
 
-def _check_start(model: Model, t0: float, u0: Any, u0_from: Mapping[str, Any] | None) -> None:
+def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
     """Refuse an initial time that is not finite, and an initial state that is said twice or not."""
     if not np.isfinite(t0):
         raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
-    if u0_from and u0 is None:
-        raise ConfigurationError("u0_from says what u0 was made of: give u0, too.")
+    for name, given in uncertain.items():
+        if given and u0 is None:
+            raise ConfigurationError(f"{name} describes u0: give u0, too.")
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."

@@ -16,8 +16,10 @@ import tomlkit
 
 from livepde.cases.case_channels import (
     between_of,
+    check_initial,
     columns_of,
     expanded,
+    initial_errors,
     initial_of,
     initial_weights,
     input_noise_of,
@@ -103,14 +105,15 @@ class Prepared:
         )
 
     def uncertain(self, law: AnyLaw) -> dict[str, Any]:
-        """Return the options of an identifier for noise of inputs and of initial readings."""
+        """Return the options of an identifier for noise of inputs and errors of the start."""
         case = self.case
         if isinstance(law, GradientLaw):  # it has no covariance
             return {}
-        weights = {}
+        found: dict[str, Any] = {"input_noise": input_noise_of(case)}
         if self.u0 is not None:
-            weights = initial_weights(case, self.first)
-        return {"input_noise": input_noise_of(case), "u0_from": weights}
+            found["u0_from"] = initial_weights(case, self.first)
+            found["u0_errors"] = initial_errors(case, self.first)
+        return found
 
     @cached_property
     def u0(self) -> Any:
@@ -227,6 +230,7 @@ class Case(CaseContent):
         _ = self.mesh, self.options, self.model, self.observation, self.withheld, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
         _ = input_noise_of(self)
+        check_initial(self)
         self._check_names()
 
     def _check_names(self) -> None:

@@ -16,7 +16,14 @@ from livepde.cases.read import did_you_mean, is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, MissingInputError
-from livepde.fem import MeanReverting, Normal, Scalars, Unknown, with_constants
+from livepde.fem import (
+    MeanReverting,
+    Normal,
+    Scalars,
+    Unknown,
+    random_field,
+    with_constants,
+)
 from livepde.identifier import Sample
 from livepde.observation import (
     Averages,
@@ -41,8 +48,10 @@ if TYPE_CHECKING:
 
 __all__ = [
     "between_of",
+    "check_initial",
     "columns_of",
     "expanded",
+    "initial_errors",
     "initial_of",
     "initial_weights",
     "input_noise_of",
@@ -52,8 +61,9 @@ __all__ = [
     "unknowns_of",
 ]
 
-# The first sample interpolated: with the noise of its readings, or as if they had none.
-INTERPOLATED = ("interpolate", "interpolate-exact")
+# The first sample interpolated, under two names; or as if it were exact, and the lines between.
+EXACT = "interpolate-exact"
+INTERPOLATED = ("readings", "interpolate", EXACT)
 
 Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, ChannelSpec]]
 """(kind of sensor, component of the state) -> its channels."""
@@ -295,12 +305,12 @@ def initial_of(case: CaseContent, first: Sample) -> Any:
 
     Withheld channels take no part.
     """
-    initial = case.spec.initial
-    if initial is None:
+    if case.spec.initial is None:
         raise case.missing("initial", "a number, or 'interpolate' from the first sample.")
-    if isinstance(initial, dict):
-        unit = case.equation.state.unit
-        return {name: case.convert(v, unit, f"initial.{name}") for name, v in initial.items()}
+    if isinstance(case.spec.initial, dict):
+        unit, parts = case.equation.state.unit, case.spec.initial.items()
+        return {name: case.convert(v, unit, f"initial.{name}") for name, v in parts}
+    initial = case.spec.initial.start
     if initial not in INTERPOLATED:
         if isinstance(initial, str) and not any(letter.isdigit() for letter in initial):
             text = f"got '{initial}'; {did_you_mean(initial, [*INTERPOLATED, 'a number'])}"
@@ -318,7 +328,7 @@ def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
     As x -> u, and NaN for that of the sensor. Empty where readings are taken as exact (`initial =
     "interpolate-exact"`).
     """
-    if case.spec.initial != "interpolate" or len(case.mesh.p) != 1:
+    if not _made_of_readings(case):
         return {}
     readings = _initial_readings(case, first)
     given = by_name(first.z, ())
@@ -329,6 +339,55 @@ def initial_weights(case: CaseContent, first: Sample) -> dict[str, Any]:
         weight = partial(_interpolated, *_level(unit))
         found[one.channel] = (weight, given.get(noise_channel(one.channel), np.nan))
     return found
+
+
+def _made_of_readings(case: CaseContent) -> bool:
+    """Return whether the initial state is made of readings that are uncertain."""
+    initial = case.spec.initial
+    if initial is None or isinstance(initial, dict) or len(case.mesh.p) != 1:
+        return False
+    return initial.start in INTERPOLATED and initial.start != EXACT
+
+
+def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
+    """Return the errors of the initial state itself, each a function of x: see `random_field`.
+
+    Between readings they are as large as stated, or by the spread of the readings. A stated profile
+    has none unless they are stated.
+    """
+    initial = case.spec.initial
+    if initial is None or isinstance(initial, dict):
+        return ()
+    unit = "K" if (of := case.equation.state.unit) == "degC" else of
+    std, length = (
+        None if value is None else case.positive(value, unit, f"initial.{key}", np.inf)
+        for key, value, unit in (
+            ("std", initial.std, unit),
+            ("length", initial.length, case.equation.length_unit),
+        )
+    )
+    if _made_of_readings(case):
+        known = dict(zip(*_level(_initial_readings(case, first)), strict=True))
+        return random_field(case.mesh, std, known=known, length=length)
+    return () if std is None else random_field(case.mesh, std, length=length)
+
+
+def check_initial(case: CaseContent) -> None:
+    """Refuse an uncertainty of the initial state that nothing could use."""
+    initial = case.spec.initial
+    if initial is None or isinstance(initial, dict) or (initial.std, initial.length) == (None,) * 2:
+        return
+    key = "initial.std" if initial.std is not None else "initial.length"
+    if initial.start == EXACT:
+        raise case.error(key, f"'{EXACT}' takes the start as exact; use from = 'readings'.")
+    if initial.std is None and not _made_of_readings(case):
+        raise case.error(key, "it needs the standard deviation of the start; add initial.std.")
+    if case.equation.components:
+        raise case.error(key, "is only valid for a state of one component; leave it out.")
+    if case.spec.law.kind != "sensitivity":
+        raise case.error(
+            key, f"law.kind = '{case.spec.law.kind}' has no covariance for it; leave it out."
+        )
 
 
 def _interpolated(at: Sequence[float], values: Sequence[float], x: Any) -> Any:

@@ -319,6 +319,10 @@ def _options_of(case: CaseContent) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, option in known.items():
         key = f"options.{name}"
+        if name == case.equation.storage and name in case.spec.unknowns:
+            if name in given:
+                raise case.error(key, f"unknowns.{name} is stated, too; keep one of both.")
+            continue
         if name in given:
             values[name] = _option(case, option, given[name], key)
         elif option.default is not None:

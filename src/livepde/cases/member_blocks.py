@@ -134,6 +134,7 @@ class MemberBlock:
             between=between_of(case),
             input_noise=one.uncertain(case.law).get("input_noise"),
             u0_from=[member.uncertain(case.law).get("u0_from", {}) for member in self._each],
+            u0_errors=[member.uncertain(case.law).get("u0_errors", ()) for member in self._each],
         )
         self.status = "finished"
         self.error: DataError | None = None

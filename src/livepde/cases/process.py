@@ -329,6 +329,9 @@ def conditioned(case: CaseContent) -> CaseContent:
     """Return the case whose equation has the fluxes and sources of the case, and their names."""
     spec, equation = case.spec, case.equation
     given = {name: item for name, item in spec.boundary.items() if item.passes}
+    per = equation.storage if equation.storage in spec.unknowns else None
+    if per is not None:
+        _check_drive(case, per)
     if not (given or spec.sources):
         return case
     units = equation.fluxes
@@ -359,12 +362,33 @@ def conditioned(case: CaseContent) -> CaseContent:
         }
         model = base(mesh, own, dirichlet, **options)
         with case.located("boundary", ModelError):
-            return with_conditions(model, boundary, placed, more)
+            return with_conditions(model, boundary, placed, more, per)
 
     unknowns = {**equation.unknowns, **names.unknowns}
     inputs = {**equation.inputs, **names.inputs}
     changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
     return replace(case, equation=changed)
+
+
+def _check_drive(case: CaseContent, storage: str) -> None:
+    """Refuse an unknown heat capacity where no flux, exchange or source is known.
+
+    The equation and all its unknowns can be multiplied by a number then.
+    """
+    spec = case.spec
+    amounts = [
+        *(item.flux for item in spec.boundary.values()),
+        *(item.transfer for item in spec.boundary.values()),
+        *(item.value for item in spec.sources.values()),
+    ]
+    if any(amount not in (None, 0.0) and amount not in spec.unknowns for amount in amounts):
+        return
+    text = (
+        f"temperatures alone do not determine '{storage}': it needs a known flux, exchange or "
+        "source, such as boundary.left = { flux = 'CHANNEL' } of a heat-flux plate, or sources of "
+        f"a known power; add one, or state options.{storage}."
+    )
+    raise case.error(f"unknowns.{storage}", text)
 
 
 def _passing(

@@ -13,8 +13,10 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     StrictBool,
+    Tag,
     model_validator,
 )
 
@@ -640,12 +642,33 @@ class SourceSpec(Spec):
     over: Pair | Box | Name | None = None
 
 
+class InitialSpec(Spec):
+    """The initial state: where it comes from, and how far off it may be."""
+
+    start: Quantity = Field(alias="from")
+    std: Quantity | None = None
+    length: Quantity | None = None
+
+
+def _has_from(value: Any) -> str:
+    """Return which table an initial state is: a table without `from` has components."""
+    whole = not isinstance(value, Mapping) or "from" in value
+    return "whole" if whole else "components"
+
+
+Initial: TypeAlias = Annotated[
+    Annotated[InitialSpec, Tag("whole")] | Annotated[dict[Name, Quantity], Tag("components")],
+    Discriminator(_has_from),
+    _short("from"),
+]
+
+
 class CaseSpec(Spec):
     """A whole case file."""
 
     title: str = ""
     equation: Name
-    initial: Quantity | dict[Name, Quantity] | None = None
+    initial: Initial | None = None
     mesh: MeshSpec
     options: dict[Identifier, StrictBool | Quantity] = Field(default_factory=dict)
     boundary: dict[Name, Boundary] = Field(default_factory=dict)

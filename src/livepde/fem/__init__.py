@@ -49,6 +49,7 @@ from livepde.fem.notation import (
 )
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
+from livepde.fem.random_field import random_field
 from livepde.fem.sobolev import Sobolev
 from livepde.fem.space import FunctionSpace, Named
 
@@ -105,6 +106,7 @@ __all__ = [
     "mul",
     "positive",
     "quadratic",
+    "random_field",
     "read_mesh",
     "rectangle",
     "smooth",

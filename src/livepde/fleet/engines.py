@@ -178,8 +178,8 @@ class SeparateEngine(FleetEngine):
 class BlockEngine(FleetEngine):
     """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members.
 
-    `readings` are those that the initial state of each member was made of, `initial` how it was
-    given.
+    `readings` are those that the initial state of each member was made of, `errors` its own errors,
+    (errors, n), `initial` how it was given.
     """
 
     def __init__(
@@ -187,16 +187,18 @@ class BlockEngine(FleetEngine):
         law: Any,
         work: SensitivityWork,
         readings: Sequence[Mapping[str, InitialReading]],
+        errors: Sequence[Array],
         initial: Sequence[Any],
     ) -> None:
         super().__init__(law, work)
         made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
         self._begins = []
-        for one, u0 in zip(readings, initial, strict=True):
-            begin = made.get(id(u0)) if not one else None
+        for one, off, u0 in zip(readings, errors, initial, strict=True):
+            own = bool(one) or bool(len(off))
+            begin = made.get(id(u0)) if not own else None
             if begin is None:
-                begin = work.made_of(one, u0)
-                made |= {} if one else {id(u0): begin}
+                begin = work.made_of(one, off, u0)
+                made |= {} if own else {id(u0): begin}
             self._begins.append(begin)
 
     def subset(self, which: IntArray) -> BlockEngine:

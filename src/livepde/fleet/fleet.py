@@ -55,8 +55,9 @@ class Fleet:
         As for `Identifier`.
     members
         How many, or their names.
-    q0, u0, u0_from
-        As for `Identifier`, for all members; or a list with one for each.
+    q0, u0, u0_from, u0_errors
+        As for `Identifier`, for all members; or a list with one for each, so that the errors of
+        one u0 are a tuple.
     t0, withheld, scheme, dt_max, halvings, assimilate_from, between, input_noise
         As for `Identifier`.
 
@@ -93,12 +94,15 @@ class Fleet:
         between: Mapping[str, Between] | None = None,
         input_noise: Mapping[str, float] | None = None,
         u0_from: Mapping[str, Any] | list[Mapping[str, Any]] | None = None,
+        u0_errors: tuple[Any, ...] | list[tuple[Any, ...]] = (),
     ) -> None:
         self.members = _named(members)
         if isinstance(law, SensitivityLaw):  # the sums of each member would cost more than its step
             law = replace(law, verdict=False)
         q0s, u0s = self._each("q0", q0), self._each("u0", u0)
         made_of = [one or {} for one in self._each("u0_from", u0_from)]
+        off = [tuple(one) for one in self._each("u0_errors", u0_errors)]
+        most: tuple[Any, ...] = max(off, key=len)
         self._one = Identifier(
             model,
             observation,
@@ -114,6 +118,7 @@ class Fleet:
             between=between,
             input_noise=input_noise,
             u0_from=max(made_of, key=len),
+            u0_errors=most,
         )
         self.model = model = self._one.model
         self.law = law
@@ -131,6 +136,7 @@ class Fleet:
                 stated = model.boundary_readings(u)
             self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
         self.note = law.stepped_alone(self._work)
+        self._errors = [self._one.initial_errors(one) for one in off]
         self._engine = self._stepper(made_of, u0s)
         count = len(self)
         self._state: Any = None
@@ -151,7 +157,12 @@ class Fleet:
         """Return the engine that steps members as blocks if the law can, else one by one."""
         if not self.note:
             readings = [self._one.initial_readings(one) for one in made_of]
-            return BlockEngine(self.law, self._work, readings, u0s)
+            return BlockEngine(self.law, self._work, readings, self._errors, u0s)
+        if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
+            raise ConfigurationError(
+                "u0_errors differ between members, which are stepped separately, as "
+                f"{self.note}: give all the same."
+            )
         if any(one.keys() != made_of[0].keys() for one in made_of):
             raise ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "
@@ -404,7 +415,7 @@ class Fleet:
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Kept, since its fingerprint is computed once for all checkpoints of this member.
-        start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k])
+        start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k], self._errors[k])
         self._starts[k] = start
         return start.placed(state, ends, self._samples)
 
@@ -432,7 +443,8 @@ class Fleet:
             vars(other).pop(name, None)
         other.members = tuple(self.members[k] for k in which)
         other._engine = self._engine.subset(which)
-        other._q0, other._u0 = ([all_[k] for k in which] for all_ in (self._q0, self._u0))
+        starts = self._q0, self._u0, self._errors
+        other._q0, other._u0, other._errors = ([each[k] for k in which] for each in starts)
         other._stated = self._stated[which]
         for name, values in self.ends.items():
             setattr(other, f"_{name}", values[which])
@@ -556,7 +568,7 @@ class Fleet:
     @cached_property
     def fingerprint(self) -> Fingerprint:
         """Numbers by which a checkpoint of this fleet is known; computed when first asked for."""
-        return self._one.fingerprint.of_members(self._q0, self._u0)
+        return self._one.fingerprint.of_members(self._q0, self._u0, self._errors)
 
     @cached_property
     def header(self) -> dict[str, Any]:

@@ -140,10 +140,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
                 "GradientLaw: a component of the state has no mass term, so that M is no inner "
                 "product of X: use SensitivityLaw, or give M a term for each component."
             )
-        if problem.input_noise or problem.initial_readings:
+        if problem.input_noise or problem.initial_rank:
             raise LawError(
-                "GradientLaw has no covariance that input_noise or u0_from could enter: leave them "
-                "out, or use SensitivityLaw."
+                "GradientLaw has no covariance that input_noise, u0_from or u0_errors could enter: "
+                "leave them out, or use SensitivityLaw."
             )
         parts = self._parts(problem)
         metric, prior = parts.metric, np.zeros((problem.model.Q.dim, 0))

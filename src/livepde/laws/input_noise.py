@@ -1,4 +1,4 @@
-"""Noise of input channels and of readings that an initial state was made of, as rows of [U; C]."""
+"""Noise of input channels, and errors of an initial state, as rows of [U; C]."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ ROWS = 10
 
 
 def input_rank(problem: Problem) -> int:
-    """Return how many rows of the square root the noise of inputs and initial readings needs."""
-    return ROWS * len(problem.input_noise) + len(problem.initial_readings)
+    """Return how many rows of the square root the noise of inputs and an initial state need."""
+    return ROWS * len(problem.input_noise) + problem.initial_rank
 
 
 def with_input_noise(
@@ -82,11 +82,12 @@ def _moved(span: Span, name: str, change: float) -> Span:
 def initial_rows(
     problem: Problem, reduction: Reduction, noise: Array, q: Array, u: Array, moment: Moment
 ) -> tuple[Array, Array]:
-    """Return the uncertainty of a u0 made of readings: rows of U and of C.
+    """Return the uncertainty of u0: rows of U and of C.
 
-    With u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise of each
-    reading is a row of its own, and the effect of the unknowns on the sensors, an offset say,
-    stands in the rows of those unknowns. So the readings tell nothing more of them.
+    The errors of u0 itself (`Problem.initial_errors`) are rows of their own. For a u0 made of
+    readings, with u0 = sum_i w_i z_i the error of u0 is -sum_i w_i (noise_i + H_q Phi a): the noise
+    of each reading is a row of its own, and the effect of the unknowns on the sensors, an offset
+    say, stands in the rows of those unknowns. So the readings tell nothing more of them.
 
     Parameters
     ----------
@@ -98,7 +99,7 @@ def initial_rows(
     Returns
     -------
     U, C
-        Shapes (k + readings, n) and (k + readings, k).
+        Shapes (k + readings + errors, n) and (k + readings + errors, k).
     """
     observed, k = problem.observed, reduction.size
     free = problem.model.X.free
@@ -114,6 +115,7 @@ def initial_rows(
             std = noise[sensor] if np.isnan(reading.noise) else reading.noise
             unknown -= np.outer(seen[:, sensor], direction)
         own.append(std * direction)
+    own += [free * error for error in problem.initial_errors]
     C = np.vstack([np.eye(k), np.zeros((len(own), k))])
     return np.vstack([unknown, *own]), C
 
@@ -121,8 +123,8 @@ def initial_rows(
 def with_initial_rows(
     x: FilterState, problem: Problem, reduction: Reduction, noise: Array, moment: Moment
 ) -> FilterState:
-    """Return the state at the start with the uncertainty of the readings that it was made of."""
-    if not problem.initial_readings:
+    """Return the state at the start with the uncertainty of the initial state."""
+    if not problem.initial_rank:
         return x
     U, C = initial_rows(problem, reduction, noise, x.q[0], x.u[0], moment)
     causes = np.zeros((1, len(C), x.causes.shape[2]))

@@ -111,6 +111,9 @@ class Problem:
         Channel of the model -> standard deviation of its noise.
     initial_readings
         Channel -> its reading at the initial time, if the initial state was made of it.
+    initial_errors
+        Independent errors of the initial state itself, each one standard deviation, shape (errors,
+        n).
     initial
         The initial state as it was given: a number, a function of x, coefficients, or a mapping.
     """
@@ -120,7 +123,13 @@ class Problem:
     control: Advance
     input_noise: Mapping[str, float] = field(default_factory=dict)
     initial_readings: Mapping[str, InitialReading] = field(default_factory=dict)
+    initial_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     initial: Any = None
+
+    @property
+    def initial_rank(self) -> int:
+        """Number of independent errors of the initial state that are no errors of unknowns."""
+        return len(self.initial_readings) + len(self.initial_errors)
 
     @cached_property
     def channels(self) -> tuple[str, ...]:

@@ -66,9 +66,13 @@ class SensitivityWork:
     fades: bool
     relinearises: bool
 
-    def made_of(self, readings: Mapping[str, InitialReading], initial: Any) -> SensitivityWork:
+    def made_of(
+        self, readings: Mapping[str, InitialReading], errors: Array, initial: Any
+    ) -> SensitivityWork:
         """Return the same for a member whose initial state was given so, and made of readings."""
-        problem = replace(self.filter.problem, initial_readings=readings, initial=initial)
+        problem = replace(
+            self.filter.problem, initial_readings=readings, initial_errors=errors, initial=initial
+        )
         return replace(self, filter=replace(self.filter, problem=problem))
 
     @cached_property

@@ -65,8 +65,8 @@ def judge_of(
         windows=len(WINDOWS),
     )
     sizes = problem.observed.size, reduction.size, model.X.dim
-    # Noise of inputs, and of the readings of the start, adds rows before they are compressed.
-    rows = rank + input_rank(problem) + len(problem.initial_readings)
+    # Noise of inputs, and errors of the start, add rows before they are compressed.
+    rows = rank + input_rank(problem) + problem.initial_rank
     return Judge(dictionary, *sizes, rows, still=still)
 
 
@@ -167,6 +167,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
         aside={sensors[i]: (since[i], off[i]) for i in np.flatnonzero(screened.aside[0])},
         apart=int(screened.apart[0].sum()),
         strain=int(screened.strain[0].max()),
+        start_uncertain=len(problem.initial_errors) > 0,
     )
 
 

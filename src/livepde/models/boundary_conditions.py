@@ -75,6 +75,7 @@ def with_conditions(
     boundary: Mapping[str, Condition | Sequence[Condition]] | None = None,
     sources: Mapping[str, Source] | None = None,
     unknowns: Mapping[str, Unknown] | None = None,
+    per: str | None = None,
 ) -> Model:
     """Return a process with added boundary fluxes and sources.
 
@@ -88,6 +89,9 @@ def with_conditions(
         Mapping from name, for messages, to source.
     unknowns
         Unknowns named by these conditions, in addition to those of the model.
+    per
+        Unknown of the model by which its equation is divided, as an unknown heat capacity:
+        conditions are divided by it, too.
 
     Raises
     ------
@@ -109,7 +113,7 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
-    terms = _Terms(tuple(more))
+    terms = _Terms(tuple(more), per)
     for name, given in (boundary or {}).items():
         _check_boundary(model, name)
         for condition in given if isinstance(given, Sequence) else [given]:
@@ -128,8 +132,8 @@ def _everywhere(x: Place) -> float:
 class _Terms:
     """Additional terms of A, which contain unknowns, and of B, which do not."""
 
-    def __init__(self, unknowns: tuple[str, ...]) -> None:
-        self.unknowns = unknowns
+    def __init__(self, unknowns: tuple[str, ...], per: str | None) -> None:
+        self.unknowns, self.per = unknowns, per
         self.named: set[str] = set()
         self.inputs: list[str] = []
         self.A: list[Any] = []
@@ -143,7 +147,7 @@ class _Terms:
         """Add a flux, or an exchange as two terms, so that the term in u reads no input."""
         if isinstance(condition, Flux):
             return self.gained(condition.value, boundary)
-        h, ambient = self._amount(condition.coefficient), self._amount(condition.ambient)
+        h, ambient = self._divided(condition.coefficient), self._amount(condition.ambient)
         given = condition.coefficient, condition.ambient
         # A term in u that reads an input would make the matrix of a stage depend on time, and
         # prevent the reuse of its factor.
@@ -154,7 +158,7 @@ class _Terms:
         self, value: Amount, where: str | None, inside: Callable[[Any], Any] = _everywhere
     ) -> None:
         """Add a flux or a source."""
-        amount = self._amount(value)
+        amount = self._divided(value)
         # In M u_t + A(u) q + B(u) = f the terms stand on the left side, hence the sign.
         self._add(where, lambda q, _, v, x: -amount(q, x) * inside(x) * v, value)
 
@@ -163,9 +167,14 @@ class _Terms:
             return term(None, u, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
-        unknown = any(isinstance(amount, str) for amount in amounts)
+        unknown = self.per is not None or any(isinstance(amount, str) for amount in amounts)
         form = term if unknown else known
         (self.A if unknown else self.B).append(form if where is None else On(where, form))
+
+    def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:
+        """Return an amount over the unknown that divides the equation, if one does."""
+        amount, per = self._amount(value), self.per
+        return amount if per is None else lambda q, x: amount(q, x) / getattr(q, per)
 
     def _amount(self, value: Amount) -> Callable[[Any, Place], Any]:
         """Return an amount as a function of q and x."""

@@ -109,6 +109,9 @@ class Equation:
         Function mesh -> element of the state, and of unknown fields.
     fluxes
         Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
+    storage
+        Option that may be an unknown instead, by which the equation is divided then: only the
+        ratio of other unknowns to it is determined without a known flux or source.
     spacing
         Of an interval's mesh: "geometric" where u changes most at the left end, as around a well.
     alternatives
@@ -132,6 +135,7 @@ class Equation:
     length_unit: str = "m"
     time_unit: str = "s"
     fluxes: Fluxes | None = None
+    storage: str = ""
     spacing: Literal["uniform", "geometric"] = "uniform"
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     components: tuple[str, ...] = ()

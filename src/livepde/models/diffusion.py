@@ -6,7 +6,19 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from livepde.errors import ModelError
-from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
+from livepde.fem import (
+    Field,
+    On,
+    Piecewise,
+    Place,
+    Prior,
+    Scalar,
+    Scalars,
+    Unknown,
+    dot,
+    grad,
+    linear,
+)
 from livepde.model import Model
 from livepde.models.description import Equation, Fluxes, Option, Variable, by_name
 
@@ -79,14 +91,17 @@ def conduction(
     k: Unknown,
     dirichlet: Mapping[str, Any] | None = None,
     *,
-    C: float | Callable[[Place], Any],
+    C: float | Callable[[Place], Any] | Unknown,
     loss: Unknown | None = None,
     transfer: Unknown | None = None,
     source: Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
-    """Return C u_t - div(k grad u) + loss (u - ambient) = source with known heat capacity C.
+    """Return C u_t - div(k grad u) + loss (u - ambient) = source with heat capacity C.
+
+    With an unknown C the equation is divided by it. Temperatures alone determine k/C: add a known
+    flux or source by `with_conditions(..., per="C")`.
 
     At boundaries without a value -k u_n = transfer (u - ambient).
 
@@ -97,14 +112,15 @@ def conduction(
     k
         Conductivity in W/(m K).
     C
-        Volumetric heat capacity in J/(m^3 K): a number, or a function of x.
+        Volumetric heat capacity in J/(m^3 K): a number, a function of x, or one unknown number.
     loss, transfer, source
         Loss rate, transfer coefficient and source, in W/(m^3 K), W/(m^2 K) and W/m^3.
 
     Raises
     ------
     ModelError
-        C is not positive, or `transfer` is given, but every boundary has a value.
+        C is not positive, or unknown by region or as a field; or `transfer` is given, but every
+        boundary has a value.
 
     Examples
     --------
@@ -118,10 +134,15 @@ def conduction(
     ...     C=lambda x: dry + (wet - dry) * (x[0] > 0.2),
     ... )
     """
+    unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
+    if isinstance(C, Field | Piecewise | Scalars):  # grad(1/C) would be a term of its own
+        raise ModelError("conduction: an unknown C must be one number; give a Scalar or a prior.")
+    if isinstance(C, Scalar | Prior):
+        unknowns["C"] = C
+        return _model("conduction", mesh, "k", unknowns, dirichlet, lambda x: 1.0, element, unit)
     if not callable(C) and not C > 0:
         raise ModelError(f"conduction: the heat capacity C must be positive; got {C}.")
     capacity = C if callable(C) else lambda x: C
-    unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
     return _model("conduction", mesh, "k", unknowns, dirichlet, capacity, element, unit)
 
 
@@ -138,15 +159,20 @@ def _model(
     held = dict(dirichlet or {})
     # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
+
+    def per(q: Any) -> Any:
+        """Return what the equation is divided by: an unknown heat capacity."""
+        return q.C if "C" in given else 1.0
+
     terms: list[Any] = [
-        lambda q, u, v, x: getattr(q, conductivity) * dot(grad(u), grad(v)),
+        lambda q, u, v, x: getattr(q, conductivity) / per(q) * dot(grad(u), grad(v)),
     ]
     if "loss" in given:
-        terms += _exchange("loss")
+        terms += _exchange("loss", per)
     if "transfer" in given:
-        terms += _transfer(name, mesh, held)
+        terms += _transfer(name, mesh, held, per)
     if "source" in given:
-        terms.append(lambda q, _, v, x: -q.source * v)
+        terms.append(lambda q, _, v, x: -q.source / per(q) * v)
     return Model(
         Field(mesh, element or linear(mesh), dirichlet=held, unit=unit),
         given,
@@ -158,15 +184,15 @@ def _model(
     )
 
 
-def _exchange(coefficient: str) -> list[Any]:
+def _exchange(coefficient: str, per: Callable[[Any], Any]) -> list[Any]:
     """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
     return [
-        lambda q, u, v, x: getattr(q, coefficient) * u * v,
-        lambda q, _, v, x: -getattr(q, coefficient) * x.inputs[AMBIENT] * v,
+        lambda q, u, v, x: getattr(q, coefficient) / per(q) * u * v,
+        lambda q, _, v, x: -getattr(q, coefficient) / per(q) * x.inputs[AMBIENT] * v,
     ]
 
 
-def _transfer(name: str, mesh: Any, held: Mapping[str, Any]) -> list[On]:
+def _transfer(name: str, mesh: Any, held: Mapping[str, Any], per: Callable[[Any], Any]) -> list[On]:
     """Return the Robin terms at the named boundaries without a value."""
     free = (
         [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
@@ -176,7 +202,7 @@ def _transfer(name: str, mesh: Any, held: Mapping[str, Any]) -> list[On]:
             f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
             "it out, or leave one out of dirichlet."
         )
-    return [On(side, term) for side in free for term in _exchange("transfer")]
+    return [On(side, term) for side in free for term in _exchange("transfer", per)]
 
 
 SURROUNDINGS = {
@@ -202,11 +228,12 @@ HEAT = Equation(
 
 CONDUCTION = Equation(
     name="conduction",
-    summary="heat conduction by conductivity and known heat capacity",
+    summary="heat conduction by conductivity and heat capacity",
     formula="C u_t = div(k grad u) - loss (u - ambient) + source",
     state=Variable("degC", "temperature"),
     unknowns={
         "k": Variable("W/(m K)", "conductivity: a number, by layer, or a field"),
+        "C": Variable("J/(m^3 K)", "heat capacity in place of the option, with a flux", True),
         "loss": Variable("W/(m^3 K)", "exchange with the surroundings", True),
         "transfer": Variable("W/(m^2 K)", "heat transfer at free boundaries", True),
         "source": Variable("W/m^3", "heat gained", True),
@@ -216,4 +243,5 @@ CONDUCTION = Equation(
     build=by_name(conduction),
     element=linear,
     fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
+    storage="C",
 )

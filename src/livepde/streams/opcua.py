@@ -51,6 +51,8 @@ class OpcuaSource(RowSource):
     ----------
     dropped
         Rows that came faster than they were taken.
+    undated
+        Values without a source time, which have the server's, or the time of their arrival.
 
     Raises
     ------
@@ -73,7 +75,7 @@ class OpcuaSource(RowSource):
             raise DataError("OPC UA: a url with a password is written down: use username instead.")
         if not interval > 0.0:
             raise DataError(f"OPC UA: interval must be a time > 0; got {interval}.")
-        self.dropped = 0
+        self.dropped = self.undated = 0
         self._url = url
         self._columns = dict(columns)
         self._time = time
@@ -161,6 +163,15 @@ class OpcuaSource(RowSource):
         if self._seen.get(column) == moment:
             return
         self._seen[column] = moment
+        if found.SourceTimestamp is None:
+            self.undated += 1
+            if self.undated == 1:
+                log.warning(
+                    "'%s' has no source time: its values, and others without one, have the time of "
+                    "%s; set the time at the source if the server is slow",
+                    column,
+                    "the server" if found.ServerTimestamp else "their arrival",
+                )
         row = Row({}, token=None, broken=f"'{column}' is {found.StatusCode.name}")
         if found.StatusCode.is_good():
             time = moment if moment.tzinfo else moment.replace(tzinfo=UTC)

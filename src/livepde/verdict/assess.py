@@ -77,6 +77,8 @@ class Position:
         Label of each reduced unknown that stays.
     moving
         Whether unknowns move.
+    start_uncertain
+        Whether the initial state has an uncertainty of its own.
     aside
         Sensors that are set aside: name -> (since when, last reading minus prediction).
     apart, strain
@@ -96,6 +98,7 @@ class Position:
     aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     apart: int = 0
     strain: int = 0
+    start_uncertain: bool = False
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -169,16 +172,26 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
     grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
+    chance_of = f"(one such run in {_many(evidence.whitened)} would look so by chance)"
+    evident = math.exp(min(evidence.whitened, 700.0))
+    # The state forgets where it began: later readings determine the unknowns without it.
+    if causes[0].kind == "initial" and not grave and (recent or understood):
+        text = (
+            f"The readings do not fit the initial state {chance_of}, which moves no unknown by a "
+            "standard deviation."
+        )
+        yield Finding("start", "note", text, "", evident, "e-value", causes, shift=shift)
+        return
     text = (
-        "The model does not explain the data: what is left of the readings is not noise (one such "
-        f"run in {_many(evidence.whitened)} would look so by chance)."
+        "The model does not explain the data: what is left of the readings is not noise "
+        f"{chance_of}."
     )
     yield Finding(
         "misfit",
         "do not trust" if grave or not understood else "caution",
         text,
         subject=causes[0].subject,
-        evidence=math.exp(min(evidence.whitened, 700.0)),
+        evidence=evident,
         measure="e-value",
         causes=causes,
         shift=shift,
@@ -267,7 +280,9 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
         return channel_setting(direction.subject, keys[direction.kind], f"{width:.2g}")
     if direction.kind == "jump":
         return _jump(direction.subject)
-    return 'initial="interpolate"' if direction.kind == "initial" else ""
+    if direction.kind == "initial" and not at.start_uncertain:
+        return 'initial="interpolate"'
+    return ""
 
 
 def _jump(label: str) -> str:
@@ -335,7 +350,10 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
         ),
         "initial": (
             f"the initial state lies {side} the one that is stated",
-            'Let the first readings make it: initial = "interpolate".',
+            "State a larger `initial.std`, or leave out the first samples."
+            if at.start_uncertain
+            else "State how uncertain the initial state is: "
+            'initial = { from = "readings", std = ... }, or from = a number.',
         ),
     }
     return words[direction.kind]

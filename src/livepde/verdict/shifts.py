@@ -15,6 +15,7 @@ __all__ = ["NOT_KNOWN", "REFINE", "Shifts", "discretised", "held_inputs", "known
 
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
 DECIDES = 5.0  # the same, from which the interval is little else
+SHARED = 1.0  # the same by one kind of error, from which it is named
 SETTING = 1.0  # the same if inputs are readings: no interval holds that
 HOLD = "hold"
 SAID = 5  # unknowns in a sentence
@@ -23,7 +24,7 @@ REFINE = {
         "the time step",
         "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
     ),
-    "mesh": ("the mesh", "Take more elements, where the state bends most."),
+    "mesh": ("the mesh", "Take more elements (mesh.cells), where the state bends most."),
     "input": (
         "the straight lines between readings of the input channels",
         "Read these channels more often.",
@@ -89,12 +90,16 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
     if not total > SHIFTED or not sizes:
         return
-    kind = max(sizes, key=lambda kind: sizes[kind])
-    what, remedy = REFINE[kind]
+    # Shares may cancel in the total: each that is as large as it matters is named with its remedy.
+    largest = max(sizes.values())
+    parts = sorted(sizes, key=lambda kind: -sizes[kind])
+    parts = [kind for kind in parts if sizes[kind] >= min(largest, SHARED)]
+    each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
     text = (
-        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations, and most "
-        f"of it is {what}{_listed(shifts.by(kind))}. The intervals were widened by that."
+        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations: "
+        f"{', '.join(each)}. The intervals were widened by that."
     )
+    remedy = " ".join(REFINE[kind][1] for kind in parts)
     # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
     # and says more on the mesh and the step than on the data.
     severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
