@@ -41,11 +41,10 @@ from livepde.laws.sensitivity_state import (
     Scale,
     SensitivityState,
     SensitivityWork,
+    kept_for_estimates,
     reports_of,
     shortened,
     stored,
-    without_factors,
-    without_ledger,
 )
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
@@ -498,10 +497,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
-        now = without_factors(state.now)
-        alone, fit = without_ledger(now), state.fit.member(0)
-        judge = with_fit(judged(work.filter, now, 0), fit)
-        return Deferred(lambda: self.member_belief(work, alone, 0), judge)
+        now, fit = kept_for_estimates(state.now), state.fit.member(0)
+        judge = with_fit(judged(work.filter, state.now, now), fit)
+        return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

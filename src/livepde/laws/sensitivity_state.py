@@ -30,13 +30,12 @@ __all__ = [
     "Scale",
     "SensitivityState",
     "SensitivityWork",
+    "kept_for_estimates",
     "new_window",
     "reports_of",
     "restarted",
     "shortened",
     "stored",
-    "without_factors",
-    "without_ledger",
     "without_past",
 ]
 
@@ -385,7 +384,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.array(np.broadcast_to(told.steps, members))
+    steps = np.full(members, told.steps)
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
 
 
@@ -398,18 +397,11 @@ def _with_refused(
     return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
 
 
-def without_factors(x: FilterState) -> FilterState:
-    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
-    if not (x.kept.q.shape[1] or x.shadows.u.shape[1]):
-        return x
-    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())
-
-
-def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter state without the data that only its verdict needs."""
-    if x.ledger is NO_LEDGER:
-        return x
-    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
+def kept_for_estimates(x: FilterState) -> FilterState:
+    """Return a filter state without the data that only its next steps and its verdict need."""
+    shadows = x.shadows.without_stages() if x.shadows.u.shape[1] else x.shadows
+    none = x.causes[:, :, :0]
+    return changed(x, kept=x.kept.forgotten(), shadows=shadows, causes=none, ledger=NO_LEDGER)
 
 
 def new_window(

@@ -34,7 +34,7 @@ from livepde.laws.process_noise import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.linalg import Array, BlockFactor, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     TINY,
     Advance,
@@ -203,7 +203,7 @@ class MeanProcess:
         """Return the same as `propagate`, through the parts of a span that end at some times."""
         members, no = len(u), np.zeros(len(u), dtype=bool)
         tangents = self.reduction.directions(x.q, np.zeros((members, 0, x.C.shape[2])))
-        factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
+        factors: dict[float, Any] = {}  # of all stages of a step that have the same q
         now = kept
 
         def stage(columns: Array, t: float, h: float) -> Array:
@@ -655,14 +655,23 @@ class ShadowSet:
         return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(
-        self, x: FilterState, new: FilterState, left: Array, weights: Array, off: Array, t: float
+        self,
+        x: FilterState,
+        U: Array,
+        C: Array,
+        left: Array,
+        weights: Array,
+        off: Array,
+        t: float,
     ) -> ShadowState:
         """Return the shadows after a sample.
 
         Parameters
         ----------
-        x, new
-            The filter before and after it.
+        x
+            The filter before it.
+        U, C
+            The square root after it.
         left
             `Update.left`.
         weights
@@ -675,14 +684,14 @@ class ShadowSet:
         # K^T = `gain` [U C], with the rows of the new square root.
         gain = weights[:, :, None] * left.swapaxes(1, 2)  # (members, sensors, r)
         half = off @ gain
-        parts = {"u": s.u - half @ new.U, "a": s.a - half @ new.C}
+        parts = {"u": s.u - half @ U, "a": s.a - half @ C}
         since = t - s.begun
         if s.gains.size and np.count_nonzero(since):
             # A sample multiplies the effect of earlier ones by I - K H, for which the share of the
             # variance that it leaves stands: the full product would need a matrix for each sensor.
-            share = np.einsum("brk,brk->bk", new.C, new.C)
-            share /= np.maximum(np.einsum("brk,brk->bk", x.C, x.C), TINY)
-            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ new.C)
+            share = np.add.reduce(C * C, axis=1)
+            share /= np.maximum(np.add.reduce(x.C * x.C, axis=1), TINY)
+            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ C)
         return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
@@ -744,7 +753,7 @@ def _watch_rate(
     """Return fields after one more step, and members whose rate of the state jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
-    count, differs = s.count + 1, np.sqrt(np.einsum("mn,mn->m", more, more))
+    count, differs = s.count + 1, np.sqrt(np.add.reduce(more * more, axis=1))
     most = np.where(count > CALM + 1, JUMP * s.usual, np.inf)  # in the first steps none is known
     jumps = differs > most
     # A jump does not count as usual.

@@ -46,7 +46,8 @@ class StepLedger:
     @property
     def failed(self) -> bool:
         """Whether any step was not ok."""
-        return bool(self.counts.sum() > self.counts[STATUS_CODES.index("ok")])
+        counts = self.counts.tolist()
+        return sum(counts) > counts[STATUS_CODES.index("ok")]
 
     def findings(self) -> Iterator[Finding]:
         """Return a finding for each way in which steps have failed."""

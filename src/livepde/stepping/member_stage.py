@@ -7,16 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.linalg import (
-    Array,
-    BlockFactor,
-    IntArray,
-    Mask,
-)
+from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Moments
@@ -82,8 +77,8 @@ class StageOfMembers(NamedTuple):
         linearisation point, which has to be more accurate than a covariance square root; shape
         (members,).
     factors
-        Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
-        step of a time scheme; a stage may read it and add to it.
+        Cache of factorised matrices for this q and these directions, keyed by step length, shared
+        by the stages of one step of a time scheme; a stage may read it and add to it.
     apart
         Number of trailing tangents that are solved separately, so that their presence does not
         change the rounding of the other columns.
@@ -96,7 +91,7 @@ class StageOfMembers(NamedTuple):
     at: Moments
     kept: KeptFactors
     off_centre: Mask
-    factors: dict[float, BlockFactor]
+    factors: dict[float, Any]
     apart: int = 0
 
 
