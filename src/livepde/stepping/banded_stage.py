@@ -45,7 +45,7 @@ NONE = np.zeros((0, 0))
 
 
 class BandedStep(NamedTuple):
-    """What stages of one length with the same unknowns and directions share.
+    """What stages of one length with the same unknowns share.
 
     Attributes
     ----------
@@ -53,17 +53,12 @@ class BandedStep(NamedTuple):
         The factorised matrices.
     amounts
         h q of the physical unknowns, shape (members, unknowns).
-    along, apart
-        h times the directions of the tangents, and of those that are solved separately, (members,
-        r, unknowns).
     forced
         See `BandedStage`.
     """
 
     factor: BlockFactor
     amounts: Array
-    along: Array
-    apart: Array
     forced: tuple[Array, Array] | None
 
 
@@ -192,10 +187,11 @@ class BandedStage(MemberStage):
             driven = self._slopes(u).reshape(size, -1, n)
             if offset is not None:
                 driven = driven + offset
-            if together > size:
-                known[size:together] -= _along(step.along, driven)
+            along, chosen = stage.h * stage.directions, together // size - 1
+            if chosen:
+                known[size:together] -= _along(along[:, :chosen], driven)
             if stage.apart:
-                known[together:] -= _along(step.apart, driven)
+                known[together:] -= _along(along[:, chosen:], driven)
             new[1:] = step.factor.solve(new[1:])
         if not self._boundary.zero:
             u += self._boundary(at)
@@ -209,11 +205,7 @@ class BandedStage(MemberStage):
         amounts = np.multiply(unknowns, h, out=weights[:, :-2])
         weights[:, -2], weights[:, -1] = h, 1.0
         factor = self._blocks.factorise(weights.dot(self._bands))
-        along = h * stage.directions
-        together = along.shape[1] - stage.apart
-        step = BandedStep(
-            factor, amounts, along[:, :together], along[:, together:], self._forced(h)
-        )
+        step = BandedStep(factor, amounts, self._forced(h))
         stage.factors[h] = step
         return step
 

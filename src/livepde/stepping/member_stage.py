@@ -77,8 +77,8 @@ class StageOfMembers(NamedTuple):
         linearisation point, which has to be more accurate than a covariance square root; shape
         (members,).
     factors
-        Cache of factorised matrices for this q and these directions, keyed by step length, shared
-        by the stages of one step of a time scheme; a stage may read it and add to it.
+        Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
+        step of a time scheme; a stage may read it and add to it.
     apart
         Number of trailing tangents that are solved separately, so that their presence does not
         change the rounding of the other columns.
