@@ -26,7 +26,7 @@ from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.process_noise import NoiseRows, grades, pieces
 from livepde.laws.reduction import Reduction
@@ -69,8 +69,7 @@ class Update(NamedTuple):
     @property
     def left(self) -> Array:
         """Return W^T Y, shape (members, r, sensors)."""
-        left: Array = self.W.transpose(0, 2, 1) @ self.Y
-        return left
+        return product(self.W.transpose(0, 2, 1), self.Y)
 
     @property
     def spread(self) -> Array:
@@ -348,15 +347,15 @@ class Filter:
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
-        U, C, parts = Wt @ x.U, Wt @ x.C, {"causes": causes}
+        U, C, parts = product(Wt, x.U), product(Wt, x.C), {"causes": causes}
         # Past values and causes are coordinates on the rows of the square root, and so have to be
         # multiplied by the same matrix as U and C.
         if x.past.shape[2]:
             parts["past"] = past = Wt @ x.past
             parts["dpast"] = x.dpast + (row @ past)[:, 0]
         if causes.shape[2]:
-            parts["causes"] = Wt @ causes
-        da, du = x.da + (row @ C)[:, 0], x.du + (row @ U)[:, 0]
+            parts["causes"] = product(Wt, causes)
+        da, du = x.da + product(row, C)[:, 0], x.du + product(row, U)[:, 0]
         return parts | {"da": da, "du": du, "U": U, "C": C}, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:

@@ -9,7 +9,7 @@ import numpy as np
 
 from livepde.linalg import Array, Mask
 
-__all__ = ["changed", "join", "put", "take", "where", "zeros"]
+__all__ = ["changed", "join", "product", "put", "take", "where", "zeros"]
 
 State = TypeVar("State")
 
@@ -22,6 +22,11 @@ def changed(state: State, **parts: Any) -> State:
     new.__dict__.update(state.__dict__)
     new.__dict__.update(parts)
     return new
+
+
+def product(one: Array, other: Array) -> Array:
+    """Return the product of stacks of matrices, (members, ., .): a call for one costs less."""
+    return one[0].dot(other[0])[None] if len(one) == 1 else one @ other
 
 
 def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:

@@ -29,7 +29,7 @@ from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take, where
+from livepde.laws.member_arrays import changed, product, put, take, where
 from livepde.laws.process_noise import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
@@ -683,15 +683,15 @@ class ShadowSet:
         s = x.shadows
         # K^T = `gain` [U C], with the rows of the new square root.
         gain = weights[:, :, None] * left.swapaxes(1, 2)  # (members, sensors, r)
-        half = off @ gain
-        parts = {"u": s.u - half @ U, "a": s.a - half @ C}
+        half = product(off, gain)
+        parts = {"u": s.u - product(half, U), "a": s.a - product(half, C)}
         since = t - s.begun
         if s.gains.size and np.count_nonzero(since):
             # A sample multiplies the effect of earlier ones by I - K H, for which the share of the
             # variance that it leaves stands: the full product would need a matrix for each sensor.
             share = np.add.reduce(C * C, axis=1)
             share /= np.maximum(np.add.reduce(x.C * x.C, axis=1), TINY)
-            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ C)
+            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * product(gain, C)
         return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
@@ -754,7 +754,9 @@ def _watch_rate(
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
     count, differs = s.count + 1, np.sqrt(np.add.reduce(more * more, axis=1))
-    most = np.where(count > CALM + 1, JUMP * s.usual, np.inf)  # in the first steps none is known
+    most, early = JUMP * s.usual, count <= CALM + 1
+    if np.count_nonzero(early):  # in the first steps none is known
+        most = np.where(early, np.inf, most)
     jumps = differs > most
     # A jump does not count as usual.
     weight = WEIGHTS[np.minimum(count, USUAL)]

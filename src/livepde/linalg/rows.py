@@ -12,8 +12,8 @@ from livepde.linalg.types import Array
 
 __all__ = ["RowProduct", "row_product"]
 
-# Entries up to which a dense product costs less than one by diagonals.
-DENSE = 2_500
+# Entries up to which a dense product costs less than one by diagonals, and than a sparse one.
+DENSE, WIDE = 2_500, 10_000
 # Diagonals up to which they cost less than a sparse product.
 MOST_DIAGONALS = 5
 
@@ -27,12 +27,13 @@ def row_product(matrix: sp.csr_array) -> RowProduct:
     Rows are in C order, and so is the result.
     """
     m, n = matrix.shape
-    if m * n <= DENSE:
-        transposed = np.ascontiguousarray(matrix.toarray().T)
-        return lambda x: np.asarray(x.dot(transposed))
     places = matrix.tocoo()
     offsets = np.unique(places.col - places.row).tolist()
-    if m == n and 0 in offsets and len(offsets) <= MOST_DIAGONALS:
+    banded = m == n and 0 in offsets and len(offsets) <= MOST_DIAGONALS
+    if m * n <= (DENSE if banded else WIDE):
+        transposed = np.ascontiguousarray(matrix.toarray().T)
+        return lambda x: np.asarray(x.dot(transposed))
+    if banded:
         return _by_diagonals({k: matrix.diagonal(k) for k in offsets})
     return lambda x: np.ascontiguousarray(matrix.dot(x.T).T)
 
