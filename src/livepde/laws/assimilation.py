@@ -202,7 +202,7 @@ def absorb(
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
     sizes = np.abs(d)
-    worst = float(np.fmax.reduce(sizes, axis=None, initial=0.0))
+    worst = float(np.fmax.reduce(sizes, axis=None))
     variance = 1.0 + np.add.reduce(Y * Y, axis=1)
     e = d / np.sqrt(variance)
     shadows, off, shift = filter_.shadows, None, None

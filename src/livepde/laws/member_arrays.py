@@ -19,8 +19,7 @@ def changed(state: State, **parts: Any) -> State:
     # Neither __init__ nor __post_init__ runs, and a cached property would be copied with the
     # fields: states have none.
     new: State = object.__new__(type(state))
-    new.__dict__.update(state.__dict__)
-    new.__dict__.update(parts)
+    object.__setattr__(new, "__dict__", {**state.__dict__, **parts})
     return new
 
 

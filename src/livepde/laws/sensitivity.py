@@ -387,7 +387,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not usual.any():
                 return (new if len(state) > 1 else state), reports
         due = new.assimilated >= new.due
-        if work.fits and work.window:  # samples without a reading need room, too
+        if work.fits and 0 < work.window < new.log.shape[1]:  # samples without a reading need room
             due = due | (new.log.shape[1] - new.window > work.window)
         if np.count_nonzero(due):
             new, moved = refit_due(work, new, due)

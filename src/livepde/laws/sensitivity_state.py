@@ -296,7 +296,8 @@ def stored(
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken)
     # A sensor that is set aside brings no measurements, from the first one that misfitted on.
-    if (aside := now.screened.aside & taken[:, None]).any():
+    if np.count_nonzero(now.screened.aside):
+        aside = now.screened.aside & taken[:, None]
         log = withdrawn(log, aside, now.screened.since)
     parts["log"] = log
     if work.window:

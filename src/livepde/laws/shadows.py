@@ -682,8 +682,8 @@ class ShadowSet:
         """
         s = x.shadows
         # K^T = `gain` [U C], with the rows of the new square root.
-        gain = weights[:, :, None] * left.swapaxes(1, 2)  # (members, sensors, r)
-        half = product(off, gain)
+        gain = left.swapaxes(1, 2)  # (members, sensors, r), in units of the noise
+        half = product(off * weights[:, None], gain)
         parts = {"u": s.u - product(half, U), "a": s.a - product(half, C)}
         since = t - s.begun
         if s.gains.size and np.count_nonzero(since):
@@ -691,7 +691,8 @@ class ShadowSet:
             # variance that it leaves stands: the full product would need a matrix for each sensor.
             share = np.add.reduce(C * C, axis=1)
             share /= np.maximum(np.add.reduce(x.C * x.C, axis=1), TINY)
-            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * product(gain, C)
+            gained = (weights * since[:, None])[:, :, None] * product(gain, C)
+            parts["gains"] = share[:, None] * s.gains + gained
         return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:

@@ -165,9 +165,11 @@ class BandedStage(MemberStage):
         # product with the others. Each column is solved by itself, however many there are.
         new, rows = np.empty(columns.shape), columns.reshape(-1, n)
         known, together = new.reshape(-1, n), (len(columns) - stage.apart) * size
-        known[:together] = self._mass(rows[:together])
-        if stage.apart:
-            known[together:] = self._mass(rows[together:])
+        if self._mass.separate or not stage.apart:
+            self._mass(rows, known)
+        else:
+            self._mass(rows[:together], known[:together])
+            self._mass(rows[together:], known[together:])
         u = known[:size]
         if step.forced is not None:
             base, changes = step.forced

@@ -156,22 +156,26 @@ class Judge:
         reached = ledger.reached[:, 1] >= sample.at.t
         if self.answered(members) and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
-        row, at = np.zeros((members, self.numbers)), self._at  # of what is lacking zeros
+        rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
+        alone = members == 1
+        row = rows[:, int(waiting[0])] if alone else np.empty((members, self.numbers))
         row[:, 0] = sample.at.t
         for name in ("used", "d", "noise", "z", "predicted"):
             row[:, at[name]] = getattr(sample, name)
         for name, part in (("Y", sample.Y), ("M", M)):
-            start = at[name].start
+            start, stop = at[name].start, at[name].stop
             row[:, start : start + part[0].size] = part.reshape(members, -1)
+            row[:, start + part[0].size : stop] = 0.0  # rows that a square root lacks
         if self.dictionary.shifts is not None:
             row[:, at["moved"]] = self.dictionary.shifts.of_readings(sample.u)
         if self.terms:  # interpolated later on, many at once
             row[:, at["answers"]] = np.nan
-        if self.recorded and sample.C.shape[1] == self.unknowns:
-            row[:, at["a"]] = sample.a()
-            row[:, at["C"]] = sample.C.reshape(members, -1)
-        rows = ledger.rows.copy()
-        rows[np.arange(members), ledger.waiting] = row
+        if self.recorded:
+            known = sample.C.shape[1] == self.unknowns
+            row[:, at["a"]] = sample.a() if known else 0.0
+            row[:, at["C"]] = sample.C.reshape(members, -1) if known else 0.0
+        if not alone:
+            rows[np.arange(members), waiting] = row
         # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
         # [U C].
         one = self._eye[:, :r]
