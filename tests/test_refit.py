@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+import threading
 from functools import cache
 from typing import Any
 
@@ -13,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.special import erfc, erfcx
 
 import livepde as lp
+from livepde.laws import refit_apart
 from livepde.laws.refit import refitted
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import heat
@@ -287,3 +290,98 @@ def test_a_fit_that_leaves_out_many_readings_says_so():
     assert "left out" in said.text
     clean = column((0.3, 0.1, 0.05, 0.03)).run(stream()).last
     assert not [one for one in clean.verdict.findings if one.what == "fit"]
+
+
+# --- apart from the samples ---------------------------------------------------------------------
+
+
+def rod_samples(seed: int = 0, count: int = 160) -> list[tuple[float, dict[str, float]]]:
+    """Readings of a rod with insulated ends, from the series of its exact solution."""
+    rng, times = np.random.default_rng(seed), np.linspace(0.02, 4.0, count)
+    exact = {name: np.cos(np.pi * x) * np.exp(-0.23 * np.pi**2 * times) for name, x in PLACES}
+    noisy = {name: 20.0 * u + 0.05 * rng.standard_normal(count) for name, u in exact.items()}
+    return [(t, {name: float(z[k]) for name, z in noisy.items()}) for k, t in enumerate(times)]
+
+
+PLACES = (("a", 0.3), ("b", 0.6))
+
+
+def insulated(**options: Any) -> lp.Identifier:
+    model = heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.07))
+    sensors = lp.Points(dict(PLACES), noise=0.05)
+    law = lp.SensitivityLaw(refit=lp.Refit(**options))
+    return lp.Identifier(model, sensors, law, u0=lambda x: 20.0 * np.cos(np.pi * x[0]))
+
+
+def numbers_of(identifier: lp.Identifier, items: Any) -> np.ndarray:
+    found = []
+    for t, z in items:
+        estimate = identifier.step(t, z)
+        found.append([estimate.belief.q[0], estimate.belief.q_std[0]])
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_a_refit_apart_goes_on_from_where_one_at_once_would():
+    samples = rod_samples()
+    apart, at_once = insulated(apart=True), insulated()
+    beside, direct = numbers_of(apart, samples), numbers_of(at_once, samples)
+    assert np.array_equal(beside[:127], direct[:127])
+    # The fit of 128 samples is used from sample 144 on, and the 16 since are taken by sample 151.
+    assert not np.array_equal(beside[128:150], direct[128:150])
+    # From the same fit on, both have taken the same samples: the noise of rounding,
+    # and that of fits that end within a tenth of a standard deviation.
+    assert np.abs(beside[152:, 0] - direct[152:, 0]).max() < 0.1 * direct[100, 1]
+    assert apart.refit().belief.q[0] == pytest.approx(
+        at_once.refit().belief.q[0], abs=0.05 * direct[-1, 1]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [130, 143, 147, 150])
+def test_a_refit_apart_survives_restarts_and_copies(at: int):
+    samples = rod_samples()
+    whole = numbers_of(insulated(apart=True), samples)
+    first, second = insulated(apart=True), insulated(apart=True)
+    before = numbers_of(first, samples[:at])
+    second.restore(first.dump())
+    twin = copy.deepcopy(first)
+    for one in (first, second, twin):
+        assert np.array_equal(np.concatenate([before, numbers_of(one, samples[at:])]), whole)
+
+
+def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatch):
+    """A fit that has not ended holds no sample up before it is due."""
+    ends = threading.Event()
+    fit = refit_apart.refitted_now
+
+    def slowly(*given: Any) -> Any:
+        assert ends.wait(60.0)
+        return fit(*given)
+
+    monkeypatch.setattr(refit_apart, "refitted_now", slowly)
+    identifier, samples = insulated(apart=True), rod_samples()
+    numbers_of(identifier, samples[:143])  # that of 128 samples is due with sample 144
+    ends.set()
+    numbers_of(identifier, samples[143:])
+
+
+@pytest.mark.slow
+def test_an_error_in_a_refit_apart_reaches_who_steps(monkeypatch: pytest.MonkeyPatch):
+    def broken(*given: Any) -> Any:
+        raise ValueError("of a form")
+
+    monkeypatch.setattr(refit_apart, "refitted_now", broken)
+    with pytest.raises(ValueError, match="of a form"):
+        numbers_of(insulated(apart=True), rod_samples())
+
+
+def test_readings_withdrawn_while_a_refit_is_under_way_are_not_in_it():
+    """A sensor that is set aside meanwhile brings no reading, from its first misfit on."""
+    samples = rod_samples()
+    broken = [
+        (t, {**z, "b": z["b"] + (3.0 if k >= 60 else 0.0)}) for k, (t, z) in enumerate(samples)
+    ]
+    identifier = insulated(apart=True)
+    numbers = numbers_of(identifier, broken)
+    assert abs(numbers[-1, 0] - 0.23) < 5.0 * numbers[-1, 1]

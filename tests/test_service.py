@@ -376,9 +376,9 @@ def test_dates_without_a_zone_are_of_the_zone_that_the_case_names(here):
 def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
     begin = cases.Case.begin
 
-    def begins(*arguments):
+    def begins(*arguments, **options):
         signal.raise_signal(signal.SIGINT)
-        return begin(*arguments)
+        return begin(*arguments, **options)
 
     class Health(beside._LiveHealth):
         def __setattr__(self, name, value):

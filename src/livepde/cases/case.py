@@ -63,6 +63,8 @@ class Prepared:
         Date of t = 0, if the data have dates.
     raw
         The table as read, with its gaps; None for a stream.
+    live
+        True for a run that waits for its source.
     """
 
     case: Case
@@ -71,11 +73,13 @@ class Prepared:
     assimilate_from: float
     origin: datetime | None
     raw: DataTable | None = None
+    live: bool = False
 
     @cached_property
     def identifier(self) -> Identifier:
         """The identifier, before the first sample."""
-        identifier = self.identifier_with(self.case.law)
+        law = self.case.law
+        identifier = self.identifier_with(law.live() if self.live else law)
         if self.case.spec.output.smoothed and (why := identifier.unsmoothed):
             raise self.case.error("output.smoothed", f"{why}; leave it out.")
         return identifier
@@ -393,7 +397,9 @@ class Case(CaseContent):
             return self.live
         return self.spec.data.follow and data != "-" and not data.endswith(".parquet")
 
-    def begin(self, first: Sample, origin: datetime | None = None) -> Prepared:
+    def begin(
+        self, first: Sample, origin: datetime | None = None, *, live: bool = False
+    ) -> Prepared:
         """Return the case with the first sample of a live process.
 
         Parameters
@@ -402,6 +408,8 @@ class Case(CaseContent):
             The first sample, which gives the initial state and inputs.
         origin
             The date of t = 0, if times are dates.
+        live
+            True for a run that waits for its source.
 
         Raises
         ------
@@ -409,6 +417,6 @@ class Case(CaseContent):
             The sample lacks values needed for the initial state or inputs.
         """
         start = assimilation_start(self, self.clock, origin)
-        prepared = Prepared(self, first, (), start, origin)
+        prepared = Prepared(self, first, (), start, origin, live=live)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared

@@ -159,7 +159,7 @@ class LiveCase:
         irregular: dict[tuple[str, str], Remark] = {}
         if self._journal is not None and self._journal.first is not None:
             first = self._journal.first
-            self.prepared = self.case.begin(Sample(t=first.t, z=first.values), self._start)
+            self.prepared = self._prepared(Sample(t=first.t, z=first.values))
         else:
             found = self._begun(stopping, irregular)
             if found is None:
@@ -189,6 +189,10 @@ class LiveCase:
             LOG.info("goes on after %d samples, %d of them taken again", len(live.result), again)
         return live
 
+    def _prepared(self, first: Sample) -> Prepared:
+        """Return the case with its first sample; rows that were all read at once are not live."""
+        return self.case.begin(first, self._start, live=self._intake is not None)
+
     @property
     def _start(self) -> datetime | None:
         """The date of t = 0, if times are dates; known after the first row."""
@@ -215,7 +219,7 @@ class LiveCase:
             while found and not self._too_few(found):
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 try:
-                    return self.case.begin(Sample(t=found[0].t, z=values), self._start), found
+                    return self._prepared(Sample(t=found[0].t, z=values)), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
                 self.why = f"the run cannot begin yet: {why}"

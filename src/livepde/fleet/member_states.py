@@ -99,6 +99,9 @@ class JoinedStates:
 
     def _put_leaf(self, which: IntArray, path: str, new: Array) -> None:
         leaf = self._leaves[path]
+        if not len(new):  # there is nothing of any member
+            self._leaves[path] = new
+            return
         if path in self._once:  # stored once as long as no member differs
             if leaf.shape[1:] == new.shape[1:] and np.array_equal(
                 np.broadcast_to(leaf, new.shape), new, equal_nan=leaf.dtype.kind == "f"
@@ -131,7 +134,7 @@ class JoinedStates:
         other._leaves = {path: leaves[path] for path in self._leaves}
         lengths = {path: len(leaf) for path, leaf in other._leaves.items()}
         other._once = {path for path, length in lengths.items() if length < self._count}
-        if {len(other._rows), len(other._log), *lengths.values()} - {1, self._count}:
+        if {len(other._rows), len(other._log), *lengths.values()} - {0, 1, self._count}:
             raise ValueError(f"states of other than {self._count} members")
         if self._count == 1:
             other._once = set()
@@ -140,8 +143,10 @@ class JoinedStates:
 
 
 def _repeated(leaf: Array, length: int) -> Array:
-    """Return a leaf of one member as that of several."""
-    return leaf if length == 1 else np.broadcast_to(leaf, (length, *leaf.shape[1:]))
+    """Return a leaf of one member as that of several; one without members stays so."""
+    return (
+        leaf if length == 1 or not len(leaf) else np.broadcast_to(leaf, (length, *leaf.shape[1:]))
+    )
 
 
 def _widened(array: Array, room: int, value: float) -> Array:

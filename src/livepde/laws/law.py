@@ -424,6 +424,13 @@ class Law(ABC, Generic[Work, State]):
         """Return the state after a fit of all stored samples; here the same state."""
         return state
 
+    def live(self) -> Law[Work, State]:
+        """Return the law for a run that waits for its source; here the same.
+
+        A law that now and then computes for long does that beside the samples there.
+        """
+        return self
+
     def fit(self, work: Work, state: State) -> Fit | None:
         """Return the last fit of all stored samples, None for a law without."""
         return None

@@ -1,15 +1,18 @@
-"""States of several members: dataclasses of arrays whose leading axis is the members."""
+"""States of several members: dataclasses of arrays whose leading axis is the members.
+
+Arrays without members hold what no member has, and stay so.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 
 from livepde.linalg import Array, Mask
 
-__all__ = ["changed", "join", "product", "put", "take", "where", "zeros"]
+__all__ = ["changed", "join", "product", "put", "put_each", "take", "where", "zeros"]
 
 State = TypeVar("State")
 
@@ -54,7 +57,7 @@ def take(state: State, which: Any) -> State:
     if isinstance(which, int) and _members(state) == 1:
         return state
     index = [which] if isinstance(which, int) else which
-    taken: State = _each(lambda array: array[index], state)
+    taken: State = _each(lambda array: array[index] if len(array) else array, state)
     return taken
 
 
@@ -78,6 +81,8 @@ def put(state: State, which: Any, part: State) -> State:
     index = [which] if isinstance(which, int) else which
 
     def exchanged(array: Array, new: Array) -> Array:
+        if not len(array):
+            return array
         array, new = _widened((array, new))
         result = array.copy()
         result[index] = new
@@ -85,6 +90,13 @@ def put(state: State, which: Any, part: State) -> State:
 
     whole: State = _each(exchanged, state, part)
     return whole
+
+
+def put_each(state: State, parts: Mapping[int, State]) -> State:
+    """Return a state with some members exchanged: all at once, since each copies all members."""
+    if len(parts) < 2:
+        return next((put(state, k, one) for k, one in parts.items()), state)
+    return put(state, np.array([*parts]), join(*parts.values()))
 
 
 def where(chosen: Mask, state: State, other: State) -> State:
@@ -95,6 +107,8 @@ def where(chosen: Mask, state: State, other: State) -> State:
         return other
 
     def either(one: Array, two: Array) -> Array:
+        if not len(one):
+            return one
         one, two = _widened((one, two))
         return np.where(chosen.reshape(-1, *(1,) * (one.ndim - 1)), one, two)
 

@@ -6,16 +6,23 @@ import numpy as np
 
 from livepde.laws.filter_state import FilterState
 from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.refit import Found, refitted
 from livepde.laws.refit_options import Refit
-from livepde.laws.sensitivity_state import FitState, SensitivityState, SensitivityWork, new_window
+from livepde.laws.sensitivity_state import (
+    FitState,
+    Fork,
+    SensitivityState,
+    SensitivityWork,
+    new_window,
+)
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, Mask, nonfinite_allowed
 
-__all__ = ["refit_due", "settle"]
+__all__ = ["refit_due", "refitted_now", "settle"]
 
+AT_ONCE = 64  # samples up to which a refit takes no thread of its own: it is as short as ten steps
 NEAR = 1.0  # standard deviations within which a refit that another one follows keeps these sums
 
 
@@ -27,6 +34,7 @@ def refit_due(
         return iterate_starts(work, state, due)
     if (options := work.refit) is None:
         return state, None
+    each: dict[int, SensitivityState] = {}
     for k in np.flatnonzero(due).tolist():
         one = take(state, k)
         count = int(one.assimilated[0])
@@ -34,12 +42,14 @@ def refit_due(
             one = new_window(work, one.now, one)
         else:
             # A window but the first begins with what is known: it has nothing to search for.
-            if count <= options.start:
-                one = _refitted(work, options, one)
+            if count <= options.start and options.apart and len(state) == 1 and count > AT_ONCE:
+                one = changed(one, fork=Fork.of(one))
+            elif count <= options.start:
+                one = refitted_now(work, options, one)
             later = 2 * count if 2 * count <= options.start else options.window
             one = changed(one, due=np.array([later]))
-        state = put(state, k, one)
-    return state, None
+        each[k] = one
+    return put_each(state, each), None
 
 
 @nonfinite_allowed()  # such a trajectory is refused
@@ -51,6 +61,7 @@ def settle(
     Those of the last samples of each member, (samples, sensors); None of one that is not fitted.
     """
     used: list[Mask | None] = [None] * len(state)
+    each: dict[int, SensitivityState] = {}
     options = work.refit
     if options is None or not work.fits:
         return state, used
@@ -60,11 +71,14 @@ def settle(
             samples = StoredSamples.of(work, one)
             found = refitted(samples, options, last=True)
             used[k] = None if found is None else found.used
-            state = put(state, k, _after(work, one, samples, found, last=True))
-    return state, used
+            one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
+            each[k] = _after(work, one, samples, found, last=True)
+    return put_each(state, each), used
 
 
-def _refitted(work: SensitivityWork, options: Refit, state: SensitivityState) -> SensitivityState:
+def refitted_now(
+    work: SensitivityWork, options: Refit, state: SensitivityState
+) -> SensitivityState:
     """Return one member after a refit that another one follows."""
     samples = StoredSamples.of(work, state)
     return _after(work, state, samples, refitted(samples, options, last=False), last=False)

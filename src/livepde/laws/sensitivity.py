@@ -29,15 +29,17 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, join, put, take, where
+from livepde.laws.member_arrays import changed, join, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
+from livepde.laws.refit_apart import go_on
 from livepde.laws.refit_options import Refit
 from livepde.laws.refits import refit_due, settle
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,
+    Fork,
     Scale,
     SensitivityState,
     SensitivityWork,
@@ -280,6 +282,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             assimilated=zero,
             due=np.array([1 if work.window else NEVER]),
             fit=FitState.none(),
+            fork=Fork.none(x),
             older=x,
             newer=x,
             since_older=zero,
@@ -396,6 +399,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 reports = reports.updated(
                     moved.each(lambda number: np.where(taken, number, np.nan))
                 )
+        if len(new.fork):
+            new = go_on(work, new)
         return shortened(work, new), reports
 
     def _together(
@@ -448,19 +453,19 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> tuple[SensitivityState, MemberReports]:
         """Return state and reports after those members that are not `usual` have stepped alone."""
         alone: dict[int, Report] = {}
-        parts: list[SensitivityState] = []
+        each: dict[int, SensitivityState] = {}
         for k in np.flatnonzero(~usual).tolist():
             one, alone[k] = step_alone(work, take(state, k), span.member(k))
             # The members share the rows of one log: whoever failed has an empty row there.
             while work.keeps_log and one.log.shape[1] <= state.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
-            parts.append(one)
-        if usual.any():
-            for k, one in zip(alone, parts, strict=True):
-                new = put(new, k, one)
-        else:
-            new = join(*parts) if len(parts) > 1 else parts[0]
-        return new, reports.with_members(alone)
+            each[k] = one
+        return put_each(new, each), reports.with_members(alone)
+
+    def live(self) -> SensitivityLaw:
+        if self.refit is None or self.refit.apart is not None:
+            return self
+        return replace(self, refit=replace(self.refit, apart=True))
 
     def fit(self, work: SensitivityWork, state: SensitivityState) -> Fit | None:
         return state.fit.member(0)

@@ -17,7 +17,7 @@ from livepde.laws.guards import Guards
 from livepde.laws.history import added, trimmed, withdrawn
 from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import Fit, InitialReading
-from livepde.laws.member_arrays import changed, where, zeros
+from livepde.laws.member_arrays import changed, take, where, zeros
 from livepde.laws.refit_options import Refit
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
@@ -27,6 +27,7 @@ from livepde.stepping import Span
 __all__ = [
     "NEVER",
     "FitState",
+    "Fork",
     "Scale",
     "SensitivityState",
     "SensitivityWork",
@@ -129,6 +130,8 @@ class SensitivityState:
         Samples used since, and at how many they are taken again; `NEVER`: they never are.
     fit
         The last refit.
+    fork
+        A refit under way beside the samples.
     older, newer, since_older, since_newer
         Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     log
@@ -147,6 +150,7 @@ class SensitivityState:
     assimilated: IntArray
     due: IntArray
     fit: FitState
+    fork: Fork
     older: FilterState
     newer: FilterState
     since_older: IntArray
@@ -210,6 +214,44 @@ class FitState:
             refused=int(self.refused[k]),
             converged=bool(self.converged[k]),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Fork:
+    """A refit under way beside the samples; arrays without members where there is none.
+
+    Attributes
+    ----------
+    filter
+        The filter where the refit began; after it that which is to take the samples since.
+    samples
+        How many samples are fitted, shape (1,).
+    row
+        Row of the log that the filter has taken last, shape (1,).
+    fitted
+        True once the refit has ended, shape (1,).
+    """
+
+    filter: FilterState
+    samples: IntArray
+    row: IntArray
+    fitted: Mask
+
+    @classmethod
+    def none(cls, x: FilterState) -> Fork:
+        """Return the value while no refit is under way."""
+        nothing = np.zeros(0, dtype=np.int64)
+        return cls(take(x, nothing), samples=nothing, row=nothing, fitted=nothing.astype(bool))
+
+    @classmethod
+    def of(cls, state: SensitivityState) -> Fork:
+        """Return the value where a refit of all stored samples of one member begins."""
+        row = np.array([state.log.shape[1] - 1])
+        no = np.zeros(1, dtype=bool)
+        return cls(state.now, samples=state.assimilated, row=row, fitted=no)
+
+    def __len__(self) -> int:
+        return len(self.samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,7 +340,10 @@ def stored(
     # A sensor that is set aside brings no measurements, from the first one that misfitted on.
     if np.count_nonzero(now.screened.aside):
         aside = now.screened.aside & taken[:, None]
-        log = withdrawn(log, aside, now.screened.since)
+        kept = withdrawn(log, aside, now.screened.since)
+        if len(state.fork) and _differ(kept, log, int(state.fork.row[0])):
+            parts |= {"fork": Fork.none(now), "due": state.assimilated}
+        log = kept
     parts["log"] = log
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
@@ -319,6 +364,13 @@ def stored(
     return changed(state, now=now, **parts)
 
 
+def _differ(log: Array, other: Array, row: int) -> bool:
+    """Return whether two logs have other readings up to a row, for a refit that is under way."""
+    if log is other:
+        return False
+    return not np.array_equal(log[:, : row + 1], other[:, : row + 1], equal_nan=True)
+
+
 def _windows_from(
     state: SensitivityState, now: FilterState, row: int, begun: Mask
 ) -> dict[str, Any]:
@@ -335,6 +387,7 @@ def _windows_from(
         "assimilated": np.where(begun, zero, state.assimilated),
         "due": np.where(begun, zero + 1, state.due),
         "fit": where(begun, FitState.none(len(begun)), state.fit),
+        "fork": Fork.none(now),
     }
 
 
@@ -355,6 +408,7 @@ def shortened(work: SensitivityWork, state: SensitivityState) -> SensitivityStat
         state,
         log=trimmed(state.log, first),
         window=np.maximum(state.window - first, 0),
+        fork=changed(state.fork, row=state.fork.row - first),
         since_older=state.since_older - first,
         since_newer=state.since_newer - first,
     )
@@ -429,6 +483,7 @@ def new_window(
         assimilated=zero,
         due=zero + (1 if work.window else NEVER),
         fit=FitState.none(),
+        fork=Fork.none(start),
     )
 
 
