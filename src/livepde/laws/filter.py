@@ -218,10 +218,12 @@ class Filter:
         self, x: FilterState, span: Span
     ) -> tuple[FilterState, FilterState, Steps, StepFailed | None]:
         """Return the state at the start with the rate that the step needs, and as `carried`."""
+        if not self.moves:
+            return x, *self._through(x, span, [span.t1])
         length, more = span.t1 - span.start, True
         while more:
             end, taken, failure = self.carried(x, span)
-            if failure is not None or not self.moves:
+            if failure is not None:
                 break
             rate = np.maximum(x.rate, end.rate)
             more = bool((grades(rate, length) > grades(x.rate, length)).any())
