@@ -34,7 +34,7 @@ from livepde.observation import Points
 from livepde.runs.outcome import Check, Outcome, Table
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
-__all__ = ["EARLIER", "RODS", "SIZES", "Rod", "fleet", "lean_forward", "rods"]
+__all__ = ["EARLIER", "RODS", "SIZES", "Rod", "fleet", "forward_times", "lean_forward", "rods"]
 
 SIZES = (31, 200, 1_000, 10_000)
 SQUARE = 10_000  # nodes, from which the process is a square
@@ -151,7 +151,7 @@ def _law(given: Rod, samples: Sequence[Any]) -> list[float]:
     return spent
 
 
-def _forward(given: Rod, count: int) -> list[float]:
+def forward_times(given: Rod, count: int) -> list[float]:
     """Time forward steps of the model at its prior."""
     states, spent = given.forward(given.model.latent.prior, count), []
     next(states)
@@ -237,7 +237,7 @@ def _timed(given: Rod, runs: int, first: int) -> Iterator[tuple[Row, Check | Non
         spent[SENSITIVITY].append(_law(given, samples))
         if not large:  # where a factorisation costs more than a correction it is no reference
             spent[LEAN].append(_lean(given, samples))
-        units.append(float(np.median(_forward(given, first))))
+        units.append(float(np.median(forward_times(given, first))))
         lean_units.append(float(np.median(lean_forward(given, first))))
     earlier = EARLIER.get((given.nodes, given.ends))
     for name, times in spent.items():

@@ -535,11 +535,24 @@ def test_symmetric_tridiagonal_blocks_are_solved_whether_definite_or_not(shift):
     matrices *= near
     assert (np.linalg.eigvalsh(matrices[1])[0] > 0.0) == (shift == 3.0)
     right = rng.standard_normal((2, blocks, n))
-    solver = BandedBlocks(BandedSolver(pattern))
-    x = solver.factorise(solver.band(matrices[:, *np.nonzero(near)])).solve(right.copy())
+    data = matrices[:, *np.nonzero(near)]
+    solver = BandedBlocks.of(BandedSolver(pattern), *data)
+    assert solver.symmetric
+    factor = solver.factorise(solver.band(data))
+    assert (factor.symmetric is not None) == (shift == 3.0)
+    x = factor.solve(right.copy())
     for k in range(blocks):
         wanted = np.linalg.solve(matrices[k], right[:, k].T).T
         np.testing.assert_allclose(x[:, k], wanted, rtol=1e-10)
+    data[1, 3] = np.nan  # disturbs no other block
+    x = solver.factorise(solver.band(data)).solve(right.copy())
+    assert np.isnan(x[:, 1]).all()
+    for k in (0, 2):
+        wanted = np.linalg.solve(matrices[k], right[:, k].T).T
+        np.testing.assert_allclose(x[:, k], wanted, rtol=1e-10)
+    data[1] = data[0]
+    data[0, 1] += 1e-9
+    assert not BandedBlocks.of(BandedSolver(pattern), *data).symmetric
 
 
 @pytest.mark.long

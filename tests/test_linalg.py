@@ -28,6 +28,7 @@ from livepde.linalg import (
     gmres,
     nonfinite_allowed,
     positive_definite,
+    row_product,
     sandwich,
 )
 
@@ -357,3 +358,34 @@ def test_the_error_state_of_a_thread_is_its_own():
         waits()
         assert np.geterr()["over"] == "raise"
     thread.join()
+
+
+@pytest.mark.parametrize(
+    ("shape", "offsets", "separate"),
+    [
+        ((8, 8), (-1, 0, 1), False),
+        ((90, 90), (-2, 0, 1), True),
+        ((90, 90), (-1, 1), True),
+        ((400, 300), (0, 5), False),
+        ((200, 200), range(-4, 5), False),
+    ],
+    ids=["dense", "diagonals", "no main diagonal", "sparse", "many diagonals"],
+)
+def test_a_matrix_is_multiplied_by_rows(shape, offsets, separate):
+    rng = np.random.default_rng(0)
+    matrix = sp.csr_array(
+        sp.diags_array(
+            [rng.standard_normal(shape[1]) for _ in offsets], offsets=[*offsets], shape=shape
+        )
+    )
+    product, x = row_product(matrix), rng.standard_normal((5, shape[1]))
+    assert product.separate == separate
+    wanted = x @ matrix.toarray().T
+    np.testing.assert_allclose(product(x), wanted, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(product(x[:1]), wanted[:1], rtol=0, atol=1e-13)
+    out = np.full(wanted.shape, np.nan)
+    product(x[:4], out[:4])
+    np.testing.assert_allclose(out[:4], wanted[:4], rtol=0, atol=1e-13)
+    assert np.isnan(out[4]).all()
+    if separate:
+        np.testing.assert_array_equal(product(x)[2:3], product(x[2:3]))

@@ -12,7 +12,7 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from livepde.fem import Inputs, Moment
 from livepde.laws.assimilation import absorb
-from livepde.laws.member_arrays import changed, join, put, take, where
+from livepde.laws.member_arrays import changed, join, put, put_each, take, where
 from livepde.linalg import Array
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, Span, StageOfMembers
 from livepde.stepping.banded_stage import DrivenVector
@@ -77,6 +77,21 @@ def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, m
         kept = KeptFactors.none(1).member(0)
         wanted, _ = forward.advance(columns[:, k].T, q[k], directions[k].T, 0.1, moment, kept)
         np.testing.assert_allclose(new[:, k].T, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+def test_stages_that_share_factors_have_their_own_directions():
+    """As for unknowns that move: the process noise of a stage is that of its time."""
+    model, rng = MODELS["source in time"], np.random.default_rng(0)
+    stage, at = BandedStage(model), Moments(t=0.7, channels=(), inputs=np.zeros((1, 0)))
+    columns, q = rng.standard_normal((4, 1, model.X.dim)), np.array([[0.2, 0.5]])
+    columns[1:, :, model.state_space.fixed] = 0.0
+    shared: dict[float, Any] = {}
+    for apart in (0, 1, 2):
+        directions = rng.standard_normal((1, 3, 2))
+        parts = np.zeros(1, dtype=int), q, directions, 0.1, at, stage.kept(1), np.zeros(1, bool)
+        found, _ = stage.advance(columns, StageOfMembers(*parts, shared, apart))
+        wanted, _ = stage.advance(columns, StageOfMembers(*parts, {}, apart))
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_other_stages_step_members_one_by_one():
@@ -152,6 +167,11 @@ def test_members_are_taken_put_and_joined_and_square_roots_widened():
     assert mixed.value.tolist() == [7.0, 1.0, 2.0]
     assert mixed.inner.root[0].tolist() == [[7.0, 7.0]] + 4 * [[0.0, 0.0]]
     assert whole.value[0] == 1.0
+    both = {2: state(1, 1, 8.0), 0: state(1, 2, 7.0)}
+    assert put_each(whole, both).value.tolist() == [7.0, 1.0, 8.0]
+    assert put_each(whole, both).inner.root[:, 1, 0].tolist() == [7.0, 1.0, 0.0]
+    assert put_each(whole, {0: both[0]}).value.tolist() == [7.0, 1.0, 2.0]
+    assert put_each(whole, {}) is whole
     chosen = np.array([True, False, False])
     assert where(chosen, mixed, whole).value.tolist() == [7.0, 1.0, 2.0]
     assert where(~chosen, mixed, whole).value.tolist() == [1.0, 1.0, 2.0]

@@ -505,8 +505,7 @@ class Identifier:
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names = self.withheld.names if self.withheld is not None else ()
         inputs = self._channels.inputs
-        silent = not np.count_nonzero(gaps.counts[1:]) and not gaps.unstated.any()
-        if not names and not steps.failed and silent:
+        if not names and not steps.failed and gaps.silent:
             return judge
 
         def found() -> Verdict:

@@ -18,7 +18,7 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
-from livepde.verdict import Judge, ScoredSample
+from livepde.verdict import Judge, Ledger, ScoredSample
 
 __all__ = [
     "OK",
@@ -202,16 +202,16 @@ def absorb(
     # From here on in units of the noise: variance of an innovation 1 + |Y|^2.
     Y, d = Y / noise[:, None], d / noise
     sizes = np.abs(d)
-    worst = float(np.fmax.reduce(sizes, axis=None, initial=0.0))
-    variance = 1.0 + (Y * Y).sum(axis=1)
+    worst = float(np.fmax.reduce(sizes, axis=None))
+    variance = 1.0 + np.add.reduce(Y * Y, axis=1)
     e = d / np.sqrt(variance)
-    shadows, off = filter_.shadows, None
-    told, shift = d, np.zeros_like(d)
+    shadows, off, shift = filter_.shadows, None, None
+    told = d
     if shadows is not None:
         x, off = shadows.in_readings(x, at)
         # Shifts of the innovations by the known discretisation error have a finding of their own:
         # neither the gate nor the verdict may count them again.
-        shift = off[:, shadows.counted].sum(axis=1) / noise
+        shift = np.add.reduce(off[:, shadows.counted], axis=1) / noise
         told = d + shift
     newest = anchored = None
     parts: dict[str, Any] = {}
@@ -221,10 +221,11 @@ def absorb(
         whole = bool(used.all())
         e = np.where(used, e, np.nan)
     elif options.gate.beyond < math.inf:
-        expected = d / np.sqrt(variance + shift * shift)
-        screened, pause = x.screened.paused(span.t1 - np.asarray(span.t0))
-        far = _far(x, e, np.where(pause[:, None], e, expected), used, options.gate.beyond)
-        z = np.broadcast_to(span.z1, used.shape)  # members may share one sample
+        screened, pause = x.screened.paused(span.t1 - span.t0)
+        far = _far(x, e, d, variance, shift, pause, used, options.gate.beyond)
+        z = span.z1
+        if z.shape != used.shape:  # members may share one sample
+            z = np.broadcast_to(z, used.shape)
         if far is None:
             parts["screened"] = screened.fitted(z, used)
         else:
@@ -237,19 +238,22 @@ def absorb(
         d, told = np.where(used, d, 0.0), np.where(used, told, 0.0)
         Y = np.where(used[:, None], Y, 0.0)
         off = None if off is None else np.where(used[:, None], off, 0.0)
-    if filter_.judge is not None:
-        x = _judged(filter_.judge, filter_, x, Y, told, used, noise, predicted, span)
+    causes, judge = x.causes, filter_.judge
+    if judge is not None:
+        causes, parts["ledger"] = _judged(judge, filter_, x, Y, told, used, noise, predicted, span)
     parts["innovations"] = x.innovations.add(e, measured, newest)
-    new, made = filter_.update(x, Y, d, **parts)
-    learned: dict[str, Any] = {}
+    changes, made = filter_.update(x, Y, d, causes)
+    parts |= changes
     if options.scored:
         logs = (np.log(noise) * used).sum(axis=1)
-        learned["evidence"] = x.evidence - 0.5 * made.misfit - made.spread - logs
+        parts["evidence"] = x.evidence - 0.5 * made.misfit - made.spread - logs
     if options.adaptive:
-        learned |= _learned(x, used, d, made)
+        parts |= _learned(x, used, d, made)
     if shadows is not None and off is not None:
-        learned["shadows"] = shadows.update(x, new, made.left, used / noise, off, span.t1)
-    new = changed(new, **learned) if learned else new
+        weights = (1.0 if whole else used) / noise
+        U, C = parts["U"], parts["C"]
+        parts["shadows"] = shadows.update(x, U, C, made.left, weights, off, span.t1)
+    new = changed(x, **parts)
     if anchored is not None and anchored.any():
         new = filter_.anchor.corrected(new, innovations, anchored, at)
     # An entry of U that is not finite makes du not finite, whatever its weight. An innovation whose
@@ -260,7 +264,16 @@ def absorb(
     return new, Assimilation(predicted, steps, OK, good, refused, worst, anchored)
 
 
-def _far(x: FilterState, e: Array, expected: Array, used: Mask, beyond: float) -> Mask | None:
+def _far(
+    x: FilterState,
+    e: Array,
+    d: Array,
+    variance: Array,
+    shift: Array | None,
+    pause: Mask,
+    used: Mask,
+    beyond: float,
+) -> Mask | None:
     """Return which values do not fit; None if all do, of members that refuse no sensor.
 
     The gate is as much wider as the innovations are usually larger than expected, so that a noise
@@ -268,13 +281,18 @@ def _far(x: FilterState, e: Array, expected: Array, used: Mask, beyond: float) -
 
     Parameters
     ----------
-    e, expected
-        Normalised innovations, and those by a standard deviation that includes known errors.
+    e, d, variance
+        Normalised innovations, and innovations with their variance, in units of the noise.
+    shift
+        Known errors of the innovations, which widen the gate but after a pause; None: none.
     """
     # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
     near, quiet = np.abs(e) <= beyond, not np.count_nonzero(x.screened.refused)
     if quiet and np.count_nonzero(near) == near.size:
         return None
+    expected = e
+    if shift is not None:
+        expected = np.where(pause[:, None], e, d / np.sqrt(variance + shift * shift))
     limit = beyond * np.sqrt(np.maximum(x.innovations.ratio, 1.0))
     far: Mask = used & ~(np.abs(expected) <= limit[:, None])
     return None if quiet and not far.any() else far
@@ -296,14 +314,14 @@ def _judged(
     noise: Array,
     predicted: Array,
     span: Span,
-) -> FilterState:
-    """Return the state before an update, with the sample added to the sums of the verdict."""
+) -> tuple[Array, Ledger]:
+    """Return causes before an update and the ledger, with the sample added to the sums."""
     prior = filter_.problem.model.latent.prior
 
     def a() -> Array:
         found: Array = filter_.reduction.reduced(x.q - prior) + x.da
         if filter_.shadows is not None:
-            found = found - x.shadows.a[:, filter_.shadows.counted].sum(axis=1)
+            found -= np.add.reduce(x.shadows.a[:, filter_.shadows.counted], axis=1)
         return found
 
     def q() -> Array:
@@ -324,8 +342,7 @@ def _judged(
         noise=noise,
         at=at,
     )
-    causes, ledger = judge.add(x.ledger, sample)
-    return changed(x, causes=causes, ledger=ledger)
+    return judge.add(x.ledger, sample)
 
 
 def _learned(x: FilterState, used: Mask, d: Array, made: Update) -> dict[str, Array]:

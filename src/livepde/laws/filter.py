@@ -26,12 +26,12 @@ from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import with_input_noise
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.process_noise import NoiseRows, grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
-from livepde.linalg import Array, BlockFactor, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     Interval,
     MemberStage,
@@ -69,8 +69,7 @@ class Update(NamedTuple):
     @property
     def left(self) -> Array:
         """Return W^T Y, shape (members, r, sensors)."""
-        left: Array = self.W.transpose(0, 2, 1) @ self.Y
-        return left
+        return product(self.W.transpose(0, 2, 1), self.Y)
 
     @property
     def spread(self) -> Array:
@@ -165,9 +164,9 @@ class Filter:
 
     def _noise(self, x: FilterState, start: float, h: float) -> NoiseRows | None:
         """Return the process noise of a step; None if no coordinate gains any."""
-        drifts = self.drifts(x.member)
-        if h == 0.0 or not (self.reduction.moves or drifts.any()):
+        if h == 0.0 or not self.moves:
             return None
+        drifts = self.drifts(x.member)
         variance = np.einsum("brk,brk->bk", x.C, x.C)
         gained = self.reduction.gained(h, variance, drifts)
         # A coordinate that gains in one member has rows in all of them: members share one array.
@@ -219,10 +218,12 @@ class Filter:
         self, x: FilterState, span: Span
     ) -> tuple[FilterState, FilterState, Steps, StepFailed | None]:
         """Return the state at the start with the rate that the step needs, and as `carried`."""
+        if not self.moves:
+            return x, *self._through(x, span, [span.t1])
         length, more = span.t1 - span.start, True
         while more:
             end, taken, failure = self.carried(x, span)
-            if failure is not None or not self.moves:
+            if failure is not None:
                 break
             rate = np.maximum(x.rate, end.rate)
             more = bool((grades(rate, length) > grades(x.rate, length)).any())
@@ -282,7 +283,7 @@ class Filter:
             return np.concatenate([found, apart], axis=1)
 
         at_end = directions(end, end.C)
-        factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
+        factors: dict[float, Any] = {}  # of all stages of a step that have the same q
         begun, length = start, stop - start
 
         def begin(t: float, h: float) -> None:
@@ -333,29 +334,31 @@ class Filter:
         return noise.rate(x.rate, Y / (level * self.noise)[:, None])
 
     @staticmethod
-    def update(x: FilterState, Y: Array, d: Array, **parts: Any) -> tuple[FilterState, Update]:
-        """Return the state after a sample, and the matrices of the update.
+    def update(
+        x: FilterState, Y: Array, d: Array, causes: Array
+    ) -> tuple[dict[str, Array], Update]:
+        """Return the fields of the state after a sample, and the matrices of the update.
 
         Parameters
         ----------
         Y, d
             Observed square root, (members, r, sensors), and innovations, (members, sensors), in
             units of the noise; zero where no value is.
-        parts
-            Other fields to exchange.
+        causes
+            `FilterState.causes` before the update.
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
-        U, C = Wt @ x.U, Wt @ x.C
+        U, C, parts = product(Wt, x.U), product(Wt, x.C), {"causes": causes}
         # Past values and causes are coordinates on the rows of the square root, and so have to be
         # multiplied by the same matrix as U and C.
         if x.past.shape[2]:
             parts["past"] = past = Wt @ x.past
             parts["dpast"] = x.dpast + (row @ past)[:, 0]
-        if x.causes.shape[2]:
-            parts["causes"] = Wt @ x.causes
-        da, du = x.da + (row @ C)[:, 0], x.du + (row @ U)[:, 0]
-        return changed(x, da=da, du=du, U=U, C=C, **parts), Update(W, Y, half, misfit)
+        if causes.shape[2]:
+            parts["causes"] = product(Wt, causes)
+        da, du = x.da + product(row, C)[:, 0], x.du + product(row, U)[:, 0]
+        return parts | {"da": da, "du": du, "U": U, "C": C}, Update(W, Y, half, misfit)
 
     def remembered(self, x: FilterState) -> FilterState:
         """Return the state that follows the values of a of now also from now on."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -106,7 +106,7 @@ class Screened:
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""
         last, run, _ = self.shown(z, present)
-        return changed(self, last=last, run=run).used(z, present, present)
+        return changed(self, last=last, run=run, **self._used(z, run, present, present))
 
     def shown(self, z: Array, present: Mask) -> tuple[Array, IntArray, Mask]:
         """Return the last reading and its repetitions after a sample, and which ones it repeats."""
@@ -119,18 +119,22 @@ class Screened:
 
     def used(self, z: Array, kept: Mask, learned: Mask) -> Screened:
         """Return the value with the readings that are used in the past of their sensors."""
+        return changed(self, **self._used(z, self.run, kept, learned))
+
+    def _used(self, z: Array, run: IntArray, kept: Mask, learned: Mask) -> dict[str, Any]:
+        """Return the fields that readings change which are used; `run` is that after them."""
         if np.count_nonzero(kept) < kept.size:
             z = np.where(kept, z, np.nan)
-        parts = {"low": np.fmin(self.low, z), "high": np.fmax(self.high, z)}
+        parts: dict[str, Any] = {"low": np.fmin(self.low, z), "high": np.fmax(self.high, z)}
         # Most samples repeat nothing, come after the first ones, and in no disturbance.
-        if np.count_nonzero(self.run):
-            parts["longest"] = np.maximum(self.longest, np.where(kept, self.run, 0))
+        if np.count_nonzero(run):
+            parts["longest"] = np.maximum(self.longest, np.where(kept, run, 0))
         if self.taken.min() < SETTLED:
             parts["taken"] = np.minimum(self.taken + learned, SETTLED)
         if np.count_nonzero(self.strain):
             calm = np.where(self.apart.any(axis=1), 0, np.minimum(self.calm + 1, CALM))
             parts |= {"calm": calm, "strain": np.where(calm[:, None] < CALM, self.strain, 0)}
-        return changed(self, **parts)
+        return parts
 
 
 class Gated(NamedTuple):

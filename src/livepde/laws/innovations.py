@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from livepde.laws.member_arrays import product
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 
@@ -74,7 +75,8 @@ class Innovations:
             sensors = DECAY * before + (SHARE * np.where(seen, e, 0.0)[:, None] + GAINED)
             sensors = np.where(seen[:, None], sensors, before)
             counted = sensors * seen[:, None]
-        products = counted @ np.concatenate([sensors, before], axis=1).transpose(0, 2, 1)
+        rows = np.concatenate([sensors, before], axis=1).transpose(0, 2, 1)
+        products = product(counted, rows)
         sums = FADES * self.sums + products.reshape(len(e), -1).take(TERMS, axis=1)
         if measured is not None and not measured.all():
             sums = np.where(measured[:, None], sums, self.sums)

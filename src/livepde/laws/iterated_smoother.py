@@ -21,7 +21,7 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gauss_newton import Window, placed
 from livepde.laws.history import first_interval, intervals_since
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
@@ -66,9 +66,10 @@ def iterate_starts(
 ) -> tuple[SensitivityState, Diagnostics[Array] | None]:
     """Return all members after the iteration of those that are due, and diagnostics if one was."""
     moved = np.full(len(state), np.nan)
+    each: dict[int, SensitivityState] = {}
     for k in np.flatnonzero(due).tolist():
-        one, moved[k] = _iterated(work, take(state, k))
-        state = put(state, k, one) if len(state) > 1 else one
+        each[k], moved[k] = _iterated(work, take(state, k))
+    state = put_each(state, each)
     if np.isnan(moved).all():
         return state, None
     return state, replace(state.now.innovations.diagnostics, smoother_moved=moved)

@@ -10,7 +10,7 @@ import scipy.sparse as sp
 from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Problem
 from livepde.laws.reduction import Reduction
-from livepde.linalg import Array, compact
+from livepde.linalg import Array, RowProduct, row_product
 from livepde.observation import Observed
 from livepde.stepping import Moments
 
@@ -32,8 +32,8 @@ class MemberSensors:
         )
 
     @cached_property
-    def _G(self) -> sp.csr_array | Array:
-        return compact(self.problem.observed.G)
+    def _read(self) -> RowProduct:
+        return row_product(sp.csr_array(self.problem.observed.G))
 
     def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
         """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
@@ -41,7 +41,7 @@ class MemberSensors:
         Linear about the linearisation point.
         """
         if self.fixed:
-            return self._G.dot((x.u + x.du).T).T, self.rows(x, x.U, x.C, at)
+            return self._read(x.u + x.du), self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
@@ -58,9 +58,8 @@ class MemberSensors:
     def rows(self, x: FilterState, U: Array, C: Array, at: Moments) -> Array:
         """Return [U C] H^T for rows of each member, (members, rows, sensors), about its point."""
         if self.fixed:
-            members, r, n = U.shape
-            seen = self._G.dot(U.reshape(-1, n).T).T
-            return np.asarray(seen.reshape(members, r, seen.shape[1]))
+            seen = self._read(U.reshape(-1, U.shape[2]))
+            return seen.reshape(*U.shape[:2], seen.shape[1])
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from livepde.laws.filter_state import FilterState
 from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
-from livepde.laws.member_arrays import changed, put, take
+from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.refit import Found, refitted
 from livepde.laws.refit_options import Refit
 from livepde.laws.sensitivity_state import (
@@ -34,6 +34,7 @@ def refit_due(
         return iterate_starts(work, state, due)
     if (options := work.refit) is None:
         return state, None
+    each: dict[int, SensitivityState] = {}
     for k in np.flatnonzero(due).tolist():
         one = take(state, k)
         count = int(one.assimilated[0])
@@ -47,8 +48,8 @@ def refit_due(
                 one = refitted_now(work, options, one)
             later = 2 * count if 2 * count <= options.start else options.window
             one = changed(one, due=np.array([later]))
-        state = put(state, k, one)
-    return state, None
+        each[k] = one
+    return put_each(state, each), None
 
 
 @nonfinite_allowed()  # such a trajectory is refused
@@ -60,6 +61,7 @@ def settle(
     Those of the last samples of each member, (samples, sensors); None of one that is not fitted.
     """
     used: list[Mask | None] = [None] * len(state)
+    each: dict[int, SensitivityState] = {}
     options = work.refit
     if options is None or not work.fits:
         return state, used
@@ -70,8 +72,8 @@ def settle(
             found = refitted(samples, options, last=True)
             used[k] = None if found is None else found.used
             one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
-            state = put(state, k, _after(work, one, samples, found, last=True))
-    return state, used
+            each[k] = _after(work, one, samples, found, last=True)
+    return put_each(state, each), used
 
 
 def refitted_now(

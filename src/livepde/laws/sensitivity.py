@@ -30,7 +30,7 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.input_noise import input_rank, with_initial_rows
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, join, put, take, where
+from livepde.laws.member_arrays import changed, join, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
 from livepde.laws.reduction import Reduction
@@ -44,11 +44,10 @@ from livepde.laws.sensitivity_state import (
     Scale,
     SensitivityState,
     SensitivityWork,
+    kept_for_estimates,
     reports_of,
     shortened,
     stored,
-    without_factors,
-    without_ledger,
 )
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
@@ -392,7 +391,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             if not usual.any():
                 return (new if len(state) > 1 else state), reports
         due = new.assimilated >= new.due
-        if work.fits and work.window:  # samples without a reading need room, too
+        if work.fits and 0 < work.window < new.log.shape[1]:  # samples without a reading need room
             due = due | (new.log.shape[1] - new.window > work.window)
         if np.count_nonzero(due):
             new, moved = refit_due(work, new, due)
@@ -455,19 +454,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> tuple[SensitivityState, MemberReports]:
         """Return state and reports after those members that are not `usual` have stepped alone."""
         alone: dict[int, Report] = {}
-        parts: list[SensitivityState] = []
+        each: dict[int, SensitivityState] = {}
         for k in np.flatnonzero(~usual).tolist():
             one, alone[k] = step_alone(work, take(state, k), span.member(k))
             # The members share the rows of one log: whoever failed has an empty row there.
             while work.keeps_log and one.log.shape[1] <= state.log.shape[1]:
                 one = changed(one, log=skipped(one.log))
-            parts.append(one)
-        if usual.any():
-            for k, one in zip(alone, parts, strict=True):
-                new = put(new, k, one)
-        else:
-            new = join(*parts) if len(parts) > 1 else parts[0]
-        return new, reports.with_members(alone)
+            each[k] = one
+        return put_each(new, each), reports.with_members(alone)
 
     def live(self) -> SensitivityLaw:
         if self.refit is None or self.refit.apart is not None:
@@ -509,10 +503,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
-        now = without_factors(state.now)
-        alone, fit = without_ledger(now), state.fit.member(0)
-        judge = with_fit(judged(work.filter, now, 0), fit)
-        return Deferred(lambda: self.member_belief(work, alone, 0), judge)
+        now, fit = kept_for_estimates(state.now), state.fit.member(0)
+        judge = with_fit(judged(work.filter, state.now, now), fit)
+        return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         found, columns = self.deferred(work, state), Columns.of(work, state)

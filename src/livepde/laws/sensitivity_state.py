@@ -31,13 +31,12 @@ __all__ = [
     "Scale",
     "SensitivityState",
     "SensitivityWork",
+    "kept_for_estimates",
     "new_window",
     "reports_of",
     "restarted",
     "shortened",
     "stored",
-    "without_factors",
-    "without_ledger",
     "without_past",
 ]
 
@@ -343,7 +342,8 @@ def stored(
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken)
     # A sensor that is set aside brings no measurements, from the first one that misfitted on.
-    if (aside := now.screened.aside & taken[:, None]).any():
+    if np.count_nonzero(now.screened.aside):
+        aside = now.screened.aside & taken[:, None]
         kept = withdrawn(log, aside, now.screened.since)
         if len(state.fork) and _differ(kept, log, int(state.fork.row[0])):
             parts |= {"fork": Fork.none(now), "due": state.assimilated}
@@ -443,7 +443,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
                 found = replace(found, bounded=np.where(held > 0, held, np.nan))
         return found
 
-    steps = np.array(np.broadcast_to(told.steps, members))
+    steps = np.full(members, told.steps)
     return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
 
 
@@ -456,18 +456,11 @@ def _with_refused(
     return replace(found, refused=refused.sum(axis=1).astype(float), extra={**found.extra, **each})
 
 
-def without_factors(x: FilterState) -> FilterState:
-    """Return a filter state without warm-start data of its stages, for estimates that are kept."""
-    if not (x.kept.q.shape[1] or x.shadows.u.shape[1]):
-        return x
-    return changed(x, kept=x.kept.forgotten(), shadows=x.shadows.without_stages())
-
-
-def without_ledger(x: FilterState) -> FilterState:
-    """Return a filter state without the data that only its verdict needs."""
-    if x.ledger is NO_LEDGER:
-        return x
-    return changed(x, causes=np.zeros((*x.causes.shape[:2], 0)), ledger=NO_LEDGER)
+def kept_for_estimates(x: FilterState) -> FilterState:
+    """Return a filter state without the data that only its next steps and its verdict need."""
+    shadows = x.shadows.without_stages() if x.shadows.u.shape[1] else x.shadows
+    none = x.causes[:, :, :0]
+    return changed(x, kept=x.kept.forgotten(), shadows=shadows, causes=none, ledger=NO_LEDGER)
 
 
 def new_window(

@@ -29,12 +29,12 @@ from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, along
 from livepde.laws.halved_mesh import HalvedMesh, refusal
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, put, take, where
+from livepde.laws.member_arrays import changed, product, put, take, where
 from livepde.laws.process_noise import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.linalg import Array, BlockFactor, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     TINY,
     Advance,
@@ -204,7 +204,7 @@ class MeanProcess:
         """Return the same as `propagate`, through the parts of a span that end at some times."""
         members, no = len(u), np.zeros(len(u), dtype=bool)
         tangents = self.reduction.directions(x.q, np.zeros((members, 0, x.C.shape[2])))
-        factors: dict[float, BlockFactor] = {}  # of all stages of a step that have the same q
+        factors: dict[float, Any] = {}  # of all stages of a step that have the same q
         now = kept
 
         def stage(columns: Array, t: float, h: float) -> Array:
@@ -674,14 +674,23 @@ class ShadowSet:
         return changed(x, shadows=changed(s, **parts)), np.where(rows, 0.0, seen)
 
     def update(
-        self, x: FilterState, new: FilterState, left: Array, weights: Array, off: Array, t: float
+        self,
+        x: FilterState,
+        U: Array,
+        C: Array,
+        left: Array,
+        weights: Array,
+        off: Array,
+        t: float,
     ) -> ShadowState:
         """Return the shadows after a sample.
 
         Parameters
         ----------
-        x, new
-            The filter before and after it.
+        x
+            The filter before it.
+        U, C
+            The square root after it.
         left
             `Update.left`.
         weights
@@ -692,16 +701,17 @@ class ShadowSet:
         """
         s = x.shadows
         # K^T = `gain` [U C], with the rows of the new square root.
-        gain = weights[:, :, None] * left.swapaxes(1, 2)  # (members, sensors, r)
-        half = off @ gain
-        parts = {"u": s.u - half @ new.U, "a": s.a - half @ new.C}
+        gain = left.swapaxes(1, 2)  # (members, sensors, r), in units of the noise
+        half = product(off * weights[:, None], gain)
+        parts = {"u": s.u - product(half, U), "a": s.a - product(half, C)}
         since = t - s.begun
         if s.gains.size and np.count_nonzero(since):
             # A sample multiplies the effect of earlier ones by I - K H, for which the share of the
             # variance that it leaves stands: the full product would need a matrix for each sensor.
-            share = np.einsum("brk,brk->bk", new.C, new.C)
-            share /= np.maximum(np.einsum("brk,brk->bk", x.C, x.C), TINY)
-            parts["gains"] = share[:, None] * s.gains + since[:, None, None] * (gain @ new.C)
+            share = np.add.reduce(C * C, axis=1)
+            share /= np.maximum(np.add.reduce(x.C * x.C, axis=1), TINY)
+            gained = (weights * since[:, None])[:, :, None] * product(gain, C)
+            parts["gains"] = share[:, None] * s.gains + gained
         return changed(s, **parts)
 
     def shifts(self, x: FilterState) -> tuple[Array, Array]:
@@ -763,8 +773,10 @@ def _watch_rate(
     """Return fields after one more step, and members whose rate of the state jumped in it."""
     rate = (end.u - x.u) / (span.t1 - span.t0)[:, None]
     more = rate - s.rate
-    count, differs = s.count + 1, np.sqrt(np.einsum("mn,mn->m", more, more))
-    most = np.where(count > CALM + 1, JUMP * s.usual, np.inf)  # in the first steps none is known
+    count, differs = s.count + 1, np.sqrt(np.add.reduce(more * more, axis=1))
+    most, early = JUMP * s.usual, count <= CALM + 1
+    if np.count_nonzero(early):  # in the first steps none is known
+        most = np.where(early, np.inf, most)
     jumps = differs > most
     # A jump does not count as usual.
     weight = WEIGHTS[np.minimum(count, USUAL)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,7 @@ __all__ = ["StepLedger", "step_findings"]
 
 SOME = 0.02  # share of the samples from which failed steps are more than a mishap
 MOST = 0.5  # share from which little is left of the data
+PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
 WORDS = {
     "departed": "departed: the unknowns were held, since prior and data do not allow for where "
     "they would have gone",
@@ -26,8 +27,7 @@ WORDS = {
 """Code of a status that is not ok -> what has happened to such a sample."""
 
 
-@dataclass(frozen=True, eq=False)
-class StepLedger:
+class StepLedger(NamedTuple):
     """Numbers of samples by the status of their step, in the order of `STATUS_CODES`."""
 
     counts: IntArray
@@ -40,13 +40,14 @@ class StepLedger:
     def add(self, code: str) -> StepLedger:
         """Return the value after a sample whose step ended with a status."""
         counts = self.counts.copy()
-        counts[STATUS_CODES.index(code)] += 1
+        counts[PLACES[code]] += 1
         return StepLedger(counts)
 
     @property
     def failed(self) -> bool:
         """Whether any step was not ok."""
-        return bool(self.counts.sum() > self.counts[STATUS_CODES.index("ok")])
+        counts = self.counts.tolist()
+        return bool(sum(counts) > counts[PLACES["ok"]])
 
     def findings(self) -> Iterator[Finding]:
         """Return a finding for each way in which steps have failed."""

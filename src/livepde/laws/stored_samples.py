@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from livepde.laws.gate import Gate
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.linalg import Array, BlockFactor, Mask
+from livepde.linalg import Array, Mask
 from livepde.stepping import BandedStage, Span, StageOfMembers, advance
 
 __all__ = ["Passed", "StoredSamples"]
@@ -184,7 +185,7 @@ class StoredSamples:
 
     def _followed(self, x: FilterState) -> Iterator[tuple[FilterState, Span]]:
         """Yield trajectories after each span; ends early where a step fails."""
-        filter_, factors, kept = self.filter, dict[float, BlockFactor](), x.kept
+        filter_, factors, kept = self.filter, dict[float, Any](), x.kept
         along = filter_.reduction.directions(x.q, x.C)
         exact = np.zeros(len(x.member), dtype=bool)
         columns = np.concatenate([x.u[None], x.U.transpose(1, 0, 2)])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Fit, Problem
-from livepde.laws.member_arrays import changed, take
+from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
@@ -70,21 +69,24 @@ def judge_of(
     return Judge(dictionary, *sizes, rows, still=still)
 
 
-def judged(filter_: Filter, x: FilterState, member: int) -> Callable[[], Verdict]:
-    """Return a function that gives the verdict on a member, and holds no more than that needs."""
-    judge = filter_.judge
+def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], Verdict]:
+    """Return a function that gives the verdict on one member, and holds no more than that needs.
+
+    `kept` is the filter state without what only its next steps and its verdict need.
+    """
+    judge, ledger, causes = filter_.judge, x.ledger, x.causes
     if judge is None:
         return lambda: Verdict.of((), ("innovations: verdict = False",), judged=False)
-    if not x.ledger.seen[member]:
+    if not ledger.seen[0]:
         return lambda: Verdict.of((), (too_few("innovations", 0),), judged=False)
     # The answers of the process are states of the size of u, which no finding reads.
-    x = changed(x, ledger=changed(x.ledger, process=np.zeros((len(x), 0, 0))))
+    if ledger.process.size:
+        ledger = changed(ledger, process=ledger.process[:, :0, :0].copy())
 
     def found() -> Verdict:
-        one = take(x, member)
-        w, settled = judge.summed_up(one.ledger, one.causes)
+        w, settled = judge.summed_up(ledger, causes)
         with nonfinite_allowed():
-            at = _position(filter_, replace(one, causes=w, ledger=settled))
+            at = _position(filter_, changed(kept, causes=w, ledger=settled))
             return assess(judge.dictionary, at)
 
     return found

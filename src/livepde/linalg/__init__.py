@@ -15,6 +15,7 @@ from livepde.linalg.nonfinite import nonfinite_allowed
 from livepde.linalg.pardiso import PardisoSolver
 from livepde.linalg.pattern import Pattern, compact, sandwich
 from livepde.linalg.protocol import Factor, Solver
+from livepde.linalg.rows import RowProduct, row_product
 from livepde.linalg.superlu import SuperLUSolver, positive_definite
 from livepde.linalg.types import Array, IntArray, Mask, Sparse
 
@@ -34,6 +35,7 @@ __all__ = [
     "MultigridSolver",
     "PardisoSolver",
     "Pattern",
+    "RowProduct",
     "Solver",
     "Sparse",
     "SuperLUSolver",
@@ -45,5 +47,6 @@ __all__ = [
     "gmres",
     "nonfinite_allowed",
     "positive_definite",
+    "row_product",
     "sandwich",
 ]

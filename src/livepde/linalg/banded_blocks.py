@@ -74,37 +74,72 @@ class BandedBlocks:
     The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block: no pivot
     is taken from another block, because the coupling entries are zero. LU with partial pivoting; L
     D L^T for symmetric positive definite tridiagonal matrices, at a third of the cost.
+
+    Attributes
+    ----------
+    symmetric
+        True if all matrices are symmetric and tridiagonal: storage is the main diagonal, and the
+        lower one with a zero at the end.
     """
 
     solver: BandedSolver
+    symmetric: bool = False
+
+    @classmethod
+    def of(cls, solver: BandedSolver, *data: Array) -> BandedBlocks:
+        """Return the blocks of sums of matrices, each with data of shape (nnz,)."""
+        whole = cls(solver)
+        tridiagonal = solver.band == (1, 1)
+        return cls(solver, tridiagonal and all(whole._mirrored(part) for part in data))
+
+    def _mirrored(self, data: Array) -> bool:
+        """Return True if a tridiagonal matrix is symmetric to the bit."""
+        _, upper, _, lower = self._rows(self.band(data))
+        return np.array_equal(upper[1:], lower[:-1])
+
+    def _rows(self, storage: Array) -> Array:
+        """Return LAPACK's band storage of one matrix or more, shape (height, blocks n)."""
+        return storage.reshape(-1, self.solver.storage[0][1]).T
 
     def band(self, data: Array) -> Array:
         """Return matrices of shape (..., nnz) in band storage, shape (..., size)."""
         shape, position = self.solver.storage
         storage = np.zeros((*data.shape[:-1], shape[0] * shape[1]))
         storage[..., position] = data
-        return storage
+        if not self.symmetric:
+            return storage
+        rows = storage.reshape(-1, *shape)
+        return rows[:, :, 2:].swapaxes(1, 2).reshape(*data.shape[:-1], 2 * shape[0])
 
     def factorise(self, storage: Array) -> BlockFactor:
         """Factorise matrices in band storage, shape (blocks, size), which is overwritten."""
-        (n, height), blocks = self.solver.storage[0], len(storage)
-        lower, upper = self.solver.band
-        middle, bad = lower + upper, NONE
+        (n, height), blocks, bad = self.solver.storage[0], len(storage), NONE
         if not math.isfinite(np.vdot(storage, storage)):  # one of its squares may overflow, too
             bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
             # A block that is not finite is replaced by the identity, so that the others can be
             # factorised.
             storage[bad] = 0.0
-            storage.reshape(blocks, n, height)[bad, :, middle] = 1.0
-        banded = storage.reshape(blocks * n, height).T
-        # Rows of the storage: fill-in, upper, main, lower diagonal. Symmetric if rows 1, 3 agree.
-        if lower == upper == 1 and not np.count_nonzero(banded[1, 1:] != banded[3, :-1]):
-            diagonal, side, info = lapack.dpttrf(banded[2], banded[3, :-1])
+            if self.symmetric:
+                storage.reshape(blocks, 2, n)[bad, 0] = 1.0
+            else:
+                storage.reshape(blocks, n, height)[bad, :, sum(self.solver.band)] = 1.0
+        if self.symmetric:
+            diagonal, side = storage.reshape(blocks, 2, n).swapaxes(0, 1).reshape(2, -1)
+            *factors, info = lapack.dpttrf(diagonal, side[:-1])
             if info == 0:
-                return BlockFactor(self.solver, bad, None, None, (diagonal, side))
-        lu, pivots, info = lapack.dgbtrf(banded, lower, upper, overwrite_ab=1)
+                return BlockFactor(self.solver, bad, None, None, tuple(factors))
+            general = np.zeros((blocks * n, height))
+            general[:, 2], general[:, 3], general[1:, 1] = diagonal, side, side[:-1]
+            return self._lu(general, bad)
+        return self._lu(storage.reshape(blocks * n, height), bad)
+
+    def _lu(self, storage: Array, bad: IntArray) -> BlockFactor:
+        """Return LU factors of a whole matrix in band storage, shape (blocks n, height)."""
+        lower, upper = self.solver.band
+        lu, pivots, info = lapack.dgbtrf(storage.T, lower, upper, overwrite_ab=1)
         if info > 0:  # a pivot is zero: mark its block, and go on without dividing by it
+            middle = lower + upper
             zero = lu[middle] == 0.0
             lu[middle, zero] = 1.0
-            bad = np.union1d(bad, np.flatnonzero(zero) // n)
+            bad = np.union1d(bad, np.flatnonzero(zero) // self.solver.storage[0][0])
         return BlockFactor(self.solver, bad, lu, pivots)

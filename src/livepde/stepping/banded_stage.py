@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -14,9 +15,10 @@ from livepde.linalg import (
     Assembler,
     BandedBlocks,
     BandedSolver,
+    BlockFactor,
     Pattern,
     analyse,
-    compact,
+    row_product,
 )
 from livepde.model import Model
 from livepde.stepping.interval import Moments
@@ -37,6 +39,27 @@ ROUNDING = 1e-11
 # Inputs at which responses are measured: so large that subtracting the vector without inputs
 # cancels no digits, and a power of two so that the division is exact.
 LARGE = 2.0**20
+
+
+NONE = np.zeros((0, 0))
+
+
+class BandedStep(NamedTuple):
+    """What stages of one length with the same unknowns share.
+
+    Attributes
+    ----------
+    factor
+        The factorised matrices.
+    amounts
+        h q of the physical unknowns, shape (members, unknowns).
+    forced
+        See `BandedStage`.
+    """
+
+    factor: BlockFactor
+    amounts: Array
+    forced: tuple[Array, Array] | None
 
 
 class BandedStage(MemberStage):
@@ -63,14 +86,14 @@ class BandedStage(MemberStage):
         mass = maps["M"] @ model.mass.data
         rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
         slopes = [maps["A"] @ form.data("v", "u", some, u=zero, q=q) for q in units]
-        self._blocks = BandedBlocks(BandedSolver(self.pattern))
-        self._mass = compact(self._stacked(mass * free[rows]))
-        self._slopes = compact(self._stacked(*(slope * inner for slope in slopes)))
-        self._mass_band = self._blocks.band(mass * inner)
+        self._mass = row_product(self._stacked(mass * free[rows]))
+        self._slopes = row_product(self._stacked(*(slope * inner for slope in slopes)))
         # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
-        self._rest_band = self._blocks.band(rest * inner + ones)
-        self._slope_bands = self._blocks.band(np.array(slopes) * inner)
+        parts = np.array([*(slope * inner for slope in slopes), rest * inner + ones, mass * inner])
+        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *parts)
+        # The matrix of a stage is the sum of these with weights h q, h and 1.
+        self._bands = self._blocks.band(parts)
         # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
         # They have few entries, and stay sparse: their products are formed once.
         mass_edge, rest_edge = self._stacked(mass * outer), self._stacked(rest * outer)
@@ -133,52 +156,80 @@ class BandedStage(MemberStage):
 
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
         # The equations are multiplied by h, which avoids dividing an array of the size of all
-        # columns. `dot` has half the overhead of `@` for a few rows, and serves sparse matrices.
-        (size, n), h, at = columns.shape[1:], stage.h, stage.at
-        together = len(columns) - stage.apart
-        latent = self.model.latent
-        unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
-        factor = stage.factors.get(h)
-        if factor is None:
-            storage = unknowns.dot(self._slope_bands)
-            storage += self._rest_band
-            storage *= h
-            storage += self._mass_band
-            factor = stage.factors[h] = self._blocks.factorise(storage)
-        if size == 1 and len(factor.bad):
+        # columns.
+        (size, n), at = columns.shape[1:], stage.at
+        step = stage.factors.get(stage.h) or self._begin(stage)
+        if size == 1 and len(step.factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
         # BLAS may round products of other shapes differently, so the separate columns share no
         # product with the others. Each column is solved by itself, however many there are.
-        new = np.empty(columns.shape)
-        known = self._mass.dot(columns[:together].reshape(-1, n).T).T
-        new[:together] = known.reshape(together, size, n)
-        if stage.apart:
-            known = self._mass.dot(columns[together:].reshape(-1, n).T).T
-            new[together:] = known.reshape(-1, size, n)
-        if not self._load.zero:
-            new[0] += h * self._load(at)
-        if not self._boundary.zero:
-            new[0] -= self._mass_boundary(at)
-        offset = None if self._offset.zero else self._offset(at).reshape(-1, unknowns.shape[1], n)
+        new, rows = np.empty(columns.shape), columns.reshape(-1, n)
+        known, together = new.reshape(-1, n), (len(columns) - stage.apart) * size
+        if self._mass.separate or not stage.apart:
+            self._mass(rows, known)
+        else:
+            self._mass(rows[:together], known[:together])
+            self._mass(rows[together:], known[together:])
+        u = known[:size]
+        if step.forced is not None:
+            base, changes = step.forced
+            u += base
+            if len(changes):
+                u += at.inputs[:, : len(changes)].dot(changes)
+        else:
+            u += stage.h * self._load(at) - self._mass_boundary(at)
+        offset = None if self._offset.zero else self._offset(at).reshape(-1, len(step.amounts.T), n)
         if offset is not None:
-            new[0] -= h * (unknowns[:, None] @ offset)[:, 0]
+            u -= (step.amounts[:, None] @ offset)[:, 0]
         # The state first: the tangents need it.
-        new[:1] = factor.solve(new[:1])
+        u[:] = step.factor.solve(new[:1])[0]
         if len(columns) > 1:
             # A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n), drives the
             # tangents.
-            driven = self._slopes.dot(new[0].T).T.reshape(size, -1, n)
+            driven = self._slopes(u).reshape(size, -1, n)
             if offset is not None:
                 driven = driven + offset
-            along = h * stage.directions
-            if together > 1:
-                new[1:together] -= (along[:, : together - 1] @ driven).transpose(1, 0, 2)
+            along, chosen = stage.h * stage.directions, together // size - 1
+            if chosen:
+                known[size:together] -= _along(along[:, :chosen], driven)
             if stage.apart:
-                new[together:] -= (along[:, together - 1 :] @ driven).transpose(1, 0, 2)
-            new[1:] = factor.solve(new[1:])
+                known[together:] -= _along(along[:, chosen:], driven)
+            new[1:] = step.factor.solve(new[1:])
         if not self._boundary.zero:
-            new[0] += self._boundary(at)
+            u += self._boundary(at)
         return new, stage.kept
+
+    def _begin(self, stage: StageOfMembers) -> BandedStep:
+        """Return what all stages of a length share, and keep it for the next one."""
+        latent, h = self.model.latent, stage.h
+        unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
+        weights = np.empty((len(unknowns), unknowns.shape[1] + 2))
+        amounts = np.multiply(unknowns, h, out=weights[:, :-2])
+        weights[:, -2], weights[:, -1] = h, 1.0
+        factor = self._blocks.factorise(weights.dot(self._bands))
+        step = BandedStep(factor, amounts, self._forced(h))
+        stage.factors[h] = step
+        return step
+
+    def _forced(self, h: float) -> tuple[Array, Array] | None:
+        """Return what drives the state in a stage, (1, n), and its derivative in the inputs.
+
+        None where that reads the time, or is not affine in the inputs.
+        """
+        load, boundary = self._load.responses, self._mass_boundary.responses
+        if load is None or boundary is None:
+            return None
+        if self._mass_boundary.zero:
+            return h * load[0], NONE if self._load.constant else h * load[1]
+        return h * load[0] - boundary[0], h * load[1] - boundary[1]
+
+
+def _along(directions: Array, driven: Array) -> Array:
+    """Return sums of what drives the tangents along their directions, (r * members, n)."""
+    if len(driven) == 1:  # a product of stacks costs more
+        return np.asarray(directions[0].dot(driven[0]))
+    found: Array = (directions @ driven).transpose(1, 0, 2)
+    return found.reshape(-1, driven.shape[2])
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -158,8 +159,7 @@ def own_noise(noise: ArrayLike) -> Array | None:
     return None if np.isnan(found).all() else found
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Moments:
+class Moments(NamedTuple):
     """One time, with the input channels of each member.
 
     Attributes

@@ -7,16 +7,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from livepde.linalg import (
-    Array,
-    BlockFactor,
-    IntArray,
-    Mask,
-)
+from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.stepping.corrections import Kept
 from livepde.stepping.interval import Moments
@@ -96,7 +91,7 @@ class StageOfMembers(NamedTuple):
     at: Moments
     kept: KeptFactors
     off_centre: Mask
-    factors: dict[float, BlockFactor]
+    factors: dict[float, Any]
     apart: int = 0
 
 

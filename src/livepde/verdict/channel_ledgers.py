@@ -60,8 +60,16 @@ class InputLedger:
         """
         counts = self.counts.copy()
         counts[0] += 1  # of all samples
-        counts[1:] += missing > 0.0
-        return replace(self, counts=counts, held=(self.held + length) * missing)
+        held = self.held
+        if np.count_nonzero(missing) or np.count_nonzero(held):
+            counts[1:] += missing > 0.0
+            held = (held + length) * missing
+        return InputLedger(counts, held, self.unstated)
+
+    @property
+    def silent(self) -> bool:
+        """True if no channel was ever held."""
+        return not (any(self.counts.tolist()[1:]) or any(self.unstated.tolist()))
 
     def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
         """Return for how long channels were held by now, and whether they are once more."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.linalg import Array, IntArray
+from livepde.linalg import Array, IntArray, RowProduct, row_product
 from livepde.model import Model
 from livepde.observation import Observed, Points
 from livepde.verdict.missing_terms import Process
@@ -25,7 +24,6 @@ SHIFT = 0.02  # of the length of the domain
 JUMP = 0.3  # prior standard deviations of an unknown
 MOST_JUMPS = 8  # coordinates of unknowns that may jump
 MOST_SUMS = 12_000  # numbers in one kind of sum
-MOST_DENSE = 10_000  # entries of a matrix that is cheaper when dense
 
 
 @dataclass(frozen=True)
@@ -61,28 +59,25 @@ class ForwardShifts:
     ----------
     axes
         Number of axes.
-    used, rows
-        Coefficients of the state, (m,), and the matrix of all axes one after the other, (axes *
-        sensors, m): dense where it has few columns.
+    used, product
+        Coefficients of the state, (m,), and the product of the matrix of all axes one after the
+        other, (axes * sensors, m), with rows of them.
     """
 
     axes: int
     used: IntArray
-    rows: Any
+    product: RowProduct
 
     @classmethod
     def of(cls, shifts: Sequence[sp.csr_array]) -> ForwardShifts:
         """Return the value of the matrices of all axes, each (sensors, n)."""
         rows = sp.csc_array(sp.vstack(shifts))
         used = np.flatnonzero(np.diff(rows.indptr))
-        rows = rows[:, used]
-        # A sparse product of few entries takes longer than a dense one.
-        dense = rows.shape[0] * rows.shape[1] <= MOST_DENSE
-        return cls(len(shifts), used, rows.toarray() if dense else sp.csr_array(rows))
+        return cls(len(shifts), used, row_product(sp.csr_array(rows[:, used])))
 
     def of_readings(self, u: Array) -> Array:
         """Return the changes of readings with states u, (members, axes * sensors)."""
-        return np.asarray((self.rows @ u[:, self.used].T).T)
+        return self.product(u.take(self.used, axis=1))
 
 
 class Dictionary:

@@ -26,8 +26,8 @@ estimate of the unknowns for each unit of the cause.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import fields
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,8 +45,7 @@ MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ScoredSample:
+class ScoredSample(NamedTuple):
     """Prior of a filter at a sample, with the sample; in units of the noise.
 
     Attributes
@@ -157,28 +156,26 @@ class Judge:
         reached = ledger.reached[:, 1] >= sample.at.t
         if self.answered(members) and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
-        # In the order of `_at`; the rows that a square root lacks are zeros.
-        row = [
-            np.full((members, 1), sample.at.t),
-            sample.used,
-            sample.d,
-            _of_each(sample.noise, members),
-            _of_each(sample.z, members),
-            sample.predicted,
-            *_filled(sample.Y, self._at["Y"]),
-            *_filled(M, self._at["M"]),
-        ]
+        rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
+        alone = members == 1
+        row = rows[:, int(waiting[0])] if alone else np.empty((members, self.numbers))
+        row[:, 0] = sample.at.t
+        for name in ("used", "d", "noise", "z", "predicted"):
+            row[:, at[name]] = getattr(sample, name)
+        for name, part in (("Y", sample.Y), ("M", M)):
+            start, stop = at[name].start, at[name].stop
+            row[:, start : start + part[0].size] = part.reshape(members, -1)
+            row[:, start + part[0].size : stop] = 0.0  # rows that a square root lacks
         if self.dictionary.shifts is not None:
-            row.append(self.dictionary.shifts.of_readings(sample.u))
+            row[:, at["moved"]] = self.dictionary.shifts.of_readings(sample.u)
         if self.terms:  # interpolated later on, many at once
-            row.append(np.full((members, self.terms * self.sensors), np.nan))
+            row[:, at["answers"]] = np.nan
         if self.recorded:
-            if sample.C.shape[1] == self.unknowns:
-                row += [sample.a(), sample.C.reshape(members, -1)]
-            else:
-                row.append(np.zeros((members, self.unknowns * (1 + self.unknowns))))
-        rows = ledger.rows.copy()
-        rows[np.arange(members), ledger.waiting] = np.concatenate(row, axis=1)
+            known = sample.C.shape[1] == self.unknowns
+            row[:, at["a"]] = sample.a() if known else 0.0
+            row[:, at["C"]] = sample.C.reshape(members, -1) if known else 0.0
+        if not alone:
+            rows[np.arange(members), waiting] = row
         # The update of this sample multiplies M by W^T, and predictions by what moves the rows of
         # [U C].
         one = self._eye[:, :r]
@@ -399,18 +396,6 @@ class Judge:
             readings[k] = low, (process.readings(p[k], now) - low) / h
             reached[k] = begin, begin + h
         return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
-
-
-def _of_each(part: Array, members: int) -> Array:
-    """Return an array of each member, (members, ...), of one that may be common to all of them."""
-    return part if len(part) == members else np.repeat(part, members, axis=0)
-
-
-def _filled(part: Array, at: slice) -> list[Array]:
-    """Return an array as a row of each member, and the zeros that it lacks to fill its place."""
-    row = part.reshape(len(part), -1)
-    lacking = at.stop - at.start - row.shape[1]
-    return [row, np.zeros((len(row), lacking))] if lacking else [row]
 
 
 def _in_windows(effect: Array, growth: Array) -> Array:

@@ -185,8 +185,7 @@ def batch_of(numbers: int) -> int:
 def changed(ledger: Ledger, **parts: Any) -> Ledger:
     """Return a ledger with some fields exchanged: `dataclasses.replace` in a tenth of its time."""
     new: Ledger = object.__new__(Ledger)
-    new.__dict__.update(ledger.__dict__)
-    new.__dict__.update(parts)
+    object.__setattr__(new, "__dict__", {**ledger.__dict__, **parts})
     return new
 
 

@@ -1,0 +1,140 @@
+"""Cost of a usual sample of `SensitivityLaw` with its defaults on rods, in forward steps.
+
+The samples 100 to 300 of a stream are timed one by one. As many forward steps of the same model by
+implicit Euler with a known parameter follow at once, since between samples they would find the
+processor's caches without their data; the matrix is factorised once. The same sample is the same
+work in each run: of the runs the least time of each sample counts, so that slow moments of the
+machine do not. A call with a refit in it is one after which `Estimate.fit` is another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from time import process_time
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from benchmarks.rods import NOISE, Rod, forward_times
+from livepde.fleet import Fleet
+from livepde.identifier import Identifier
+from livepde.laws import SensitivityLaw
+from livepde.linalg import Array
+from livepde.runs.outcome import Check, Outcome, Table
+
+__all__ = ["BOUNDS", "MEMBERS", "usual_step"]
+
+BOUNDS: dict[tuple[int, int], float] = {
+    (31, 2): 9.0,
+    (200, 2): 9.0,
+    (1_000, 2): 12.0,
+    (31, 10): 12.0,
+    (200, 10): 14.0,
+    (1_000, 10): 24.0,
+}
+"""Nodes, unknowns -> forward steps that the median sample may cost."""
+
+FIRST, LAST = 100, 300  # samples that count
+MEAN = 1.3  # times the median that the mean may be
+LARGEST = 60.0  # forward steps of a call without a refit
+RUNS = 5
+MEMBERS, MEMBERS_NODES = 1_000, 31
+MEMBER = 3.0  # forward steps of a member of a fleet, in the mean
+STREAMS = 20  # of members that differ
+
+Times: TypeAlias = tuple[Array, Array, Array]
+"""Of each sample, whether each had a refit, and of each forward step."""
+
+
+def usual_step(
+    sizes: Sequence[int] = (31, 200, 1_000),
+    *,
+    runs: int = RUNS,
+    members: int = MEMBERS,
+    last: int = LAST,
+) -> Outcome:
+    """Time samples of the default law on rods of some sizes, and of a fleet.
+
+    Parameters
+    ----------
+    sizes
+        Numbers of nodes.
+    runs
+        How often each rod is run.
+    members
+        Of the fleet of rods with 31 nodes; 0: none.
+    last
+        Number of the last sample.
+    """
+    rows: list[tuple[Any, ...]] = []
+    checks: list[Check] = []
+    for (nodes, unknowns), bound in BOUNDS.items():
+        if nodes not in sizes:
+            continue
+        given = Rod(nodes, unknowns, "source")
+        spent, refits, forward = _timed(given, runs, last)
+        costs = spent / np.median(forward)
+        median, mean, usual = float(np.median(costs)), float(costs.mean()), costs[~refits]
+        largest = float(usual.max())
+        rows.append((nodes, unknowns, median, mean, float(usual.mean()), largest, bound))
+        text = f"{given.title}, defaults: sample / forward step"
+        checks += [
+            Check(f"{text}, median", median, bound, "<="),
+            Check(f"{text}, mean over median", mean / median, MEAN, "<="),
+            Check(f"{text}, largest without a refit", largest, LARGEST, "<="),
+        ]
+    columns = ("nodes", "unknowns", "median", "mean", "mean, no refits", "largest", "bound")
+    title = f"One sample of the default law over one forward step, samples {FIRST} to {last}"
+    tables = [Table(title, columns, rows)] if rows else []
+    if members and MEMBERS_NODES in sizes:
+        median, mean = _fleet(members, last)
+        text = f"fleet of {members} rods of {MEMBERS_NODES} nodes, defaults"
+        checks.append(Check(f"{text}: sample of a member / forward step", mean, MEMBER, "<="))
+        columns = ("members", "median", "mean", "bound")
+        row = [(members, median, mean, MEMBER)]
+        tables.append(
+            Table("One sample of a member of a fleet over one forward step", columns, row)
+        )
+    return Outcome(tables=tables, checks=checks, notes=[NOTE] if tables else [])
+
+
+NOTE = (
+    "The default law: one forward step is livepde.simulate by implicit Euler, with the factor "
+    "kept. Of each sample the least time of all runs counts, since its work is the same in each. "
+    "mean: refits included; largest: without them."
+)
+
+
+def _timed(given: Rod, runs: int, last: int) -> Times:
+    """Return the least times of samples and forward steps over some runs."""
+    samples, spent, forward = given.samples(last), [], []
+    refits = np.zeros(last - FIRST + 1, dtype=bool)
+    for _ in range(runs):
+        identifier = Identifier(given.model, given.sensors, SensitivityLaw(), u0=0.0)
+        fit, times = None, []
+        for number, sample in enumerate(samples):
+            begun = process_time()
+            estimate = identifier.step(*sample)
+            if number >= FIRST:
+                times.append(process_time() - begun)
+                refits[number - FIRST] |= estimate.fit != fit
+            fit = estimate.fit
+        spent.append(times)
+        forward.append(forward_times(given, last))
+    return np.min(spent, axis=0), refits, np.min(forward, axis=0)
+
+
+def _fleet(members: int, last: int) -> tuple[float, float]:
+    """Return median and mean cost of a sample of one member, in forward steps."""
+    given = Rod(MEMBERS_NODES, 2, "source")
+    streams = [given.samples(last, seed) for seed in range(min(members, STREAMS))]
+    noise = np.random.default_rng(0).standard_normal((last + 1, members, 4))
+    fleet = Fleet(given.model, given.sensors, SensitivityLaw(), members, u0=0.0)
+    spent = []
+    for number, row in enumerate(zip(*streams, strict=True)):
+        z = np.array([row[k % len(row)][1] for k in range(members)]) + NOISE * noise[number]
+        begun = process_time()
+        fleet.step(row[0][0], z, row[0][2])
+        spent.append(process_time() - begun)
+    costs = np.array(spent[FIRST:]) / (members * np.median(forward_times(given, last)))
+    return float(np.median(costs)), float(costs.mean())
