@@ -383,7 +383,7 @@ class Fake:
 
 @pytest.fixture
 def fake(monkeypatch):
-    from benchmarks import rods, step
+    from benchmarks import rods, step, usual_step
     from livepde import reproduce
 
     def install(value: float) -> Fake:
@@ -391,6 +391,7 @@ def fake(monkeypatch):
         monkeypatch.setattr(reproduce, "EXPERIMENTS", {"seed": one})
         monkeypatch.setattr(step, "step", lambda sizes, modes: outcome(value))
         monkeypatch.setattr(rods, "RODS", ())
+        monkeypatch.setattr(usual_step, "usual_step", lambda *_, **__: Outcome())
         return one
 
     return install

@@ -56,7 +56,8 @@ def driven(kind: str, using: str, count: int = 60) -> tuple[float, ct.Action]:
     """Return the temperature of the face after so many samples, and the last action."""
     model = rod(kind)
     law = lp.SensitivityLaw(shadows=None, verdict="cheap")
-    options: dict[str, Any] = {"hold": True, "scheme": lp.Alexander2(), "dt_max": PERIOD / 4}
+    options: dict[str, Any] = {"scheme": lp.Alexander2(), "dt_max": PERIOD / 4}
+    options["between"] = dict.fromkeys(model.channels, "next")
     loop = ct.Loop(
         lp.Identifier(model, SENSORS, law, u0=ROOM, **options), controller(using, reduced(kind))
     )

@@ -28,6 +28,7 @@ import livepde as lp
 from benchmarks.silent import unjudged
 from livepde.runs import clock_findings, input_findings, verdict
 from livepde.stepping import Advance, simulate
+from livepde.verdict import Cause, Verdict
 
 SOURCE = Path(lp.__file__).parent
 ISSUE = ("Finding", "_said")  # calls with the kind of a finding as their first argument
@@ -106,6 +107,12 @@ def mended(*, fault: bool) -> list[str]:
         t = float(rods.TIMES[1] * k)
         estimate = identifier.step(t, z[k], {"T_left": rods.driven(t)})
     return kinds(estimate.verdict)
+
+
+def one_column(share: float) -> list[str]:
+    """Return the findings of a run without a misfit, where a column explains a share of it."""
+    cause = Cause("lag", "T", "sensor T is 3 late", share)
+    return kinds(Verdict.of([]).with_causes([cause]))
 
 
 @cache
@@ -271,6 +278,7 @@ RUNS = {
     "run_verdict: jump": Pair(partial(jumped, 0.7), partial(jumped, 1.0)),
     "equation_tests: rest": Pair(partial(filled, rests=True, gain=100.0), filled),
     "equation_tests: misfit": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
+    "findings: misfit": Pair(partial(one_column, 0.9), partial(one_column, 0.2)),
     "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
     "step_ledger: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
 }

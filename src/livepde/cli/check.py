@@ -179,7 +179,7 @@ def _show_wiring(console: Console, case: Case) -> None:
     from livepde.runs import Table
 
     policy, unit = policy_of(case), case.equation.time_unit
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name, column in case.columns.items():
         habit, spec = policy.habit(name), case.spec.channels[column.noise_of or name]
         low, high = column.valid
@@ -196,7 +196,10 @@ def _show_wiring(console: Console, case: Case) -> None:
             )
         )
     columns = ("channel", "role", "column", "valid", "waits", "of two", "missing", "between")
-    print_table(console, Table(f"Channels from {source_text(case)}", columns, rows))
+    # Most channels are lines: the table stays narrow then.
+    shown = len(columns) - all(row[-1] in ("", "line") for row in rows)
+    rows = [row[:shown] for row in rows]
+    print_table(console, Table(f"Channels from {source_text(case)}", columns[:shown], rows))
     console.print(
         "Add --data FILE, a recording with the same columns, to see what its sensors can identify.",
         soft_wrap=True,

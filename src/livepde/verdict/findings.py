@@ -46,6 +46,7 @@ TELLING = "Longer data, with larger changes nearer to the sensors, would tell mo
 MOST = 5  # findings that are said unasked
 NAMED = 4  # causes that are kept
 HALF = 0.5  # share of a misfit
+GROSS = ("unit", "exchange")  # kinds of causes
 LARGEST = 1e99  # evidence beyond is written as that
 
 
@@ -294,8 +295,11 @@ class Verdict:
         # Of the same share what was fitted counts more than what a linear model says.
         ranked = sorted([*causes, *others], key=lambda one: -one.share)[:NAMED]
         same = ranked[0] is misfit.causes[0] if misfit.causes else False
+        # Of a column in another unit, or of another place, no estimate can be right.
+        gross = ranked[0].kind in GROSS and ranked[0].share >= HALF
         better = replace(
             misfit,
+            severity="do not trust" if gross else misfit.severity,
             subject=ranked[0].subject,
             causes=tuple(ranked),
             shift=misfit.shift if same else {},
