@@ -19,7 +19,7 @@ from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
 from livepde.cases.member_blocks import MemberBlock
 from livepde.cases.new_case import files_for
-from livepde.errors import CaseError, ConfigurationError, RunError
+from livepde.errors import CaseError, ConfigurationError, DataError, RunError
 from livepde.fleet import Fleet
 from livepde.laws import shadows
 from livepde.models import EQUATIONS
@@ -286,6 +286,14 @@ def test_a_step_in_two_rows_is_no_spike_and_a_spike_beside_it_is_one(noise: floa
     assert np.flatnonzero(find_spikes(t, x)).tolist() == [wild]
 
 
+def test_noise_beside_the_two_rows_of_another_channel_is_no_spike() -> None:
+    """A channel that is measured whenever another one switches: the cubic took noise for slopes."""
+    t, _ = two_rows()
+    for seed in range(20):
+        noise = 0.1 * np.random.default_rng(seed).standard_normal(len(t))
+        assert not find_spikes(t, 10.0 + 3.0 * np.sin(t / 4000.0) + noise).any()
+
+
 def test_a_value_between_two_near_rows_that_does_not_stay_is_a_spike() -> None:
     t = np.sort(np.append(60.0 * np.arange(60), 1801.0))
     x = np.sin(t / 600.0)
@@ -415,6 +423,29 @@ def test_a_log_of_changes_is_joined_with_what_held_before() -> None:
     np.testing.assert_array_equal(found.values[-1, k], [NAN, 1.0, 5.0])
 
 
+def test_a_log_whose_last_change_was_before_the_sensors_is_joined() -> None:
+    sensors = tabulated(10.0 + np.arange(3.0), {"a": np.arange(3.0)}, {"a": COLUMNS["a"]}, CLOCK)
+    hold = {"hold": HELD["hold"]}
+    log = tabulated(np.array([2.0, 5.0]), {"h": np.array([1.0, 7.0])}, hold, CLOCK)
+    found = join_tables([sensors, log], 1.0, ["a"], [], "here", {"hold": "hold"})
+    np.testing.assert_array_equal(found.t, sensors.t)
+    assert found.values[0, found.names.index("hold")] == 7.0
+    with pytest.raises(DataError, match="no time in common"):  # a line ends with its last reading
+        join_tables([sensors, log], 1.0, ["a"], [], "here")
+
+
+def test_a_live_intake_remembers_what_held_before_its_first_sample() -> None:
+    """A heater is stated before the sensor that each sample needs, and not once more."""
+    needed = {"a": Column(("a",), needed=True), "h": Column(("h",), between="hold")}
+    habits = {"h": Habit(0.0, None, False, False, "hold")}
+    sink = Intake(needed, CLOCK, Policy(channels=habits))
+    rows = [{"t": 0.0, "h": 800.0}, {"t": 1.0, "a": 1.0}, {"t": 2.0, "a": 2.0}]
+    outcomes = [sink.take(one, one["t"]) for one in rows] + [sink.flush()]
+    first, *others = [one for outcome in outcomes for one in outcome.ready]
+    assert (first.t, first.values) == (1.0, {"a": 1.0, "h": 800.0})
+    assert all("h" not in one.values for one in others)
+
+
 # --- in cases ----------------------------------------------------------------------------------
 
 
@@ -422,12 +453,14 @@ def test_switches_are_recognised_and_measured_values_are_not() -> None:
     t, rng = np.arange(200.0), np.random.default_rng(2)
     pump = np.array([0.0, 8.0, 12.0, 15.5])[np.arange(200) // 20 % 4]
     heater = 500.0 * (np.arange(200) // 11 % 2)
+    once = np.where(np.arange(200) % 40 == 0, np.arange(200) // 40 % 2, NAN)
     only_changes = np.where(np.diff(heater, prepend=-1.0) != 0.0, heater, NAN)
     coarse = np.round(20.0 + 3.0 * np.sin(t / 30.0), 1)
     for values, expected in (
         (pump, True),
         (heater, True),
         (only_changes, True),
+        (once, True),  # a log of five changes
         (coarse, False),
         (pump + 0.01 * rng.standard_normal(200), False),
         (np.full(200, 7.0), False),

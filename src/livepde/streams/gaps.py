@@ -79,7 +79,10 @@ def _residuals(t: Array, x: Array) -> _Residuals:
     # The error of a cubic grows with the product of the distances, so that a large residual beside
     # a gap is no evidence of a spike.
     reach = np.abs(np.prod([times[:, CENTRE] - times[:, i] for i in others], axis=0))
-    weights /= np.maximum(1.0, reach / np.median(reach))[:, None]
+    # A cubic through two neighbours a moment apart takes their noise for a slope.
+    noise = np.sqrt((weights * weights).sum(axis=1))
+    far = np.maximum(reach / np.median(reach), noise / np.median(noise))
+    weights /= np.maximum(1.0, far)[:, None]
     return _Residuals((weights * values).sum(axis=1), weights)
 
 

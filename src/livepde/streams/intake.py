@@ -266,6 +266,7 @@ class Intake:
         self.past: Past | None = None
         self._open: dict[float, _Open] = {}
         self._recent = deque(recent, maxlen=RECENT)
+        self._before: dict[str, float] = {}  # held inputs of rows before the first sample
         self._times = ChannelTimes(self._recent)
         self._ahead: list[_Held] = []  # rows far ahead, or the first rows, that wait for others
         self._accepted: deque[tuple[float, dict[str, float]]] = deque()  # values as they came
@@ -585,6 +586,8 @@ class Intake:
         came = dict(sample.values)
         for channel in self.columns:
             self._bridge(channel, t, sample, found)
+            if channel in self._before and math.isnan(sample.values.get(channel, NAN)):
+                sample.values[channel] = self._before[channel]
         for channel in without_noise(self.columns, sample.values):
             text = f"t = {t:g}: the noise of the reading is not positive"
             found.remark("invalid", channel, text, sample.tokens[-1])
@@ -596,10 +599,17 @@ class Intake:
         needed = [channel for channel in lacking if self.columns[channel].needed]
         if needed:
             found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
-            sample.values = self._held(sample.values) if self._recent else {}
-            if not sample.values:
+            sample.values = self._held(sample.values)
+            if not self._recent:  # a value that holds is remembered for the first sample
+                self._before |= {
+                    channel: value
+                    for channel, value in sample.values.items()
+                    if self.policy.habit(channel).between == "hold"
+                }
+            if not (self._recent and sample.values):
                 found.spent += sample.tokens
                 return
+        self._before.clear()
         self._recent.append((t, sample.values))
         self._remember(t, came)
         found.ready.append(Ready(t=t, values=sample.values, tokens=tuple(sample.tokens)))

@@ -53,8 +53,11 @@ def join_tables(
     """
     times, first = _on_one_clock(tables, second, where)
     starts, ends = np.transpose([(t[0], t[-1]) for t in times])
+    # What holds until the next reading goes on after the last one.
+    holds = [all((between or {}).get(n) == "hold" for n in table.names) for table in tables]
+    last = np.where(holds, np.inf, ends)
     start = starts.max()
-    if ends.min() < start:
+    if last.min() < start:
         raise DataError(f"{where}: the files have no time in common; check dates and units.")
     width = SAME * (ends.max() - starts.min()) or 1.0
     t, joined = _outer_join(tables, times, width)

@@ -34,7 +34,7 @@ def switches(t: Array, x: Array) -> bool:
     >>> switches(t, np.array([20.0, 20.1, 20.3, 20.2, 20.5, 20.6, 20.9, 21.0]))
     False
     """
-    known = np.isfinite(x)
+    known, rows = np.isfinite(x), len(x)
     t, x = t[known], x[known]
     if len(x) < FEWEST:
         return False
@@ -44,5 +44,7 @@ def switches(t: Array, x: Array) -> bool:
         return False
     levels, sizes = len(np.unique(x)), jumps[jumped]
     repeats = float(np.mean(~jumped))
-    few = levels <= LEVELS and (repeats >= STAYS or len(x) >= FEWEST * levels)
+    # A log of changes has a value in few rows, and none that repeats the one before.
+    changes = repeats == 0.0 and levels < len(x) <= (1.0 - STAYS) * rows
+    few = levels <= LEVELS and (repeats >= STAYS or len(x) >= FEWEST * levels or changes)
     return few or (repeats >= STAYS and float(sizes.max()) > UNEVEN * float(sizes.min()))
