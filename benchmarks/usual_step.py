@@ -19,7 +19,7 @@ from benchmarks.rods import NOISE, Rod, forward_times
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.runs.outcome import Check, Outcome, Table
 
 __all__ = ["BOUNDS", "MEMBERS", "usual_step"]
@@ -42,7 +42,7 @@ MEMBERS, MEMBERS_NODES = 1_000, 31
 MEMBER = 3.0  # forward steps of a member of a fleet, in the mean
 STREAMS = 20  # of members that differ
 
-Times: TypeAlias = tuple[Array, Array, Array]
+Times: TypeAlias = tuple[Array, Mask, Array]
 """Of each sample, whether each had a refit, and of each forward step."""
 
 
@@ -90,11 +90,9 @@ def usual_step(
         median, mean = _fleet(members, last)
         text = f"fleet of {members} rods of {MEMBERS_NODES} nodes, defaults"
         checks.append(Check(f"{text}: sample of a member / forward step", mean, MEMBER, "<="))
-        columns = ("members", "median", "mean", "bound")
+        title = "One sample of a member of a fleet over one forward step"
         row = [(members, median, mean, MEMBER)]
-        tables.append(
-            Table("One sample of a member of a fleet over one forward step", columns, row)
-        )
+        tables.append(Table(title, ("members", "median", "mean", "bound"), row))
     return Outcome(tables=tables, checks=checks, notes=[NOTE] if tables else [])
 
 
