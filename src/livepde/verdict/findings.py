@@ -288,13 +288,22 @@ class Verdict:
             text = "The data fit much better if one column is read otherwise."
             found = Finding("misfit", "do not trust", text, causes[0].subject, causes=tuple(causes))
             return self.with_findings([found])
+        before = {(one.kind, one.subject): one for one in misfit.causes}
+        # What frees a cause is known where the run has named it already.
+        causes = [
+            replace(one, remedy=known.remedy, setting=known.setting)
+            if (known := before.get((one.kind, one.subject)))
+            else one
+            for one in causes
+        ]
         said = {(cause.kind, cause.subject) for cause in causes}
         # An offset or a gain of an input is that of a boundary value, or of a channel.
         said |= {(kind, cause.subject) for cause in causes for kind in ("boundary", "channel")}
         others = [one for one in misfit.causes if (one.kind, one.subject) not in said]
         # Of the same share what was fitted counts more than what a linear model says.
         ranked = sorted([*causes, *others], key=lambda one: -one.share)[:NAMED]
-        same = ranked[0] is misfit.causes[0] if misfit.causes else False
+        first = misfit.causes[0] if misfit.causes else ranked[0]
+        same = (ranked[0].kind, ranked[0].subject) == (first.kind, first.subject)
         # Of a column in another unit, or of another place, no estimate can be right.
         gross = ranked[0].kind in GROSS and ranked[0].share >= HALF
         better = replace(
