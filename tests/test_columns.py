@@ -75,7 +75,7 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
 }
 
 
-def run(columns: dict[str, Any], **options: Any) -> lp.Result:
+def run(columns: dict[str, Any], between: Any = None, **options: Any) -> lp.Result:
     mesh = lp.interval(0.0, LENGTH, 40)
     ends = {"left": lp.Channel("TC1"), "right": lp.Channel("TC5")}
     model = lp.Model(
@@ -84,7 +84,8 @@ def run(columns: dict[str, Any], **options: Any) -> lp.Result:
         A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
     )
     sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(**options), u0=20.0)
+    law = lp.SensitivityLaw(**options)
+    identifier = lp.Identifier(model, sensors, law, u0=20.0, between=between)
     names = ("TC1", "TC5")
     samples = [
         (float(t), {name: columns[name][k] for name in PLACES}, {n: columns[n][k] for n in names})
@@ -126,6 +127,64 @@ def test_columns_that_are_right_are_not_looked_at(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("kind", "shift"), [("hold", 60.0), ("next", -60.0)])
+def test_an_input_that_is_held_is_late_by_whole_samples(kind: str, shift: float):
+    """A switched end: `next` is `hold` a row later, so that both are wrong by three rows here."""
+    _, columns = bar(1)
+    times = columns["t"]
+    steps = np.where((times // 700.0) % 2 > 0.0, 30.0, 20.0)  # constant from row to row
+    dense = run_switched(columns, steps)
+    rows = round(shift / STEP) + (kind == "next")
+    wrong = np.concatenate([np.full(max(rows, 0), steps[0]), steps])[: len(steps)]
+    if rows < 0:
+        wrong = np.concatenate([steps[-rows:], np.full(-rows, steps[-1])])
+    verdict = run({**columns, **dense, "TC5": wrong}, between={"TC5": kind}).last.verdict
+    (misfit,) = (finding for finding in verdict.findings if finding.what == "misfit")
+    side = "late" if shift > 0 else "early"
+    assert misfit.causes[0].text == f"input TC5 is 60 {side}"
+
+
+def run_switched(columns: dict[str, Any], steps: Any) -> dict[str, Any]:
+    """Return the readings of the bar with a right end that holds each value until the next row."""
+    width, alpha = LENGTH / CELLS, bar(1)[0]
+    x = width * (np.arange(CELLS) + 0.5)
+    diagonal = np.full(CELLS, -2.0)
+    diagonal[[0, -1]] = -3.0
+    ones = np.ones(CELLS - 1)
+    A = alpha / width**2 * sp.diags_array([ones, diagonal, ones], offsets=[-1, 0, 1])
+    h = STEP / FINE
+    solver = splu(sp.csc_array(sp.eye_array(CELLS) - h * A))  # implicit Euler: the end jumps
+    left = np.interp(h * np.arange(1, FINE * (COUNT - 1) + 1), columns["t"], columns["TC1"])
+    u, shown = np.full(CELLS, 20.0), [np.full(3, 20.0)]
+    for k in range(COUNT - 1):
+        for j in range(FINE):
+            b = np.zeros(CELLS)
+            b[0] = 2 * alpha / width**2 * left[k * FINE + j]
+            b[-1] = 2 * alpha / width**2 * steps[k]
+            u = solver.solve(u + h * b)
+        shown.append(np.interp(list(PLACES.values()), x, u))
+    noise = NOISE * np.random.default_rng(7).standard_normal((COUNT, 3))
+    return dict(zip(PLACES, (np.array(shown) + noise).T, strict=True))
+
+
+@pytest.mark.slow
+def test_slow_noise_is_no_wrong_column():
+    """Errors that follow each other misfit by chance: no column is blamed beyond a caution."""
+    _, columns = bar(5)
+    rng = np.random.default_rng(2)
+    slow = {}
+    for name in PLACES:
+        e = rng.standard_normal(COUNT)
+        for k in range(1, COUNT):
+            e[k] = 0.9 * e[k - 1] + np.sqrt(1.0 - 0.81) * e[k]
+        slow[name] = columns[name] + NOISE * e
+    verdict = run({**columns, **slow}).last.verdict
+    assert verdict.level in ("trusted", "caution")
+    kinds = {cause.kind for finding in verdict.findings for cause in finding.causes[:1]}
+    assert not kinds & {"unit", "exchange"}
+
+
+@pytest.mark.slow
 def test_a_fault_that_is_in_no_column_is_not_put_on_one():
     """A loss over the whole bar: no column explains more than what the model lacks."""
     _, columns = bar(7)
@@ -163,4 +222,6 @@ def test_causes_are_merged_by_what_they_explain():
     plain = Verdict.of([])
     assert plain.with_causes([Cause("lag", "c", "c is 3 late", 0.4)]) is plain
     (found,) = plain.with_causes([better]).findings
+    assert found.severity == "caution"
+    (found,) = plain.with_causes([Cause("unit", "b", "b is in degF", 0.9)]).findings
     assert found.severity == "do not trust"

@@ -130,3 +130,75 @@ def test_a_step_of_no_length_to_speak_of_is_no_crash(law):
     for k in range(1, 4):
         estimate = who.step(*sample(k))
     assert estimate.status.ok
+
+
+@dataclass(frozen=True)
+class FailingAt(lp.SensitivityLaw):
+    """Fails in the step that ends at a time."""
+
+    at: float = 0.5
+
+    def step(self, work, state, interval):
+        if interval.t1 == self.at:
+            raise LinearAlgebraError("as told")
+        return super().step(work, state, interval)
+
+
+def heated(kind: str, law: Any = FailingAt(), members: int = 0) -> Any:
+    model = heat(
+        lp.interval(0.0, 1.0, 8),
+        lp.Normal(0.1, std=0.05),
+        {"left": lp.Channel("left"), "right": 20.0},
+    )
+    sensors = lp.Points({"a": 0.3, "b": 0.6}, noise=0.1)
+    options: dict[str, Any] = {"u0": 20.0, "between": {"left": kind}}
+    if members:
+        return lp.Fleet(model, sensors, law, members, **options)
+    return lp.Identifier(model, sensors, law, **options)
+
+
+def switched(k: int) -> tuple[float, list[float], dict[str, float]]:
+    """Return a sample of a log of changes: `left` is read at the start and in the fifth row."""
+    inputs = {0: {"left": 20.0}, 5: {"left": 30.0}}.get(k, {})
+    return 0.1 * k, [math.nan, math.nan], inputs
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_what_holds_is_kept_though_its_step_fails(restart: bool):
+    who = heated("hold")
+    for k in range(6):
+        estimate = who.step(*switched(k))
+    assert not estimate.status.ok
+    if restart:
+        other = heated("hold")
+        other.restore(who.dump())
+        who = other
+    forecast = who.forecast([1.0, 40.0])["a"][-1]
+    for k in range(6, 9):
+        estimate = who.step(*switched(k))
+        assert estimate.status.ok
+        assert estimate.held == ()
+    assert who.estimate().u.max() == pytest.approx(30.0)  # the boundary has its new value
+    assert forecast == pytest.approx(27.0, abs=0.1)  # in the steady state, a line from 30 to 20
+
+
+@pytest.mark.parametrize("kind", ["line", "next"])
+def test_what_does_not_hold_is_said_to_be_missing_after_a_failed_step(kind: str):
+    who = heated(kind)
+    for k in range(6):
+        who.step(*switched(k))
+    estimate = who.step(*switched(6))
+    assert estimate.held == ("left",)
+    assert estimate.u.max() == pytest.approx(20.0)
+
+
+def test_members_keep_what_holds_though_their_step_fails():
+    fleet, alone = heated("hold", members=2), heated("hold")
+    for k in range(9):
+        t, z, inputs = switched(k)
+        found, one = fleet.step(t, [z, z], inputs), alone.step(t, z, inputs)
+    assert one.status.ok
+    assert found.member(1).u == pytest.approx(one.u)
+    assert fleet.identifier(0).step(0.9, [math.nan, math.nan]).u == pytest.approx(
+        alone.step(0.9, [math.nan, math.nan]).u
+    )

@@ -376,6 +376,21 @@ def test_an_error_in_a_refit_apart_reaches_who_steps(monkeypatch: pytest.MonkeyP
         numbers_of(insulated(apart=True), rod_samples())
 
 
+@pytest.mark.slow
+def test_numbers_that_end_a_refit_apart_end_no_run(monkeypatch: pytest.MonkeyPatch):
+    def singular(*given: Any) -> Any:
+        raise np.linalg.LinAlgError("singular")
+
+    monkeypatch.setattr(refit_apart, "refitted_now", singular)
+    identifier = insulated(apart=True)
+    for t, z in rod_samples():
+        estimate = identifier.step(t, z)
+        assert estimate.status.ok
+    assert estimate.fit.samples == 128
+    assert not estimate.fit.converged
+    assert estimate.verdict.level == "do not trust"
+
+
 def test_readings_withdrawn_while_a_refit_is_under_way_are_not_in_it():
     """A sensor that is set aside meanwhile brings no reading, from its first misfit on."""
     samples = rod_samples()

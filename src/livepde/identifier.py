@@ -54,7 +54,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 9  # of the checkpoint
+FORMAT = 10  # of the checkpoint
+INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
@@ -165,6 +166,7 @@ class Identifier:
         self._t = float(t0)
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
+        self._known = self._inputs  # the same, or what holds since the sample of a failed step
         self._samples = 0
         self._fingerprint = self._lazy_fingerprint()
         self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
@@ -213,9 +215,10 @@ class Identifier:
             ends["held_counts"].astype(np.int64), ends["held"], ends["unstated"]
         )
         other._steps = StepLedger(ends["steps"].astype(np.int64))
-        values = ends["inputs"].tolist()
-        begun = zip(self.inputs, values, strict=True) if state is not None else ()
-        other._inputs = Inputs(dict(begun))
+        names = self.inputs if state is not None else ()
+        other._inputs, other._known = (
+            Inputs(dict(zip(names, ends[part].tolist(), strict=bool(names)))) for part in INPUTS
+        )
         return other
 
     def _input_noise(self, given: Mapping[str, float]) -> dict[str, float]:
@@ -265,7 +268,7 @@ class Identifier:
 
     def _begin(self, inputs: Inputs) -> None:
         self._state = self._start(inputs)
-        self._inputs = inputs
+        self._inputs = self._known = inputs
 
     def _start(self, inputs: Inputs) -> Any:
         """Return the state of the law at the initial time."""
@@ -354,13 +357,17 @@ class Identifier:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
             self._t, self._z, self._inputs = t, used, values
+            self._known = values
+        else:  # a value that holds until the next reading may not be read again
+            last = {name: values[name] for name in self.problem.control.held.last}
+            self._known = Inputs({**self._known, **last})
         held = (*held, *unstated)
         estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
         return estimate, interval
 
     def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs, and those whose missing value is replaced by the last one."""
-        values, missing = self._channels.filled(named, self._inputs)
+        values, missing = self._channels.filled(named, self._known)
         # A value that holds until the next reading is not missing.
         known = self.problem.control.held.last
         return values, tuple(name for name in missing if name not in known) if known else missing
@@ -409,7 +416,7 @@ class Identifier:
                 f"the sample at t = {t:g} gives no finite initial state: check the values of its "
                 f"inputs {list(self.inputs)}; the run begins with the next one."
             )
-        self._state, self._inputs = state, inputs
+        self._state, self._inputs, self._known = state, inputs, inputs
         # The mean over the first interval comes with its end.
         known = {*self._stated, *self.problem.control.held.next}
         missing = [name for name in self.model.channels if name not in known]
@@ -422,11 +429,13 @@ class Identifier:
     def place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
         ledgers = self._withheld, self._gaps, self._steps
-        return self._state, self._t, self._z, self._inputs, self._samples, ledgers
+        inputs = self._inputs, self._known
+        return self._state, self._t, self._z, inputs, self._samples, ledgers
 
     def return_to(self, place: tuple[Any, ...]) -> None:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
-        self._state, self._t, self._z, self._inputs, self._samples, ledgers = place
+        self._state, self._t, self._z, inputs, self._samples, ledgers = place
+        self._inputs, self._known = inputs
         self._withheld, self._gaps, self._steps = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
@@ -614,7 +623,7 @@ class Identifier:
                 f"{t.tolist()}."
             )
         self._check_reachable(float(t[-1]))
-        planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._inputs)
+        planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._known)
         state, last = self._state, self._last
         if state is None:
             opening = self._opening(planned[0], float(t[0]))
@@ -751,6 +760,7 @@ class Identifier:
             "z": self._z,
             "samples": self._samples,
             "inputs": np.array([self._inputs[c] for c in self._inputs]),
+            "known": np.array([self._known[c] for c in self._known]),
             "withheld": self._withheld.sums,
             "withheld_last": self._withheld.last,
             "held_counts": self._gaps.counts,
@@ -807,7 +817,9 @@ class Identifier:
             )
             steps = StepLedger(leaves["steps"].astype(np.int64))
             names = self.inputs if len(leaves["inputs"]) else ()
-            inputs = Inputs(dict(zip(names, leaves["inputs"].tolist(), strict=True)))
+            inputs, known = (
+                Inputs(dict(zip(names, leaves[part].tolist(), strict=True))) for part in INPUTS
+            )
             if header["begun"]:
                 template = self.law.init(self._work, self._q0, self._u0)
                 state = checkpoint.rebuild(template, leaves)
@@ -816,7 +828,8 @@ class Identifier:
                 f"{where} does not fit this identifier ({error}): build it with the law's options "
                 "as they were when it was saved."
             ) from error
-        self._t, self._samples, self._z, self._inputs = t, samples, z, inputs
+        self._t, self._samples, self._z = t, samples, z
+        self._inputs, self._known = inputs, known
         self._state, self._withheld, self._gaps, self._steps = state, withheld, gaps, steps
         if state is None and not self.inputs:
             self._begin(inputs)

@@ -36,7 +36,7 @@ from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 9  # of the checkpoint
+FORMAT = 10  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 
@@ -143,6 +143,7 @@ class Fleet:
         self._t = np.full(count, float(t0))
         self._z = np.full((count, self.observed.size), np.nan)
         self._inputs = np.full((count, len(self.inputs)), np.nan)
+        self._known = self._inputs.copy()  # the same, or what holds since a step has failed
         self._held = np.zeros((count, len(self.inputs)))  # duration of the gaps of inputs by now
         # What verdicts count, member by member, as `InputLedger` and `StepLedger` do.
         self._held_counts = np.zeros((count, 1 + len(self.inputs)), dtype=np.int64)
@@ -231,7 +232,7 @@ class Fleet:
                         f"member '{name}' gets no finite initial state: check the values of its "
                         f"inputs {list(self.inputs)}; the run begins with the next sample."
                     )
-        self._state, self._inputs = state, inputs
+        self._state, self._inputs, self._known = state, inputs, inputs.copy()
 
     def step(
         self, t: float, z: Values, inputs: Mapping[str, ArrayLike] | None = None
@@ -321,6 +322,9 @@ class Fleet:
         self._t = np.where(good, t, self._t)
         self._z = np.where(good[:, None], used, self._z)
         self._inputs = np.where(good[:, None], values, self._inputs)
+        # A value that holds until the next reading may not be read again.
+        stays = np.array([name in self.problem.control.held.last for name in self.inputs], bool)
+        self._known = np.where(good[:, None] | stays, values, self._known)
         return self._estimate(span, measured, withheld, report, held)
 
     def _opening(self, inputs: Array) -> Array:
@@ -462,7 +466,7 @@ class Fleet:
     @property
     def ends(self) -> dict[str, Array]:
         """Times, measurements, inputs, their gaps and what verdicts count, by member."""
-        names = ("t", "z", "inputs", "held", "held_counts", "unstated", "steps")
+        names = ("t", "z", "inputs", "known", "held", "held_counts", "unstated", "steps")
         return {name: getattr(self, f"_{name}") for name in names}
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
@@ -553,7 +557,7 @@ class Fleet:
             column = named.get(name, values[:, k])
             missing = np.isnan(column)
             if name not in self._one.optional_inputs and missing.any():
-                column = np.where(missing, self._inputs[:, k], column)
+                column = np.where(missing, self._known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]
                     raise MissingInputError(

@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause
 
-__all__ = ["Columns", "likely_columns"]
+__all__ = ["Columns", "Explained", "likely_columns"]
 
 MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
 FEWEST_ROWS = 40
@@ -54,6 +55,13 @@ UNITS: tuple[tuple[str, float, float], ...] = (
     ),
 )
 """What the values of a column look like, and factor and constant that mend them."""
+
+
+class Explained(NamedTuple):
+    """What errors of columns explain: causes, the likeliest first, and misfit over noise."""
+
+    causes: list[Cause]
+    misfit: float
 
 
 @dataclass(frozen=True)
@@ -106,10 +114,14 @@ class Columns:
     options: Refit
 
     @classmethod
-    def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | None:
-        """Return the columns of one member; None if there are too few samples, or no fit."""
-        if not work.fits or work.refit is None or not state.log.shape[1]:
-            return None
+    def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
+        """Return the columns of one member, or why they cannot be looked at."""
+        if work.refit is None:
+            return "the law stores no samples"
+        if not work.fits:
+            return "unknowns move, inputs have noise, or the past fades"
+        if not state.log.shape[1]:
+            return "no sample is stored"
         problem = work.filter.problem
         names, channels = problem.observed.names, problem.channels
         inputs = tuple(name for name in channels if name in problem.model.channels)
@@ -118,11 +130,16 @@ class Columns:
         places |= {name: first + channels.index(name) for name in inputs}
         log = state.log[:, int(state.window[0]) :]
         log = log[:, np.isfinite(log[0, :, 0])]
-        passes = 6 * len(inputs) + 2 * len(inputs) * len(names) + 10 * sum(TRIED.values())
+        # At two places: three errors of each input, and all exchanges with an input.
+        passes = 2 * len(inputs) * (3 + len(names) + len(inputs))
+        passes += PASSES * ROUNDS * sum(TRIED.values())
         each = problem.model.X.dim * (1 + work.filter.reduction.size)
-        rows = min(log.shape[1], MOST_ROWS, int(MOST_WORK / (passes * each)))
+        most = min(MOST_ROWS, int(MOST_WORK / (passes * each)))
+        if most < FEWEST_ROWS:
+            return "the mesh is too large to fit that often"
+        rows = min(log.shape[1], most)
         if rows < FEWEST_ROWS:
-            return None
+            return f"fewer than {FEWEST_ROWS} samples are stored"
         log = log[:, :rows].copy()
         open_gate = replace(work.options, gate=Gate())
         zero = np.zeros(1, dtype=np.int64)
@@ -148,11 +165,15 @@ class Columns:
         if error is None:
             return StoredSamples.of(self.work, self.state)
         begun = self.state if error.numbers else changed(self.state, now=self.state.start)
-        log = self.state.log.copy()
-        at = [self.places[name] for name in error.names]
-        values, t = log[0][:, at], log[0, :, 0]
+        log, names = self.state.log.copy(), error.names
+        at = [self.places[name] for name in names]
+        values = log[0][:, at]
         if error.kind == "exchange":
             values = values[:, ::-1]
+            if not set(names) & set(self.inputs):  # the noise of a reading goes with it
+                sensors = len(self.work.filter.problem.observed.names)
+                noise = [place + sensors for place in at]
+                log[0][:, noise] = log[0][:, noise[::-1]]
         elif error.kind == "offset":
             values = values - error.size
         elif error.kind == "gain":
@@ -161,11 +182,29 @@ class Columns:
             _, factor, constant = UNITS[error.unit]
             values = factor * values + constant
         else:
-            seen = np.isfinite(values[:, 0])
-            values = np.interp(t + error.size, t[seen], values[seen, 0])[:, None]
-            values[~seen] = np.nan
+            values = self._later(names[0], values[:, 0], error.size)[:, None]
         log[0][:, at] = values
         return StoredSamples.of(self.work, changed(begun, log=log))
+
+    def _later(self, name: str, values: Array, by: float) -> Array:
+        """Return the values of a column that come later by a time; NaN stays where it is."""
+        t, held = self.state.log[0, :, 0], self.work.filter.problem.control.held
+        seen = np.isfinite(values)
+        known, times, asked = values[seen], t[seen], t + by
+        if name in held.last:
+            place = np.searchsorted(times, asked, side="right") - 1
+        elif name in held.next:
+            place = np.searchsorted(times, asked, side="left")
+        else:
+            return np.where(seen, np.interp(asked, times, known), np.nan)
+        return np.where(seen, known[np.clip(place, 0, len(known) - 1)], np.nan)
+
+    def whole(self, name: str) -> bool:
+        """Whether a column can only be late by whole samples.
+
+        Readings between two samples would have less noise, and what is held changes with a row.
+        """
+        return name not in self.inputs or name in self.work.filter.problem.control.held
 
     def column(self, name: str) -> Array:
         """Return the values of a column that are there."""
@@ -212,17 +251,17 @@ class _Fit:
 
 
 @nonfinite_allowed()  # such an error explains nothing
-def likely_columns(columns: Columns) -> list[Cause]:
+def likely_columns(columns: Columns) -> Explained:
     """Return the errors of columns that explain most of the misfit, the likeliest first."""
-    samples, search = columns.samples(), _Search(columns)
+    samples, search = columns.samples(), _Trials(columns)
     found = refitted(samples, search.options, last=False)
     if found is None:
-        return []
+        return Explained([], 0.0)
     base, prior = _Fit.about(found.best), samples.about(0.0 * found.best.xi)
     noise = _noise(found.best.residuals)
     misfit = 2.0 * base.cost - noise
     if not misfit > 0.0:
-        return []
+        return Explained([], 0.0)
     # Where a column is grossly wrong the best fit is no place to ask what is.
     places = [base] if prior is None else [base, _Fit.about(prior)]
     promising = [item for at in places for item in search.promising(at, base.cost)]
@@ -237,10 +276,11 @@ def likely_columns(columns: Columns) -> list[Cause]:
             kept.append((share, end[1]))
     # Within a small part of the misfit the error with fewer numbers is likelier.
     kept.sort(key=lambda item: -(item[0] - CLOSE * item[1].numbers))
-    return [_cause(columns, error, share) for share, error in kept if share > 0.0]
+    causes = [_cause(columns, error, share) for share, error in kept if share > 0.0]
+    return Explained(causes, misfit / max(noise, 1e-300))
 
 
-class _Search:
+class _Trials:
     """The errors of some columns, and what they explain."""
 
     def __init__(self, columns: Columns) -> None:
@@ -282,10 +322,7 @@ class _Search:
             yield from self._units(base, name, slopes)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
-        """Return a size that is possible.
-
-        Readings between two samples have less noise than others: a sensor is late by whole samples.
-        """
+        """Return a size that is possible."""
         columns = self.columns
         if kind == "gain":
             return float(np.clip(theta, -0.9, 9.0))
@@ -293,7 +330,7 @@ class _Search:
             longest = LONGEST * columns.interval * columns.state.log.shape[1]
             lag = float(np.clip(theta, -longest, longest))
             step = columns.interval
-            return lag if name in columns.inputs else step * round(lag / step)
+            return step * round(lag / step) if columns.whole(name) else lag
         return theta
 
     def _units(
@@ -402,9 +439,11 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
     problem = columns.work.filter.problem
     what = "input" if first in columns.inputs else "sensor"
     time = f" {problem.model.time_unit}" if problem.model.time_unit else ""
+    unit = problem.observed.observation.unit if what == "sensor" else ""
+    amount = f"{abs(size):.2g} {unit}".rstrip()
     words: dict[str, Callable[[], tuple[str, str]]] = {
         "offset": lambda: (
-            f"{what} {first} reads {abs(size):.2g} too {'much' if size > 0 else 'little'}",
+            f"{what} {first} reads {amount} too {'much' if size > 0 else 'little'}",
             f"Check the offset and the place of {first}.",
         ),
         "gain": lambda: (

@@ -15,6 +15,7 @@ import numpy as np
 from livepde.laws.assimilation import assimilate
 from livepde.laws.filter_state import FilterState
 from livepde.laws.history import intervals_since
+from livepde.laws.law import numerical
 from livepde.laws.member_arrays import changed
 from livepde.laws.refit_options import Refit
 from livepde.laws.refits import refitted_now
@@ -40,7 +41,14 @@ def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
         count = int(fork.samples[0])
         if state.assimilated[0] < count + max(count // LATER, 1):
             return state
-        found = refit.result()
+        try:
+            found = refit.result()
+        except Exception as error:
+            if numerical(error) is None:
+                raise
+            # Of the same samples it would fail again: the filter goes on, and the fit is none.
+            failed = changed(state.fit, samples=fork.samples, converged=np.zeros(1))
+            return _without(changed(state, fit=failed), fork.filter)
         state = changed(state, fit=found.fit)
         if found.now is fork.filter:  # no better trajectory was found
             return _without(state, fork.filter)

@@ -508,10 +508,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
-        found, columns = self.deferred(work, state), Columns.of(work, state)
-        if columns is None or not self.verdict:
+        found = self.deferred(work, state)
+        if not self.verdict:
             return found
-        return found._replace(verdict=with_columns(found.verdict, columns))
+        return found._replace(verdict=with_columns(found.verdict, Columns.of(work, state)))
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

@@ -30,6 +30,8 @@ from livepde.verdict import (
 
 __all__ = ["judge_of", "judged", "with_columns", "with_fit"]
 
+LARGE = 1.0  # misfit over noise that is looked into though no test has found it
+
 
 def judge_of(
     problem: Problem,
@@ -117,17 +119,27 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
     return (lambda: judge().with_findings(found)) if found else judge
 
 
-def with_columns(judge: Callable[[], Verdict], columns: Columns) -> Callable[[], Verdict]:
+def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:
     """Return a verdict that names the columns of the data which explain a misfit.
 
     They are looked for only where something speaks against the estimates.
+
+    Parameters
+    ----------
+    columns
+        The columns, or why they cannot be looked at.
     """
 
     def found() -> Verdict:
         verdict = judge()
         if verdict.level in ("trusted", NOT_JUDGED):
             return verdict
-        return verdict.with_causes(likely_columns(columns))
+        if isinstance(columns, str):
+            return verdict.with_untested(f"errors of single columns: {columns}")
+        causes, misfit = likely_columns(columns)
+        # Slow noise is a misfit, too, of which a column may explain a part by chance.
+        known = any(finding.what == "misfit" for finding in verdict.findings)
+        return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
 
     return found
 

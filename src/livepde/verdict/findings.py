@@ -276,6 +276,11 @@ class Verdict:
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
         return Verdict.of([*kept, *new], self.untested, self.unseen, judged=self.judged)
 
+    def with_untested(self, untested: str) -> Verdict:
+        """Return the verdict with one more thing that was not tested."""
+        more = (*self.untested, untested)
+        return Verdict.of(self.findings, more, self.unseen, judged=self.judged)
+
     def with_causes(self, causes: Sequence[Cause]) -> Verdict:
         """Return the verdict with other causes of its misfit, the likeliest first.
 
@@ -286,7 +291,8 @@ class Verdict:
             if not causes or not causes[0].share >= HALF:
                 return self
             text = "The data fit much better if one column is read otherwise."
-            found = Finding("misfit", "do not trust", text, causes[0].subject, causes=tuple(causes))
+            severity: Severity = "do not trust" if causes[0].kind in GROSS else "caution"
+            found = Finding("misfit", severity, text, causes[0].subject, causes=tuple(causes))
             return self.with_findings([found])
         before = {(one.kind, one.subject): one for one in misfit.causes}
         # What frees a cause is known where the run has named it already.
@@ -304,7 +310,7 @@ class Verdict:
         ranked = sorted([*causes, *others], key=lambda one: -one.share)[:NAMED]
         first = misfit.causes[0] if misfit.causes else ranked[0]
         same = (ranked[0].kind, ranked[0].subject) == (first.kind, first.subject)
-        # Of a column in another unit, or of another place, no estimate can be right.
+        # With a column in another unit, or of another sensor, no estimate can be right.
         gross = ranked[0].kind in GROSS and ranked[0].share >= HALF
         better = replace(
             misfit,
