@@ -508,8 +508,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
-        found, columns = self.deferred(work, state), Columns.of(work, state)
-        if columns is None or not self.verdict:
+        found = self.deferred(work, state)
+        columns = Columns.of(work, state) if self.verdict else None
+        if columns is None:
             return found
         return found._replace(verdict=with_columns(found.verdict, columns))
 
