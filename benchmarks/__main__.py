@@ -62,14 +62,12 @@ def step(
     from benchmarks.rods import RODS, rods
     from benchmarks.step import MODES, QUICK_MODES, QUICK_SIZES, SIZES
     from benchmarks.step import step as benchmark
-    from benchmarks.usual_step import MEMBERS, usual_step
+    from benchmarks.usual_step import MEMBERS, RUNS, usual_step
 
     timed = size or (QUICK_SIZES[:1] if quick else ())
     filters = rods([rod for rod in RODS if not timed or rod.nodes in timed])
     sizes = size or (QUICK_SIZES if quick else SIZES)
-    usual = usual_step(
-        timed or (31, 200, 1_000), runs=2 if quick else 5, members=0 if quick else MEMBERS
-    )
+    usual = usual_step(timed, runs=2 if quick else RUNS, members=0 if quick else MEMBERS)
     laws = benchmark(sizes, modes or (QUICK_MODES if quick else MODES))
     return _both(_both(laws, filters), usual)
 

@@ -117,6 +117,16 @@ class Rod:
             for t, u in self.forward(q, count)
         ]
 
+    def samples_of_members(
+        self, members: int, count: int
+    ) -> list[tuple[float, Array, dict[str, float]]]:
+        """Return samples of a fleet, measurements of shape (members, sensors); channels common."""
+        streams = [self.samples(count, seed) for seed in range(members)]
+        return [
+            (row[0][0], np.array([one[1] for one in row]), row[0][2])
+            for row in zip(*streams, strict=True)
+        ]
+
     @cached_property
     def matrices(self) -> lean.Matrices:
         """The process as the lean reference has it."""
@@ -268,11 +278,7 @@ def fleet(members: int = MEMBERS, *, runs: int = RUNS, first: int = FIRST) -> Ou
     checks: list[Check] = []
     for ends in ENDS:
         given = Rod(MEMBERS_NODES, 2, ends)
-        streams = [given.samples(first, seed) for seed in range(members)]
-        samples = [
-            (row[0][0], np.array([one[1] for one in row]), row[0][2])
-            for row in zip(*streams, strict=True)
-        ]
+        samples = given.samples_of_members(members, first)
         ratios = np.array([_fleet_pair(given, members, samples) for _ in range(runs)])
         median, mean, apart = np.median(ratios, axis=0)
         rows.append((ends, float(median), float(mean)))

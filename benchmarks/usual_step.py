@@ -1,10 +1,10 @@
 """Cost of a usual sample of `SensitivityLaw` with its defaults on rods, in forward steps.
 
-The samples 100 to 300 of a stream are timed one by one. As many forward steps of the same model by
-implicit Euler with a known parameter follow at once, since between samples they would find the
-processor's caches without their data; the matrix is factorised once. The same sample is the same
-work in each run: of the runs the least time of each sample counts, so that slow moments of the
-machine do not. A call with a refit in it is one after which `Estimate.fit` is another one.
+The samples 100 to 300 of a stream are timed one by one. Then follow forward steps of the same model
+by implicit Euler with a known parameter, its matrix factorised once. Between samples these steps
+would find the processor's caches without their data. A sample is the same work in each run.
+Therefore its least time over all runs counts, so that slow moments of the machine do not. A sample
+includes a refit if `Estimate.fit` has changed after it.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from benchmarks.rods import NOISE, Rod, forward_times
+from benchmarks.rods import Rod, forward_times
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array, Mask
 from livepde.runs.outcome import Check, Outcome, Table
 
-__all__ = ["BOUNDS", "MEMBERS", "usual_step"]
+__all__ = ["BOUNDS", "MEMBERS", "RUNS", "usual_step"]
 
 BOUNDS: dict[tuple[int, int], float] = {
     (31, 2): 9.0,
@@ -40,39 +40,35 @@ LARGEST = 60.0  # forward steps of a call without a refit
 RUNS = 5
 MEMBERS, MEMBERS_NODES = 1_000, 31
 MEMBER = 3.0  # forward steps of a member of a fleet, in the mean
-STREAMS = 20  # of members that differ
+NOTE = (
+    "The default law: one forward step is livepde.simulate by implicit Euler, with the factor "
+    "kept. Of each sample the least time of all runs counts, since its work is the same in each. "
+    "mean: refits included; largest: without them."
+)
 
 Times: TypeAlias = tuple[Array, Mask, Array]
 """Of each sample, whether each had a refit, and of each forward step."""
 
 
-def usual_step(
-    sizes: Sequence[int] = (31, 200, 1_000),
-    *,
-    runs: int = RUNS,
-    members: int = MEMBERS,
-    last: int = LAST,
-) -> Outcome:
+def usual_step(sizes: Sequence[int] = (), *, runs: int = RUNS, members: int = MEMBERS) -> Outcome:
     """Time samples of the default law on rods of some sizes, and of a fleet.
 
     Parameters
     ----------
     sizes
-        Numbers of nodes.
+        Numbers of nodes; empty: all of `BOUNDS`.
     runs
         How often each rod is run.
     members
-        Of the fleet of rods with 31 nodes; 0: none.
-    last
-        Number of the last sample.
+        Number of members of a fleet of rods with 31 nodes; 0: no fleet.
     """
     rows: list[tuple[Any, ...]] = []
     checks: list[Check] = []
     for (nodes, unknowns), bound in BOUNDS.items():
-        if nodes not in sizes:
+        if sizes and nodes not in sizes:
             continue
         given = Rod(nodes, unknowns, "source")
-        spent, refits, forward = _timed(given, runs, last)
+        spent, refits, forward = _timed(given, runs)
         costs = spent / np.median(forward)
         median, mean, usual = float(np.median(costs)), float(costs.mean()), costs[~refits]
         largest = float(usual.max())
@@ -84,10 +80,10 @@ def usual_step(
             Check(f"{text}, largest without a refit", largest, LARGEST, "<="),
         ]
     columns = ("nodes", "unknowns", "median", "mean", "mean, no refits", "largest", "bound")
-    title = f"One sample of the default law over one forward step, samples {FIRST} to {last}"
+    title = f"One sample of the default law over one forward step, samples {FIRST} to {LAST}"
     tables = [Table(title, columns, rows)] if rows else []
-    if members and MEMBERS_NODES in sizes:
-        median, mean = _fleet(members, last)
+    if members and (not sizes or MEMBERS_NODES in sizes):
+        median, mean = _fleet(members)
         text = f"fleet of {members} rods of {MEMBERS_NODES} nodes, defaults"
         checks.append(Check(f"{text}: sample of a member / forward step", mean, MEMBER, "<="))
         title = "One sample of a member of a fleet over one forward step"
@@ -96,17 +92,10 @@ def usual_step(
     return Outcome(tables=tables, checks=checks, notes=[NOTE] if tables else [])
 
 
-NOTE = (
-    "The default law: one forward step is livepde.simulate by implicit Euler, with the factor "
-    "kept. Of each sample the least time of all runs counts, since its work is the same in each. "
-    "mean: refits included; largest: without them."
-)
-
-
-def _timed(given: Rod, runs: int, last: int) -> Times:
+def _timed(given: Rod, runs: int) -> Times:
     """Return the least times of samples and forward steps over some runs."""
-    samples, spent, forward = given.samples(last), [], []
-    refits = np.zeros(last - FIRST + 1, dtype=bool)
+    samples, spent, forward = given.samples(LAST), [], []
+    refits = np.zeros(LAST - FIRST + 1, dtype=bool)
     for _ in range(runs):
         identifier = Identifier(given.model, given.sensors, SensitivityLaw(), u0=0.0)
         fit, times = None, []
@@ -118,21 +107,18 @@ def _timed(given: Rod, runs: int, last: int) -> Times:
                 refits[number - FIRST] |= estimate.fit != fit
             fit = estimate.fit
         spent.append(times)
-        forward.append(forward_times(given, last))
+        forward.append(forward_times(given, LAST))
     return np.min(spent, axis=0), refits, np.min(forward, axis=0)
 
 
-def _fleet(members: int, last: int) -> tuple[float, float]:
+def _fleet(members: int) -> tuple[float, float]:
     """Return median and mean cost of a sample of one member, in forward steps."""
     given = Rod(MEMBERS_NODES, 2, "source")
-    streams = [given.samples(last, seed) for seed in range(min(members, STREAMS))]
-    noise = np.random.default_rng(0).standard_normal((last + 1, members, 4))
     fleet = Fleet(given.model, given.sensors, SensitivityLaw(), members, u0=0.0)
     spent = []
-    for number, row in enumerate(zip(*streams, strict=True)):
-        z = np.array([row[k % len(row)][1] for k in range(members)]) + NOISE * noise[number]
+    for sample in given.samples_of_members(members, LAST):
         begun = process_time()
-        fleet.step(row[0][0], z, row[0][2])
+        fleet.step(*sample)
         spent.append(process_time() - begun)
-    costs = np.array(spent[FIRST:]) / (members * np.median(forward_times(given, last)))
+    costs = np.array(spent[FIRST:]) / (members * np.median(forward_times(given, LAST)))
     return float(np.median(costs)), float(costs.mean())

@@ -71,9 +71,9 @@ numbers, and a test says so. Bounds mean forward steps of commit 51ef98c, so tha
 step does not make them harder; `python -m benchmarks.earlier` steps that commit and today's sources
 in turns, in a process each, and prints today's forward step over that one's.
 
-The tables of usual samples time `SensitivityLaw` with its defaults on the samples 100 to 300, and a
-fleet of 1000 rods with the defaults of fleets. There the forward step is one of implicit Euler.
-Refits count in the mean, and not in the largest sample. Checks that fail are marked `FAILED`.
+The same command times usual samples: `SensitivityLaw` with its defaults on the samples 100 to 300,
+and a fleet of 1000 rods with the defaults of fleets. There a forward step is one of implicit Euler.
+The mean includes refits, the largest sample does not. Checks that fail are marked `FAILED`.
 """
 MEMORY = """\
 ![Memory per state unknown](performance/memory.png)

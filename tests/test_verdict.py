@@ -150,6 +150,24 @@ def test_a_lag_is_named_with_its_size_and_what_it_does_to_the_estimate():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("fault", ["none", "lag", "late offset"])
+def test_a_start_that_is_off_hides_no_other_fault(fault: str):
+    z = shown().copy()
+    if fault == "lag":
+        z[:, 2] = np.interp(TIMES - 4 * (TIMES[1] - TIMES[0]), TIMES, z[:, 2])
+    elif fault == "late offset":
+        z[len(z) // 2 :, 0] += 2.5 * NOISE
+    found = run(z + errors(), u0=0.08 if fault == "lag" else 0.14)[1].verdict
+    kinds = {cause.kind for finding in found.findings for cause in finding.causes}
+    assert "initial" in kinds
+    if fault == "none":
+        assert (found.level, [finding.what for finding in found.findings]) == ("trusted", ["start"])
+    else:
+        assert found.level != "trusted"
+        assert fault.split()[-1] in kinds
+
+
+@pytest.mark.slow
 def test_a_sensor_elsewhere_is_named():
     found = run(shown() + errors(), places={**PLACES, "B": 0.56})[1].verdict
     assert ("position", "B") in named(found)

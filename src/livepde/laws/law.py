@@ -434,13 +434,13 @@ class Law(ABC, Generic[Work, State]):
         return state
 
     def final(self, work: Work, state: State) -> Deferred:
-        """Return as `deferred` what is to be read at the end of a run; here the same."""
+        """Return belief and verdict as `deferred`, for the end of a run; here the same."""
         return self.deferred(work, state)
 
     def live(self) -> Law[Work, State]:
         """Return the law for a run that waits for its source; here the same.
 
-        A law that now and then computes for long does that beside the samples there.
+        If some steps of a law take long, the law returned moves that work into a thread.
         """
         return self
 

@@ -1,10 +1,12 @@
-"""Values of sensors that lie far from their neighbours, or from most others, in time order.
+"""Values of sensors that lie far from their neighbours in time, or from most others.
 
-Values are in units of the noise, shape (samples, sensors), NaN where there is none. Of at most
-`FEW` values of a sensor none is called far off.
+Values are in units of the noise, shape (samples, sensors), NaN where there is none. If a sensor has
+at most `FEW` values, all of them count as near.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -18,7 +20,7 @@ NORMAL = 1.4826  # standard deviation of normal values over the median of their 
 
 
 def usual_size(values: Array) -> float:
-    """Return the standard deviation that the median of the sizes of values tells, at least 1."""
+    """Return the standard deviation by the median of the sizes of values, at least 1."""
     return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
 
 
@@ -27,13 +29,7 @@ def near_neighbours(values: Array, limit: float) -> Mask:
 
     A model error, which changes slowly, stays.
     """
-    near = np.isfinite(values)
-    for k, column in enumerate(values.T):
-        (places,) = near[:, k].nonzero()
-        if len(places) > FEW:
-            away = column[places] - _of_neighbours(column[places])
-            near[places, k] = np.abs(away) <= limit * usual_size(away)
-    return near
+    return _near(values, limit, _of_neighbours)
 
 
 def near_most(values: Array, limit: float) -> Mask:
@@ -41,11 +37,16 @@ def near_most(values: Array, limit: float) -> Mask:
 
     A sensor that shows a wrong constant for some time has neighbours that agree with it.
     """
+    return _near(values, limit, np.median)
+
+
+def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
+    """Return which values lie within `limit` usual distances from the centre of their sensor."""
     near = np.isfinite(values)
     for k, column in enumerate(values.T):
         (places,) = near[:, k].nonzero()
         if len(places) > FEW:
-            away = column[places] - np.median(column[places])
+            away = column[places] - centre(column[places])
             near[places, k] = np.abs(away) <= limit * usual_size(away)
     return near
 

@@ -135,7 +135,7 @@ class SensitivityState:
     fit
         The last refit.
     fork
-        A refit under way beside the samples.
+        A refit under way while samples continue.
     older, newer, since_older, since_newer
         Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     log
@@ -222,16 +222,16 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class Fork:
-    """A refit under way beside the samples; arrays without members where there is none.
+    """A refit under way while samples continue; arrays without members where there is none.
 
     Attributes
     ----------
     filter
-        The filter where the refit began; after it that which is to take the samples since.
+        The filter where the refit began; once the refit has ended, the filter of its result.
     samples
         How many samples are fitted, shape (1,).
     row
-        Row of the log that the filter has taken last, shape (1,).
+        Row of the log that the filter has assimilated last, shape (1,).
     fitted
         True once the refit has ended, shape (1,).
     """

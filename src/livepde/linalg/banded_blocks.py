@@ -94,12 +94,8 @@ class BandedBlocks:
 
     def _mirrored(self, data: Array) -> bool:
         """Return True if a tridiagonal matrix is symmetric to the bit."""
-        _, upper, _, lower = self._rows(self.band(data))
+        _, upper, _, lower = self.band(data).reshape(self.solver.storage[0]).T
         return np.array_equal(upper[1:], lower[:-1])
-
-    def _rows(self, storage: Array) -> Array:
-        """Return LAPACK's band storage of one matrix or more, shape (height, blocks n)."""
-        return storage.reshape(-1, self.solver.storage[0][1]).T
 
     def band(self, data: Array) -> Array:
         """Return matrices of shape (..., nnz) in band storage, shape (..., size)."""

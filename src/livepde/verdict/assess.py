@@ -23,6 +23,7 @@ from livepde.verdict.evidence import (
     levels,
     mean_squares,
     quiet,
+    unsuspicious,
 )
 from livepde.verdict.findings import (
     FEWEST,
@@ -173,14 +174,17 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
     chance_of = f"(one such run in {_many(evidence.whitened)} would look so by chance)"
-    evident = math.exp(min(evidence.whitened, 700.0))
-    # The state forgets where it began: later readings determine the unknowns without it.
-    if causes[0].kind == "initial" and not grave and (recent or understood):
+    e_value = math.exp(min(evidence.whitened, 700.0))
+    # The state forgets where it began, so that later readings determine the unknowns without it.
+    # What they show has another cause, and is no matter of the start.
+    later = evidence.log_e[at.ledger.age < at.ledger.age[0]]
+    forgotten = recent or (understood and unsuspicious(later))
+    if causes[0].kind == "initial" and not grave and forgotten:
         text = (
             f"The readings do not fit the initial state {chance_of}, which moves no unknown by a "
             "standard deviation."
         )
-        yield Finding("start", "note", text, "", evident, "e-value", causes, shift=shift)
+        yield Finding("start", "note", text, "", e_value, "e-value", causes, shift=shift)
         return
     text = (
         "The model does not explain the data: what is left of the readings is not noise "
@@ -191,7 +195,7 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         "do not trust" if grave or not understood else "caution",
         text,
         subject=causes[0].subject,
-        evidence=evident,
+        evidence=e_value,
         measure="e-value",
         causes=causes,
         shift=shift,

@@ -35,6 +35,7 @@ __all__ = [
     "levels",
     "mean_squares",
     "quiet",
+    "unsuspicious",
 ]
 
 ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
@@ -144,11 +145,21 @@ def quiet(ledger: Ledger, log_e: Array) -> bool:
     log_e
         Of all windows and directions.
     """
-    if log_e.size:
-        each = scipy.special.logsumexp(log_e[1:], axis=1) - np.log(log_e.shape[1])
-        if not (each < -np.log(CAUSES)).all():
-            return False
-    return following(ledger, -1) is None
+    return unsuspicious(log_e[1:]) and following(ledger, -1) is None
+
+
+def unsuspicious(log_e: Array) -> bool:
+    """Return whether no window has evidence against the model.
+
+    Parameters
+    ----------
+    log_e
+        Of some windows and all directions.
+    """
+    if not log_e.size:
+        return True
+    each = scipy.special.logsumexp(log_e, axis=1) - np.log(log_e.shape[1])
+    return bool((each < -np.log(CAUSES)).all())
 
 
 def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:

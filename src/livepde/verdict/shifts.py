@@ -90,7 +90,7 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
     if not total > SHIFTED or not sizes:
         return
-    # Shares may cancel in the total: each that is as large as it matters is named with its remedy.
+    # Shares may cancel in the total: the largest is named, and each from `SHARED` on.
     largest = max(sizes.values())
     parts = sorted(sizes, key=lambda kind: -sizes[kind])
     parts = [kind for kind in parts if sizes[kind] >= min(largest, SHARED)]
@@ -114,8 +114,8 @@ def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
     moved = {label: -shift for label, shift in shifts.by(HOLD).items()}
     text = (
         'Inputs are held between their readings (`between = "hold"` or `"next"`), but change as '
-        f"smoothly as measured values do: as straight lines they would move the unknowns by "
-        f"{total:.1f} standard deviations{_listed(moved)}. The intervals do not contain that."
+        "smoothly as measured values do. As straight lines they would move the unknowns by "
+        f"{total:.1f} standard deviations{_listed(moved)}. The intervals do not contain this shift."
     )
     remedy = 'If these inputs are measured at single moments, use `between = "line"`.'
     yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
