@@ -357,7 +357,8 @@ def test_every_nth_row_has_the_integral_of_all(tmp_path: Path) -> None:
         rows, integral = Thinned([between]), 0.0
         last_t, last = NAN, NAN
         for k in range(200):
-            found = rows.take(float(t[k]), x[k : k + 1], k % 7 == 0 or k == 199)
+            chosen = k % 7 == 0 or k == 199
+            found = rows.take(float(t[k]), x[k : k + 1], chosen=chosen, whole=True)
             if found is None:
                 continue
             if k:
@@ -377,6 +378,23 @@ def test_a_row_without_a_needed_sensor_keeps_its_switch() -> None:
     assert dict(table.remarks) == {("skipped", "a"): 3}
     late = tabulated(t, {"a": a, "h": h}, needed, Clock("t", start=2.5))
     np.testing.assert_array_equal(late.values[:, 1], [7.0, NAN])  # as it was before the start
+
+
+def test_what_held_before_the_start_of_the_data_holds_in_each_kind_of_source() -> None:
+    rows = [{"t": 0.0, "h": 7.0, "a": 0.0}, *({"t": float(k), "a": float(k)} for k in range(1, 6))]
+    columns, clock = {"a": Column(("a",)), "h": Column(("h",), between="hold")}, Clock("t", start=3)
+    known = {n: [one.get(n, NAN) for one in rows] for n in ("a", "h")}
+    table = tabulated([one["t"] for one in rows], known, columns, clock)
+    lines = [*JsonLines([json.dumps(one) for one in rows], columns, clock)]
+    habits = {"h": Habit(0.0, None, False, False, "hold")}
+    sink = Intake(columns, clock, Policy(channels=habits))
+    outcomes = [sink.take(one, one["t"]) for one in rows] + [sink.flush()]
+    live = [one for outcome in outcomes for one in outcome.ready]
+    np.testing.assert_array_equal(table.t, [3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(table.values[:, 1], [7.0, NAN, NAN])
+    np.testing.assert_array_equal([one.z["h"] for one in lines], table.values[:, 1])
+    assert [one.t for one in live] == table.t.tolist()
+    assert [one.values.get("h") for one in live] == [7.0, None, None]
 
 
 def test_a_live_intake_has_the_samples_of_the_table() -> None:
@@ -548,6 +566,37 @@ def test_a_live_run_of_a_log_of_changes_is_the_batch_run(tmp_path: Path) -> None
     assert found.t == expected.t
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
     assert not any(finding.what == "input" for finding in expected.verdict.findings)
+
+
+HEATED = """
+equation = "conduction"
+initial = "interpolate"
+mesh = { from = 0, to = "10 cm", cells = 10 }
+data = { file = "rows.csv", time = "t", time_unit = "s" }
+boundary.left = { flux = "heater" }
+unknowns.k = { prior = "0.8 W/(m K)", std = "0.4 W/(m K)", transform = "log" }
+options.C = "1.4e6 J/(m^3 K)"
+[channels]
+T = { role = "sensor", column = "T", at = "3 cm", noise = "0.2 K" }
+heater = { role = "input", column = "h", between = "hold" }
+"""
+
+
+def test_a_live_run_begins_with_what_rows_before_it_stated(tmp_path: Path) -> None:
+    """The heater is logged once, before the first reading that the initial state is made of."""
+    (tmp_path / "case.toml").write_text(HEATED)
+    rows = [{"t": 0.0, "h": 800.0}, *({"t": 60.0 * k, "T": 20.0 + k} for k in range(1, 4))]
+    case = cases.load(tmp_path / "case.toml")
+    with LiveCase(case, Rows(rows), path=tmp_path / "journal.sqlite") as wiring:
+        live = wiring.live()
+        assert wiring.prepared.first.z == {"T": 21.0, "heater": 800.0}
+        live.run()
+        found = live.identifier.estimate()
+    one = cases.load(tmp_path / "case.toml").begin(wiring.prepared.first).identifier
+    for row in rows[1:]:
+        expected = one.step(row["t"], {"T": row["T"], "heater": 800.0})
+    assert found.t == expected.t
+    np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
 
 
 @pytest.mark.slow

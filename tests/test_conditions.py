@@ -78,6 +78,7 @@ def test_says_what_is_wrong_with_a_condition() -> None:
         ({"boundary": {"right": Flux(1.0)}}, "has a value"),
         ({"boundary": {"left": Flux("J")}}, "none of the unknowns"),
         ({"unknowns": {"J": lp.Normal()}}, "no condition names the unknown 'J'"),
+        ({"boundary": {"left": Flux(1.0)}, "per": "C"}, "per='C' is not an unknown of the model"),
         ({"sources": {"s": Source(1.0, "core")}}, "no subdomain 'core'"),
         ({"sources": {"s": Source(1.0, lambda x: x[0] > 2.0)}}, "no cell"),
     ):
@@ -354,13 +355,13 @@ def divided(**options: Any) -> lp.Model:
     ],
 )
 @pytest.mark.parametrize(
-    "own", [{}, {"source": lp.Normal(2.0, 1.0)}, {"loss": lp.Normal(2.0, 1.0)}]
+    "own", [{}, *({name: lp.Normal(2.0, 1.0)} for name in ("source", "loss", "transfer"))]
 )
 def test_an_unknown_heat_capacity_is_as_the_known_one_of_its_value(conditions, own) -> None:
     """The divided equation and that with C in the mass matrix are one at the same value of C."""
     unknowns = {"J": lp.Normal(6.0, 1.0)} if "[Flux" in str(conditions) else {}
     inputs = {name: 6.0 for name in ("J",) if "Channel" in str(conditions)}
-    inputs |= {"ambient": 5.0} if "loss" in own else {}
+    inputs |= {"ambient": 5.0} if {"loss", "transfer"} & set(own) else {}
     known = conduction(lp.interval(0.0, LENGTH, 40), lp.Normal(K, 1.0), {"right": 0.0}, C=C, **own)
     models = (
         with_conditions(known, **conditions, unknowns=unknowns),
@@ -401,7 +402,7 @@ q = { role = "input", column = "q" }
     ("condition", "text"),
     [
         ("", "unknowns.C: temperatures alone do not determine 'C'"),
-        ("boundary.left = { flux = 0 }", "needs a known flux, exchange or source"),
+        ("boundary.left = { flux = 0 }", "requires a known flux, exchange or source"),
         ('boundary.left = { flux = "q" }\noptions.C = 3', "options.C: unknowns.C is stated, too"),
     ],
 )

@@ -37,7 +37,25 @@ def test_a_field_is_zero_where_values_are_known_and_as_large_as_stated():
     mesh = lp.interval(0.0, 2.0, 80)
     field = lp.random_field(mesh, 3.0, known={0.2: 20.0, 1.5: 10.0})
     assert std_of(field, [0.2, 1.5]) == pytest.approx(0.0, abs=1e-3)
-    assert std_of(field, mesh.p[0]).max() == pytest.approx(3.0, rel=0.02)
+    assert std_of(field, mesh.p[0]).max() == pytest.approx(3.0, rel=1e-9)
+
+
+def test_a_stated_size_that_few_functions_do_not_have_is_refused():
+    """Eight functions were returned, with a tenth of the variance that was stated."""
+    mesh = lp.interval(0.0, 1.0, 100)
+    with pytest.raises(lp.errors.SpaceError, match="represent 13% of the variance"):
+        lp.random_field(mesh, 1.0, length=0.01)
+    size = std_of(lp.random_field(mesh, 1.0, length=0.01, most=100), mesh.p)
+    assert size == pytest.approx(1.0, rel=0.05)
+
+
+def test_a_field_whose_values_are_all_known_is_none():
+    mesh = lp.interval(0.0, 1.0, 4)
+    for std in (None, 1.0):
+        assert (
+            lp.random_field(mesh, std, known=dict(zip(mesh.p[0], [2, 1, 4, 1, 3], strict=True)))
+            == ()
+        )
 
 
 def test_the_variance_is_that_of_kriging():
@@ -164,7 +182,7 @@ def test_smoothed_ends_as_filtered_and_begins_nearer_to_the_truth():
     assert float(smoothed["k"][-1]) == pytest.approx(
         estimate["k"].median, abs=0.1 * estimate["k"].deviation
     )
-    x = np.asarray(smoothed["vertex_x"] if "vertex_x" in smoothed else one.model.state.mesh.p[0])
+    x = one.model.state.mesh.p[0]
     first = np.asarray(smoothed["u"][0])
     true = line(x[None]) + 1.2 * bow(x[None])
     assert np.abs(first - true)[5:].max() < 0.5 * np.abs(first - line(x[None]))[5:].max()
@@ -320,13 +338,23 @@ def test_a_stated_profile_may_be_uncertain(tmp_path):
         ('from = "readings", sdt = "1 K"', "no key 'initial.sdt'; did you mean 'std'"),
         ('from = "raedings"', "initial: got 'raedings'; did you mean 'readings'"),
         ('from = "readings", std = 0', "initial.std: got 0.0; expected more than 0"),
-        ('from = "interpolate-exact", std = 1', "takes the start as exact"),
+        ('from = "interpolate-exact", std = 1', "'interpolate-exact' has no errors"),
         ('from = 20, length = "1 m"', "add initial.std"),
     ],
 )
 def test_what_makes_no_sense_is_refused(tmp_path, initial, text):
     with pytest.raises(lp.errors.CaseError, match=text):
         prepared(tmp_path, f"{{ {initial} }}")
+
+
+def test_a_length_that_is_too_short_is_refused_with_its_key(tmp_path):
+    text = INTERPOLATED_ROD_CASE.replace("cells = 10", "cells = 100").replace(
+        '"interpolate"', '{ from = "20 degC", std = "1 K", length = "1 mm" }', 1
+    )
+    (tmp_path / "rows.csv").write_text("t,left,T\n0,20,22\n300,20,22\n")
+    (tmp_path / "case.toml").write_text(text + CHANNELS)
+    with pytest.raises(lp.errors.CaseError, match="initial: random_field: 8 functions"):
+        cases.load(tmp_path / "case.toml").prepare()
 
 
 def test_a_case_with_the_gradient_law_refuses_its_size(tmp_path):

@@ -15,7 +15,7 @@ from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
 from livepde.cases.schema import CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
-from livepde.errors import CaseError, MissingInputError
+from livepde.errors import CaseError, MissingInputError, SpaceError
 from livepde.fem import (
     MeanReverting,
     Normal,
@@ -366,22 +366,23 @@ def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
             ("length", initial.length, case.equation.length_unit),
         )
     )
+    known = None
     if _made_of_readings(case):
         known = dict(zip(*_level(_initial_readings(case, first)), strict=True))
+    with case.located("initial", SpaceError):
         return random_field(case.mesh, std, known=known, length=length)
-    return () if std is None else random_field(case.mesh, std, length=length)
 
 
 def check_initial(case: CaseContent) -> None:
-    """Refuse an uncertainty of the initial state that nothing could use."""
+    """Raise an error for an uncertainty of the initial state that the run could not use."""
     initial = case.spec.initial
     if initial is None or isinstance(initial, dict) or (initial.std, initial.length) == (None,) * 2:
         return
     key = "initial.std" if initial.std is not None else "initial.length"
     if initial.start == EXACT:
-        raise case.error(key, f"'{EXACT}' takes the start as exact; use from = 'readings'.")
+        raise case.error(key, f"'{EXACT}' has no errors; use from = 'readings'.")
     if initial.std is None and not _made_of_readings(case):
-        raise case.error(key, "it needs the standard deviation of the start; add initial.std.")
+        raise case.error(key, "requires the standard deviation of the start; add initial.std.")
     if case.equation.components:
         raise case.error(key, "is only valid for a state of one component; leave it out.")
     if case.spec.law.kind != "sensitivity":

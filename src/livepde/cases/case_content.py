@@ -321,7 +321,7 @@ def _options_of(case: CaseContent) -> dict[str, Any]:
         key = f"options.{name}"
         if name == case.equation.storage and name in case.spec.unknowns:
             if name in given:
-                raise case.error(key, f"unknowns.{name} is stated, too; keep one of both.")
+                raise case.error(key, f"unknowns.{name} is stated, too; keep one of the two.")
             continue
         if name in given:
             values[name] = _option(case, option, given[name], key)

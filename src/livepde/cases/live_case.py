@@ -209,6 +209,8 @@ class LiveCase:
         why = told = "no sample came"
         heard = time.monotonic()
         found: list[Ready] = []
+        holds = [n for n, item in self.case.spec.channels.items() if item.between == "hold"]
+        held: dict[str, float] = {}  # what holds from samples in which the run cannot begin
         while not stopping.is_set() and (found or not self._feed.done):
             new = list(self._feed.poll(LOOK))
             heard = self._listened(heard)
@@ -218,6 +220,9 @@ class LiveCase:
                 gather(irregular, remark)
             while found and not self._too_few(found):
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
+                held |= {n: values[n] for n in holds if not math.isnan(values[n])}
+                values |= held
+                found[0] = replace(found[0], values=found[0].values | held)
                 try:
                     return self._prepared(Sample(t=found[0].t, z=values)), found
                 except DataError as error:

@@ -347,11 +347,11 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
         if entry := _input_of(name, inputs):
             unit = _stated(name, inputs.pop(entry).unit)
             given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
-            told = _range(values)
+            comment = _range(values)
             if _switches(table, name):
                 given["between"] = "hold"
-                told += ", constant stretches with jumps"
-            found.append(FoundChannel(entry, given, (name,), told))
+                comment += ", constant stretches with jumps"
+            found.append(FoundChannel(entry, given, (name,), comment))
         else:
             label = key if key and keys.count(key) == 1 else name
             found.append(_sensor(equation, label, name, values))

@@ -384,9 +384,9 @@ def _check_drive(case: CaseContent, storage: str) -> None:
     if any(amount not in (None, 0.0) and amount not in spec.unknowns for amount in amounts):
         return
     text = (
-        f"temperatures alone do not determine '{storage}': it needs a known flux, exchange or "
-        "source, such as boundary.left = { flux = 'CHANNEL' } of a heat-flux plate, or sources of "
-        f"a known power; add one, or state options.{storage}."
+        f"temperatures alone do not determine '{storage}'; it requires a known flux, exchange or "
+        "source. Add one, such as boundary.left = { flux = 'CHANNEL' } of a heat-flux plate, or "
+        f"state options.{storage}."
     )
     raise case.error(f"unknowns.{storage}", text)
 

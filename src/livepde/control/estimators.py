@@ -134,7 +134,7 @@ class Learned:
         lines = [c for c in identifier.inputs if c not in identifier.problem.control.held.next]
         if lines:
             raise ConfigurationError(
-                "Learned: a sample of a loop contains the inputs applied since the last one: build "
+                "Learned: a sample of a loop contains the inputs applied since the last one; build "
                 f"the identifier with between={dict.fromkeys(lines, 'next')}."
             )
         for what, mine, theirs in (

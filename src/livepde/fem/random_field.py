@@ -17,9 +17,11 @@ __all__ = ["random_field"]
 
 MOST = 8  # functions of a field at most
 KEPT = 0.98  # share of the mean variance that they represent, if so many are enough
+LEAST = 0.5  # share of it below which a stated deviation is not represented
 CANDIDATES = 2000  # vertices that are looked at
 LENGTH = 0.5  # correlation length, as a share of the largest side of the domain
 NUGGET = 1e-10  # of the variance: places that are close to each other stay independent
+ROUNDING = 100.0 * NUGGET  # of the variance: no more is left where a value is known
 
 Known: TypeAlias = Mapping[Any, float]
 
@@ -87,7 +89,8 @@ def random_field(
     Raises
     ------
     SpaceError
-        A length or deviation that is not positive.
+        A length or deviation that is not positive, or a stated deviation of which the functions
+        represent less than half of the variance, because the length is short.
 
     Examples
     --------
@@ -96,7 +99,7 @@ def random_field(
     >>> field = lp.random_field(wall, std=2.0, known={0.0: 20.0, 0.2: 4.0})
     >>> x = np.array([[0.0, 0.1, 0.2]])
     >>> np.sqrt(sum(function(x) ** 2 for function in field)).round(2)
-    array([0.  , 1.99, 0.  ])
+    array([0., 2., 0.])
     """
     vertices = np.asarray(mesh.p, dtype=float).T
     side = float(np.ptp(vertices, axis=0).max())
@@ -108,20 +111,30 @@ def random_field(
             raise SpaceError(f"random_field: {name} must be a positive number; got {value!r}.")
     at = np.array([np.atleast_1d(place) for place in known or ()]).reshape(-1, vertices.shape[1])
     points = vertices[:: -(-len(vertices) // CANDIDATES)]
-    kernel = _with_pivots(_Kernel(at, length, len(at)), points, 3 * most)
-    features = kernel.features(points)
-    largest = float(np.sqrt((features**2).sum(axis=0).max(initial=0.0)))
-    if std is None:
-        scale = _spread(kernel, np.array([*(known or {}).values()], dtype=float))
-    else:
-        scale = std / largest if largest > 0.0 else 0.0
-    if not scale * largest > 0.0:
+    kernel = _Kernel(at, length, len(at))
+    left = np.ones(len(points)) - (_explained(kernel, points) if kernel.known else 0.0)
+    if left.max(initial=0.0) < ROUNDING:  # each vertex has a known value
         return ()
+    kernel = _with_pivots(kernel, points, left, 3 * most)
+    features = kernel.features(points)
     # Directions of the features by their share of the mean variance.
     square, vectors = np.linalg.eigh(features @ features.T)
-    share = np.cumsum(square[::-1]) / square.sum()
-    count = min(int(np.searchsorted(share, KEPT)) + 1, most)
-    mixes = scale * vectors[:, ::-1][:, :count].T
+    share = np.cumsum(square[::-1]) / left.sum()
+    count = min(int(np.searchsorted(share, KEPT)) + 1, most, len(share))
+    mixes = vectors[:, ::-1][:, :count].T
+    if std is None:
+        scale = _spread(kernel, np.array([*(known or {}).values()], dtype=float))
+        if scale == 0.0:
+            return ()
+    else:
+        if share[count - 1] < LEAST:
+            raise SpaceError(
+                f"random_field: {count} functions represent {share[count - 1]:.0%} of the variance "
+                f"with length {length:g} and {len(at)} known values; expected {LEAST:.0%} or more: "
+                "use a larger length, or fewer known values."
+            )
+        scale = std / float(np.sqrt(((mixes @ features) ** 2).sum(axis=0).max()))
+    mixes = scale * mixes
     functions = [_Function(kernel, mix) for mix in mixes]
     if vertices.shape[1] > 1:
         return tuple(functions)
@@ -133,11 +146,10 @@ def _straight(nodes: Array, values: Array, x: Any) -> Array:
     return np.asarray(np.interp(x[0], nodes, values))
 
 
-def _with_pivots(kernel: _Kernel, points: Array, most: int) -> _Kernel:
+def _with_pivots(kernel: _Kernel, points: Array, left: Array, most: int) -> _Kernel:
     """Return the kernel with places added, each where the most variance is left."""
-    left = np.ones(len(points)) - (_explained(kernel, points) if kernel.known else 0.0)
-    first = float(left.max(initial=0.0))
-    while len(kernel.places) - kernel.known < most and left.max(initial=0.0) > 1e-3 * first > 0.0:
+    first = float(left.max())
+    while len(kernel.places) - kernel.known < most and left.max() > 1e-3 * first:
         places = np.vstack([kernel.places, points[int(left.argmax())]])
         kernel = _Kernel(places, kernel.length, kernel.known)
         left = 1.0 - _explained(kernel, points)

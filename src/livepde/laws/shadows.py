@@ -428,6 +428,7 @@ class HeldInputShadow(InputShadow):
         missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
         values = np.broadcast_to(span.stated, change.shape)
         held = np.stack([values, change, changes, differences], axis=1)
+        # `InputShadow` reads its lines from the same fields: what it adds to them must stay.
         both = {name: parts[name] + missed for name in ("bend", "missed")}
         return parts | both | {"held": held}
 

@@ -96,7 +96,8 @@ def with_conditions(
     Raises
     ------
     ModelError
-        A boundary does not exist or has a Dirichlet value, or no condition names an unknown.
+        A boundary does not exist or has a Dirichlet value, no condition names an unknown, or `per`
+        is not an unknown of the model.
 
     Examples
     --------
@@ -113,6 +114,11 @@ def with_conditions(
     ('k', 'J')
     """
     more = dict(unknowns or {})
+    if per is not None and per not in model.parameter_space.labels:
+        raise ModelError(
+            f"with_conditions: per='{per}' is not an unknown of the model; it has "
+            f"{list(model.parameter_space.labels)}."
+        )
     terms = _Terms(tuple(more), per)
     for name, given in (boundary or {}).items():
         _check_boundary(model, name)

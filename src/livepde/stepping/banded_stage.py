@@ -40,8 +40,7 @@ ROUNDING = 1e-11
 # cancels no digits, and a power of two so that the division is exact.
 LARGE = 2.0**20
 
-
-NONE = np.zeros((0, 0))
+NO_RESPONSE = np.zeros((0, 0))  # of a stage that does not depend on inputs
 
 
 class BandedStep(NamedTuple):
@@ -220,7 +219,7 @@ class BandedStage(MemberStage):
         if load is None or boundary is None:
             return None
         if self._mass_boundary.zero:
-            return h * load[0], NONE if self._load.constant else h * load[1]
+            return h * load[0], NO_RESPONSE if self._load.constant else h * load[1]
         return h * load[0] - boundary[0], h * load[1] - boundary[1]
 
 

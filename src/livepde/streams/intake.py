@@ -327,10 +327,11 @@ class Intake:
         except DataError as error:
             found.remark("malformed", "", str(error))
             return None
+        about = IntakeOutcome(row=token)
         if times is None:
             found.remark("outside", "", "not between start and stop")
+            self._hold_first(self._values(row, about))
             return None
-        about = IntakeOutcome(row=token)
         values = self._values(row, about)
         if not values:
             if not about.remarks:
@@ -600,12 +601,7 @@ class Intake:
         if needed:
             found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
             sample.values = self._held(sample.values)
-            if not self._recent:  # a value that holds is remembered for the first sample
-                self._before |= {
-                    channel: value
-                    for channel, value in sample.values.items()
-                    if self.policy.habit(channel).between == "hold"
-                }
+            self._hold_first(sample.values)
             if not (self._recent and sample.values):
                 found.spent += sample.tokens
                 return
@@ -629,6 +625,15 @@ class Intake:
             for channel, value in values.items()
             if self.policy.habit(channel).between != "line" and not math.isnan(value)
         }
+
+    def _hold_first(self, values: Mapping[str, float]) -> None:
+        """Remember values of rows before the first sample that hold until the next reading."""
+        if not self._recent:
+            self._before |= {
+                channel: value
+                for channel, value in self._held(values).items()
+                if self.policy.habit(channel).between == "hold"
+            }
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
         """Return whether a sample has no value of a channel; noise belongs to a reading."""

@@ -53,8 +53,9 @@ def join_tables(
     """
     times, first = _on_one_clock(tables, second, where)
     starts, ends = np.transpose([(t[0], t[-1]) for t in times])
-    # What holds until the next reading goes on after the last one.
-    holds = [all((between or {}).get(n) == "hold" for n in table.names) for table in tables]
+    # What holds until the next reading continues after the last one.
+    behaviour = between or {}
+    holds = [all(behaviour.get(name) == "hold" for name in table.names) for table in tables]
     last = np.where(holds, np.inf, ends)
     start = starts.max()
     if last.min() < start:
@@ -69,7 +70,7 @@ def join_tables(
         raise DataError(
             f"{where}: no sensor has a value where all files have one; check the times."
         )
-    begin, behaviour = int(usable.argmax()), between or {}
+    begin = int(usable.argmax())
     # A run needs each input at its start, where a slower logger may have no row.
     for k in np.flatnonzero(~sensed & ~known[begin] & known.any(axis=0)):
         at, own = known[:, k], behaviour.get(names[k], "line")

@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import datetime
 from itertools import chain, islice
@@ -246,10 +246,10 @@ def to_table(
 
     `numbers` gives the chosen rows of a column; `where` names the data and a row, for messages.
     """
-    between = [column.between for column in columns.values()]
-    held = np.array([one != "line" for one in between], dtype=bool)
+    rows = Thinned([column.between for column in columns.values()])
     # Rows that are left out may hold a switch, or a part of a mean.
-    use = _chosen(times, dates, clock, 1 if held.any() else every, where)
+    any_held = bool(rows.held.any())
+    use = _chosen(times, dates, clock, 1 if any_held else every, where)
     holes = tuple(float(number) for number in missing)
     found = {}
     for name in decimal_marks(columns):
@@ -265,7 +265,7 @@ def to_table(
     )
     remarks = Counter(_noise_remarks(columns, values))
     kept = np.zeros(len(use), dtype=bool)
-    kept[:: every if held.any() else 1] = True
+    kept[:: every if any_held else 1] = True
     chosen = kept.copy()
     # A value that is not valid is missing; a sample is left out for its first missing channel only.
     for k, (name, channel) in enumerate(columns.items()):
@@ -278,13 +278,9 @@ def to_table(
         remarks["skipped", name] = int(lacking.sum())
     if not kept.any():
         raise DataError(f"{where[0]}: no sample has all channels that it needs.")
-    if held.any():
-        before = _known_before(int(use[0]), numbers, columns, holes)
-        if kept.all():
-            opens = np.isnan(values[0])
-            values[0, opens] = before[opens]
-        else:
-            values, kept = _with_held(times[use], values, between, chosen, kept, before)
+    if any_held:
+        rows.remember(_known_before(int(use[0]), numbers, columns, holes))
+        values, kept = _with_held(times[use], values, rows, chosen, kept)
     t, values, origin = times[use][kept], values[kept], None
     if dates:
         origin = origin_at(float(t[0]) / clock.second)
@@ -332,30 +328,25 @@ def _known_before(
 
 
 def _with_held(
-    t: Array, values: Array, between: Sequence[Between], chosen: Mask, kept: Mask, before: Array
+    t: Array, values: Array, rows: Thinned, chosen: Mask, kept: Mask
 ) -> tuple[Array, Mask]:
     """Return the rows of a table, and which stay, with what all rows state of held inputs.
 
     Parameters
     ----------
+    rows
+        Knows the values of held inputs before the first row.
     chosen, kept
         Rows that `every` leaves, and those of them in which no channel is missing that they need.
-    before
-        Values of held inputs before the first row.
     """
-    held = np.array([one != "line" for one in between])
-    rows, found, stays = Thinned(between), values.copy(), np.zeros(len(t), dtype=bool)
-    rows.take(-math.inf, before, False)
-    begun = False
-    for k in range(len(t)):
-        begun = begun or bool(kept[k])
-        # A row without a channel that it needs stays as one of its held inputs.
-        needed = bool(kept[k]) or (
-            begun and bool(chosen[k]) and bool(np.isfinite(values[k, held]).any())
-        )
-        row = rows.take(float(t[k]), values[k], needed)
+    found, stays = values.copy(), kept.copy()
+    # Where no row is left out, only the first one may get values: those from before it.
+    count = 1 if kept.all() else len(t)
+    for k, time in enumerate(t[:count].tolist()):
+        row = rows.take(time, values[k], chosen=bool(chosen[k]), whole=bool(kept[k]))
+        stays[k] = row is not None
         if row is not None:
-            found[k], stays[k] = row if kept[k] else np.where(held, row, math.nan), True
+            found[k] = row
     return found, stays
 
 
@@ -406,11 +397,12 @@ class JsonLines:
     def __iter__(self) -> Iterator[Sample]:
         clock, last, zero = self._clock, -math.inf, 0.0
         needed = [channel for channel, column in self._columns.items() if column.needed]
-        between = [column.between for column in self._columns.values()]
-        held = np.array([one != "line" for one in between], dtype=bool)
-        thinned, begun = Thinned(between), False
-        step = 1 if held.any() else self._every
-        for k, (where, row, t, dates) in enumerate(islice(self._timed_rows(), None, None, step)):
+        thinned = Thinned([column.between for column in self._columns.values()])
+        any_held = bool(thinned.held.any())
+        step = 1 if any_held else self._every
+        for k, (where, row, t, dates) in enumerate(
+            islice(self._timed_rows(thinned), 0, None, step)
+        ):
             if t <= last:
                 raise _disorder(where, t == last, dates and clock.set_back(t))
             if dates and math.isinf(last):  # the first sample is t = 0
@@ -419,17 +411,13 @@ class JsonLines:
             last = t
             values = self._values(row, where)
             whole = not any(math.isnan(values[channel]) for channel in needed)
-            if not held.any():
+            if not any_held:
                 if whole:
                     yield Sample(t=t - zero, z=values)
                 continue
-            array, chosen = np.array(list(values.values())), k % self._every == 0
-            kept = chosen and whole
-            begun = begun or kept
-            states = begun and chosen and bool(np.isfinite(array[held]).any())
-            left = thinned.take(t, array, kept or states)
+            array = np.array(list(values.values()))
+            left = thinned.take(t, array, chosen=k % self._every == 0, whole=whole)
             if left is not None:
-                left = left if kept else np.where(held, left, math.nan)
                 yield Sample(t=t - zero, z=dict(zip(values, left.tolist(), strict=True)))
 
     def _values(self, row: Mapping[str, Any], where: str) -> dict[str, float]:
@@ -442,10 +430,11 @@ class JsonLines:
         without_noise(self._columns, values)
         return values
 
-    def _timed_rows(self) -> Iterator[tuple[str, dict[str, Any], float, bool]]:
+    def _timed_rows(self, thinned: Thinned) -> Iterator[tuple[str, dict[str, Any], float, bool]]:
         """Iterate over the rows between start and stop: name, row, time, and whether it is a date.
 
-        The first row after stop ends the stream, which may have no end of its own.
+        `thinned` remembers what rows before start state. The first row after stop ends the stream,
+        which may have no end of its own.
         """
         dates = None
         for number, line in enumerate(self._lines, start=1):
@@ -459,6 +448,8 @@ class JsonLines:
                 return
             if t >= low:
                 yield where, row, t, dates
+            elif thinned.held.any():
+                thinned.remember(np.array(list(self._values(row, where).values())))
 
 
 def row_time(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from livepde.linalg import Array
+from livepde.linalg import Array, Mask
 from livepde.stepping import Between
 
 __all__ = ["Thinned"]
@@ -17,56 +17,66 @@ class Thinned:
     """Every n-th row of a stream, without the loss of a switch or of a share of a mean.
 
     A row that would be left out stays as a row of its held inputs alone where one of them
-    (`between = "hold"`) changes. The reading of a `"next"` channel becomes the mean, weighted by
-    time, since the last row that stays.
+    (`between = "hold"`) changes. So does a row that lacks a channel that each sample needs. The
+    reading of a `"next"` channel becomes the mean, weighted by time, since the last row that stays.
 
     Parameters
     ----------
     between
         Behaviour of each column between two readings.
 
+    Attributes
+    ----------
+    held
+        Columns that are no "line", shape (columns,).
+
     Examples
     --------
     >>> rows = Thinned(["line", "hold"])
-    >>> rows.take(0.0, np.array([20.0, 1.0]), True)
+    >>> rows.take(0.0, np.array([20.0, 1.0]), chosen=True, whole=True)
     array([20.,  1.])
-    >>> rows.take(1.0, np.array([21.0, 0.0]), False)
+    >>> rows.take(1.0, np.array([21.0, 0.0]), chosen=False, whole=True)
     array([nan,  0.])
     """
 
     def __init__(self, between: Sequence[Between]) -> None:
+        self.held: Mask = np.array([one != "line" for one in between], dtype=bool)
         self._hold = [k for k, one in enumerate(between) if one == "hold"]
         self._means = {k: _Mean() for k, one in enumerate(between) if one == "next"}
         self._last = np.full(len(between), math.nan)
         self._begun = False
 
-    def take(self, t: float, row: Array, stays: bool) -> Array | None:
+    def remember(self, row: Array) -> None:
+        """Remember the values of a row before the start that hold until the next reading."""
+        for k in self._hold:
+            if math.isfinite(row[k]):
+                self._last[k] = row[k]
+
+    def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
         """Return what is left of a row; None if nothing.
 
         Parameters
         ----------
         t, row
             Time and values, NaN where missing, shape (columns,).
-        stays
-            Whether the row stays as it is.
+        chosen
+            Whether `every` leaves the row.
+        whole
+            Whether the row has all channels that a sample needs.
         """
         for k, mean in self._means.items():
             mean.add(t, float(row[k]))
-        changed = [k for k in self._hold if math.isfinite(row[k]) and row[k] != self._last[k]]
-        for k in changed:
-            self._last[k] = row[k]
-        # Before the first row that stays, values are remembered for it.
-        if not (stays or (changed and self._begun)):
+        changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
+        self.remember(row)
+        kept = chosen and whole
+        states = chosen and bool(np.isfinite(row[self.held]).any())
+        # Before the first row that is kept, values are remembered for it.
+        if not (kept or (self._begun and (changed or states))):
             return None
-        found = np.full(len(row), math.nan)
-        if stays:
-            found = row.copy()
-            if not self._begun:
-                for k in self._hold:
-                    found[k] = self._last[k]
+        found = row.copy() if kept else np.where(self.held, row, math.nan)
+        if kept and not self._begun:
+            found[self._hold] = self._last[self._hold]
             self._begun = True
-        else:
-            found[self._hold] = row[self._hold]
         for k, mean in self._means.items():
             found[k] = mean.taken() if math.isfinite(row[k]) else math.nan
         return found
