@@ -106,7 +106,8 @@ def models(draw: Any, name: str) -> lp.Model:
         for key, known in equation.unknowns.items()
         if key not in out
     }
-    options = {key: draw(option(key, item, typical)) for key, item in equation.options.items()}
+    known = {key: item for key, item in equation.options.items() if key not in unknowns}
+    options = {key: draw(option(key, item, typical)) for key, item in known.items()}
     return equation.build(mesh, unknowns, {}, **options)
 
 
