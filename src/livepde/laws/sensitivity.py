@@ -53,7 +53,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import judge_of, judged, with_columns, with_fit
+from livepde.laws.verdict import judge_of, judged, with_columns, with_errors, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -511,7 +511,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         found = self.deferred(work, state)
         if not self.verdict:
             return found
-        return found._replace(verdict=with_columns(found.verdict, Columns.of(work, state)))
+        verdict = with_columns(found.verdict, Columns.of(work, state))
+        return found._replace(verdict=with_errors(verdict, work, state))
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

@@ -13,7 +13,10 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed
+from livepde.laws.model_errors import model_errors
 from livepde.laws.reduction import Reduction
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
     NOT_JUDGED,
@@ -27,8 +30,9 @@ from livepde.verdict import (
     assess,
     too_few,
 )
+from livepde.verdict.model_errors import ModelErrors
 
-__all__ = ["judge_of", "judged", "with_columns", "with_fit"]
+__all__ = ["judge_of", "judged", "with_columns", "with_errors", "with_fit"]
 
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
@@ -142,6 +146,40 @@ def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callab
         return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
 
     return found
+
+
+def with_errors(
+    judge: Callable[[], Verdict], work: SensitivityWork, state: SensitivityState
+) -> Callable[[], Verdict]:
+    """Return a verdict whose level follows from fit and effect, where these can be computed.
+
+    It holds the stored samples until then.
+    """
+
+    def found() -> Verdict:
+        verdict = judge()
+        if verdict.level == NOT_JUDGED:
+            return verdict
+        errors = _errors(work, state)
+        if isinstance(errors, str):
+            return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
+        return verdict.with_errors(errors)
+
+    return found
+
+
+def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
+    """Return misfit and effects of one member, or why there are none."""
+    if work.refit is None:
+        return "the law stores no samples"
+    if not work.fits:
+        return "unknowns move, inputs have noise, or the past fades"
+    if not state.log.shape[1]:
+        return "no sample is stored"
+    reduction = work.filter.reduction
+    _, C = reported_factors(work.filter, state.now)
+    std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
+    return model_errors(StoredSamples.of(work, state), work.refit, std)
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
