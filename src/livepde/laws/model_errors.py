@@ -14,7 +14,6 @@ from functools import partial
 from typing import TypeAlias
 
 import numpy as np
-import scipy
 
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
 from livepde.laws.refit import plausible
@@ -101,11 +100,11 @@ def _root(modes: Array, count: int, time: float) -> Array:
     constant.
     """
     nodes = np.arange(count) / max(count - 1, 1)
-    if math.isinf(time):
-        one = np.ones((count, 1))
-    else:
-        covariance = np.exp(-np.abs(nodes[:, None] - nodes) / time)
-        one = np.array(scipy.linalg.cholesky(covariance + 1e-10 * np.eye(count), lower=True))
+    each = np.ones((count, count))
+    if not math.isinf(time):
+        each = np.exp(-np.abs(nodes[:, None] - nodes) / time)
+    sizes, axes = np.linalg.eigh(each)
+    one = axes * np.sqrt(np.maximum(sizes, 0.0))
     found: Array = np.kron(np.diag(1.0 / (1.0 + modes)), one)
     return found
 
@@ -126,13 +125,16 @@ def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
 
 
 @nonfinite_allowed()  # a hypothesis that overflows has no evidence
-def model_errors(samples: StoredSamples, options: Refit, std: Array) -> ModelErrors | str:
+def model_errors(
+    samples: StoredSamples, options: Refit, std: Array, shift: Array
+) -> ModelErrors | str:
     """Return misfit and intervals that allow for errors of the model, or why there are none.
 
     Parameters
     ----------
-    std
-        Reported standard deviations of the latent unknowns, (m,).
+    std, shift
+        Reported standard deviations of the latent unknowns, and their shifts by the discretisation,
+        (m,).
     """
     one = samples.about(samples.reached)
     if one is None:
@@ -143,20 +145,39 @@ def model_errors(samples: StoredSamples, options: Refit, std: Array) -> ModelErr
     start, reduction = samples.state.start, samples.filter.reduction
     T = reduction.Phi @ start.C[0].T
     model, causes, families = linear_model(samples, one, used, T)
-    mixture = averaged(model, causes, families)
+    mixture = averaged(model, causes, families).widened(shift)
     level = _level(one.residuals, used)
-    r = np.where(used, one.residuals, np.nan)
-    each = np.sqrt(np.nanmean(r**2, axis=0)) / level
-    shown = np.where(used, samples.readings, np.nan)
-    signal = np.sqrt(np.nanmean((shown - np.nanmean(shown, axis=0)) ** 2))
-    misfit = float(np.sqrt(np.nanmean(r**2)))
-    names = samples.filter.problem.observed.names
+    variance = model.asked[1] + shift**2
     return ModelErrors(
-        misfit=misfit / level,
-        of_signal=misfit / float(signal) if signal > 0.0 else math.inf,
-        sensors=dict(zip(names, each.tolist(), strict=True)),
-        unknowns=tuple(_allowed(samples, mixture, model.asked[1], std)),
+        misfit=_rms(one.residuals[used]) / level,
+        of_signal=_of_signal(samples.readings, one.residuals, used),
+        sensors={
+            name: _rms(column[there]) / level
+            for name, column, there in zip(
+                samples.filter.problem.observed.names, one.residuals.T, used.T, strict=True
+            )
+            if there.any()
+        },
+        unknowns=tuple(_allowed(samples, mixture, variance, std)),
     )
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float((values**2).mean()))
+
+
+def _of_signal(readings: Array, residuals: Array, used: Mask) -> float:
+    """Return the misfit over the scatter of the readings of each sensor about their mean."""
+    about = [column[there] - column[there].mean() for column, there in _columns(readings, used)]
+    signal = _rms(np.concatenate(about))
+    return _rms(residuals[used]) / signal if signal > 0.0 else math.inf
+
+
+def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
+    """Iterate over the sensors that have readings in use."""
+    for column, there in zip(values.T, used.T, strict=True):
+        if there.any():
+            yield column, there
 
 
 def _allowed(

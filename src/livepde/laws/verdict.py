@@ -25,12 +25,12 @@ from livepde.verdict import (
     Dictionary,
     Finding,
     Judge,
+    ModelErrors,
     Position,
     Verdict,
     assess,
     too_few,
 )
-from livepde.verdict.model_errors import ModelErrors
 
 __all__ = ["judge_of", "judged", "with_columns", "with_errors", "with_fit"]
 
@@ -176,10 +176,13 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
         return "unknowns move, inputs have noise, or the past fades"
     if not state.log.shape[1]:
         return "no sample is stored"
-    reduction = work.filter.reduction
-    _, C = reported_factors(work.filter, state.now)
-    std = np.linalg.norm(reduction.Phi @ C[0].T, axis=1)
-    return model_errors(StoredSamples.of(work, state), work.refit, std)
+    filter_ = work.filter
+    Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, state.now)
+    shift = np.zeros(len(Phi))
+    if filter_.shadows is not None:
+        shift = Phi @ filter_.shadows.widening(state.now)[1][0, 0]
+    std = np.linalg.norm(Phi @ C[0].T, axis=1)
+    return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

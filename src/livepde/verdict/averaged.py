@@ -135,6 +135,10 @@ class Mixture(NamedTuple):
     means: Array
     deviations: Array
 
+    def widened(self, shift: Array) -> Mixture:
+        """Return the same numbers with an error of a known size besides, (numbers,)."""
+        return self._replace(deviations=np.hypot(self.deviations, shift))
+
     def quantile(self, share: float) -> Array:
         """Return a quantile of each number."""
         target = scipy.special.ndtri(share)

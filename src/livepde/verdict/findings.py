@@ -18,6 +18,7 @@ __all__ = [
     "MOST",
     "NOT_JUDGED",
     "NUMBERS",
+    "PROMISES",
     "TELLING",
     "Cause",
     "Finding",
@@ -41,6 +42,13 @@ LEVELS: tuple[Level, ...] = ("trusted", "caution", NOT_JUDGED, "do not trust")
 NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not trust": 2}
 """Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
 
+PROMISES: dict[Level, str] = {
+    "trusted": "nothing in the data speaks against these estimates, or not so that it matters",
+    "caution": "the model is not exact: use the interval that allows for its errors",
+    NOT_JUDGED: "nothing tested whether the model holds",
+    LEVELS[-1]: "the estimates are not to be used as they are",
+}
+"""Level -> what it says of the estimates."""
 DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
 RANKED = (*DOUBTS, "following", "stuck")  # those whose severity follows from fit and effect
 NAMES: dict[str, Severity] = {"trusted": "note", "caution": "caution", LEVELS[-1]: "do not trust"}

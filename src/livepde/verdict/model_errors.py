@@ -108,6 +108,21 @@ class ModelErrors:
         return sorted(own, key=lambda one: -one.effect)
 
     @property
+    def differ(self) -> bool:
+        """Whether an interval differs from the plain one by more than a tenth of its width."""
+
+        def far(one: Allowed) -> bool:
+            ends = (one.low - one.plain_low, one.high - one.plain_high)
+            width = one.plain_high - one.plain_low
+            return max(map(abs, ends)) > (DIFFERENT - 1.0) * width
+
+        return any(map(far, self.unknowns))
+
+    def __getitem__(self, label: str) -> Allowed:
+        """Return the unknown with a label."""
+        return next(one for one in self.unknowns if one.label == label)
+
+    @property
     def effect(self) -> float:
         """Largest relative effect on an unknown of the model; 0 without."""
         return max((one.effect for one in self.asked), default=0.0)
