@@ -557,7 +557,8 @@ class Identifier:
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.
             now = self.law.diagnosed(self._work, state)
-            return replace(estimate.diagnostics, shifts=now.shifts)
+            before = estimate.diagnostics
+            return replace(before, shifts=now.shifts, log_evidence=now.log_evidence)
 
         return replace(
             estimate,

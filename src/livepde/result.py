@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -367,6 +368,17 @@ class Result:
         """The verdict on the run so far: that of the last estimate."""
         return Verdict.unjudged() if self.last is None else self.last.verdict
 
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the marginal likelihood of all readings; NaN for a law without covariance.
+
+        The density of the readings of the assimilated sensors, in their unit, with the unknowns
+        integrated out: after a fit of the stored samples linear about that fit, else the sum of the
+        log densities of the innovations. Readings that were refused count as if at the limit of
+        the gate. Two runs can be compared if they assimilate the same readings.
+        """
+        return math.nan if self.last is None else float(self.last.diagnostics.log_evidence)
+
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
         self.records.append(self.record(estimate, self._keeps))
@@ -451,11 +463,13 @@ class Result:
         scalar; `_modes`, the number of modes of a field that the data determine, and `_left_out`,
         the share of its mean variance in modes that the law leaves out, over `snapshot`; and
         `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
-        result of `Verdict.to_dict`, as JSON.
+        result of `Verdict.to_dict`, as JSON; `log_evidence` that of the result.
         """
         data = self.layout.dataset(*self._finished())
         if self.last is not None:
             data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+            if math.isfinite(self.log_evidence):
+                data.attrs["log_evidence"] = self.log_evidence
         return data
 
     def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
