@@ -166,6 +166,11 @@ class SensitivityState:
     def __len__(self) -> int:
         return len(self.now)
 
+    def counted(self, evidence: Array) -> SensitivityState:
+        """Return the state at the start with the evidence of readings that change nothing else."""
+        names = ("start", "now", "older", "newer")
+        return changed(self, **{n: changed(getattr(self, n), evidence=evidence) for n in names})
+
     @property
     def unaccompanied(self) -> SensitivityState:
         """The same without ledger and discretisation errors, as the filter of a search has it."""
