@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -334,6 +334,8 @@ class Result:
         Names, units and coordinates of the numbers of records; default those of model and sensors.
     count
         Number of earlier estimates, not all of which need be kept; default that of the records.
+    ignored
+        Names of withheld sensors that never count, for the default layout.
     """
 
     def __init__(
@@ -345,6 +347,7 @@ class Result:
         records: Records | None = None,
         layout: Layout | None = None,
         count: int | None = None,
+        ignored: Sequence[str] = (),
     ) -> None:
         self.model = model
         self.observed = observed
@@ -354,7 +357,7 @@ class Result:
         self._settled: Belief | None = None
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
-        self.layout = layout or layout_of(model, observed, withheld)
+        self.layout = layout or layout_of(model, observed, withheld, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
         self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
@@ -542,8 +545,16 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> Layout:
-    """Return names, units and coordinates of the records of a run."""
+def layout_of(
+    model: Model, observed: Observed, withheld: Observed | None, ignored: Sequence[str] = ()
+) -> Layout:
+    """Return names, units and coordinates of the records of a run.
+
+    Parameters
+    ----------
+    ignored
+        Names of withheld sensors that never count.
+    """
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
         unknown = unknown_of(model.parameter_space, label)
@@ -571,6 +582,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         length_unit=model.length_unit,
         places={name: at.tolist() for name, at in places.items()},
         comments=_field_comments(model),
+        attrs={"ignored": "\n".join(ignored)} if ignored else {},
     )
 
 

@@ -310,7 +310,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
         ),
         "drift": (
             f"sensor {name} drifts, by {amount / DRIFT:+.2g}{unit} a sample",
-            f"Calibrate {name}, or leave it out.",
+            f'Calibrate {name}, or leave it out: `role = "ignored"`.',
         ),
         "gain": (
             f"the scale of sensor {name} is {abs(100 * amount):.2g} % too "
@@ -428,7 +428,10 @@ def _stuck(at: Position) -> Iterator[Finding]:
         if name in at.aside:  # its readings are not used
             continue
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
-        cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
+        remedy = f'Check {name}. If it is faulty, set `role = "ignored"`.'
+        setting = channel_setting(name, "role", '"ignored"')
+        said = f"sensor {name} stands still"
+        cause = Cause("stuck", name, said, remedy=remedy, setting=setting)
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
 
 
@@ -441,9 +444,11 @@ def _aside(at: Position) -> Iterator[Finding]:
             f"{name} is set aside since t = {since:g}{time}: its readings disagree with the model "
             f"and with the other sensors or its own past, at last by {off:+.3g}{unit}."
         )
-        cause = Cause("sensor", name, f"sensor {name} is broken or displaced")
+        setting = channel_setting(name, "role", '"ignored"')
+        cause = Cause("sensor", name, f"sensor {name} is broken or displaced", setting=setting)
         remedy = (
-            f"Check {name}. If it shows a value that stands for no reading, add it to `missing`."
+            f"Check {name}. If it shows a value that is no reading, add it to `missing`. If it is "
+            'faulty, set `role = "ignored"`.'
         )
         yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
 
