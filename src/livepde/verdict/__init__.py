@@ -16,6 +16,7 @@ from livepde.verdict.findings import (
     Severity,
     Verdict,
     at_bound,
+    channel_setting,
     flat,
     too_few,
 )
@@ -49,6 +50,7 @@ __all__ = [
     "WithheldLedger",
     "assess",
     "at_bound",
+    "channel_setting",
     "discretised",
     "flat",
     "held_inputs",

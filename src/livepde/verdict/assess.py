@@ -36,6 +36,7 @@ from livepde.verdict.findings import (
     too_few,
 )
 from livepde.verdict.ledger import Ledger
+from livepde.verdict.missing_terms import GAIN, LOSS, REACH
 
 __all__ = ["Position", "assess"]
 
@@ -262,12 +263,24 @@ def _cause(
     if window and direction.kind not in ("jump", "initial"):
         text += f" in the last {int(at.ledger.age[window])} samples"
     share = float(min(max(share, 0.0), 1.0))
-    setting = _setting(direction, float(size), at)
-    return Cause(direction.kind, direction.subject, text, share, remedy, setting)
+    setting, amount = _setting(direction, float(size), at), _amount(direction, float(size), at)
+    return Cause(direction.kind, direction.subject, text, share, remedy, setting, amount)
 
 
 def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
-    """Return how large a cause is, in units of the model; a gain as a share."""
+    """Return how large a cause is, as `Cause.size` has it."""
+    interval, typical = float(at.ledger.times[1]), float(np.median(at.noise))
+    process = {
+        "source": OFFSET * typical / (REACH * interval),
+        "flux": OFFSET * typical / (REACH * interval),
+        "loss": LOSS / (REACH * interval),
+        "boundary": -OFFSET * typical,
+        "initial": OFFSET * typical,
+        "channel": -GAIN,
+        "lag": LAG * interval,
+    }
+    if direction.kind in process:
+        return size * process[direction.kind]
     if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
         return size * OFFSET * float(at.noise[list(at.sensors).index(direction.subject)])
     return size * direction.size

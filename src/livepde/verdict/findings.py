@@ -68,7 +68,10 @@ class Cause:
         Recommended action, as a sentence.
     setting
         "key=value" of a case that makes the cause an unknown, as `livepde run --set` takes it;
-        empty if there is none.
+        several are separated by "; ". Empty if no setting frees the cause.
+    size
+        Its size in units of the model: of a gain the share, of a source the change of the state per
+        unit of time, of a loss the rate; NaN if not known.
     """
 
     kind: str
@@ -77,6 +80,13 @@ class Cause:
     share: float = math.nan
     remedy: str = ""
     setting: str = ""
+    size: float = math.nan
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Cause:
+        """Return the cause that `to_dict` has written; earlier versions stored no size."""
+        numbers = {name: _number(stored.get(name)) for name in ("share", "size")}
+        return cls(**{**stored, **numbers})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause as JSON can hold it."""
@@ -88,6 +98,7 @@ class Cause:
             "share": share,
             "remedy": self.remedy,
             "setting": self.setting,
+            "size": None if math.isnan(self.size) else self.size,
         }
 
 
@@ -150,7 +161,7 @@ class Finding:
     def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
         """Return the finding that `to_dict` has written."""
         own = {name: value for name, value in stored.items() if name != "sentence"}
-        causes = tuple(Cause(**{**item, "share": _number(item["share"])}) for item in own["causes"])
+        causes = tuple(map(Cause.from_dict, own["causes"]))
         return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
 
     def to_dict(self) -> dict[str, Any]:
