@@ -230,7 +230,7 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
     names = {variant.name for variant in found}
     assert {"loss", "no offsets", "no source", "jumps", "offsets of all sensors"} <= names
     for variant in found:
-        settings = parse([*own, *variant.settings])
+        settings = parse(own), parse(variant.settings)
         assert cases.load(path, settings=settings).prepare().identifier
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -177,7 +177,7 @@ def load(
     path: str | os.PathLike[str],
     *,
     allow_code: bool = False,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
 ) -> Case:
     """Read and check a case file.
 
@@ -188,7 +188,8 @@ def load(
     allow_code
         Load an equation or a reader of the user's own ('module:function', 'file.py:function').
     settings
-        Key -> value that overrides that of the file, as {"law.noise": "2 K"}.
+        Key -> value that overrides that of the file, as {"law.noise": "2 K"}; several mappings are
+        applied one after the other.
 
     Raises
     ------
@@ -199,9 +200,10 @@ def load(
     # A run directory keeps the effective text: settings are written into it, too.
     text = original = read_text(file)
     document = read_toml(text, str(file))
-    if settings:
-        document = apply(document, settings, str(file))
-        text = tomlkit.dumps(document)
+    for each in (settings,) if isinstance(settings, Mapping) else settings or ():
+        if each:
+            document = apply(document, each, str(file))
+            text = tomlkit.dumps(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.

@@ -202,7 +202,7 @@ def run_variant(
     A variant that cannot be run ends with its reason.
     """
     try:
-        every = parse([*settings, *variant.settings])
+        every = parse(settings), parse(variant.settings)
         prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
         result = prepared.identifier.run(prepared.stream, fields_every=10**9)
         return _ended(variant, prepared, result.to_xarray())

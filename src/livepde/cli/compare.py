@@ -95,7 +95,7 @@ def compare(
     best = recommended(base, found)
     notes = conclusions(base, found)
     if write is not None:
-        notes.append(_written(write, case, [*settings, *best.variant.settings]))
+        notes.append(_written(write, case, settings, best.variant.settings))
     present(
         _tables(base, found, best),
         [],
@@ -223,12 +223,14 @@ def _check_target(target: Path, case: Path, force: bool) -> None:
         )
 
 
-def _written(target: Path, case: Path, settings: Sequence[str]) -> str:
-    """Write a case with settings, and return a sentence on it."""
+def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:
+    """Write a case with settings, one part after the other, and return a sentence on it."""
     from livepde.atomic_write import write_bytes
     from livepde.cases.fill import filled
     from livepde.cases.read import parse, read_text
 
-    text = filled(read_text(case), parse(settings), str(case))
+    text = read_text(case)
+    for each in settings:
+        text = filled(text, parse(each), str(case))
     write_bytes(target, text.encode())
     return f"Wrote {target}: livepde run {target}"
