@@ -16,7 +16,7 @@ from rich.markup import escape
 
 from livepde.cli.options import CodeOption, JsonOption, SetOption, argument, load_case, option
 from livepde.cli.printing import present
-from livepde.errors import ConfigurationError, RunError
+from livepde.errors import CaseError, ConfigurationError, RunError
 
 if TYPE_CHECKING:
     from livepde.cases.variants import Interval, Variant, VariantRun
@@ -76,7 +76,8 @@ def compare(
     from livepde.cases.variants import AS_STATED, Variant, conclusions, recommended, variant_of
 
     given = [variant_of(text) for text in variants or ()]
-    case, settings, data = _of_run(case, settings or [], data)
+    named = case
+    case, settings, data = _of_run(named, settings or [], data)
     loaded = load_case(case, allow_code, settings)
     if loaded.goes_on(data) or data == "-":
         raise ConfigurationError(
@@ -84,7 +85,13 @@ def compare(
         )
     if write is not None:
         _check_target(write, case, force)
-    prepared = loaded.prepare(data)
+    try:
+        prepared = loaded.prepare(data)
+    except CaseError as error:
+        if named == case:
+            raise
+        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        raise RunError(f"{error} {moved}") from error
     run = partial(_run, case, settings, data=data, allow_code=allow_code)
     stated = Variant(AS_STATED)
     (base, *found) = _all(run, [stated, *given], jobs, as_json)

@@ -90,7 +90,7 @@ def run(
     listen: Annotated[
         str | None,
         option(
-            "Serve /health and /metrics (Prometheus) there while the run goes on.",
+            "Serve /livez, /readyz, /health and /metrics (Prometheus) there while the run continues.",
             metavar="[HOST:]PORT",
         ),
     ] = None,
