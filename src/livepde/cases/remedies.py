@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 __all__ = ["KEYS", "adding", "freed", "with_settings"]
 
 WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
+PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
 KEYS = {"offset": "offset", "gain": "gain", "position": "at_std"}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 NO_SETTING = "No setting of this case frees it."
@@ -70,9 +71,12 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
         return ()
     others = (getattr(item, key) for item in channels.values())
     stated = next((value for value in others if value is not None), None)
-    if stated is None and not math.isfinite(cause.size):
+    size = cause.size
+    if key == "at_std" and not math.isfinite(size):
+        size = PLACE * float(np.ptp(case.mesh.p, axis=1).max())
+    if stated is None and not math.isfinite(size):
         return settings_in(cause.setting)
-    given = float(f"{WIDE * abs(cause.size):.2g}") if stated is None else stated
+    given = float(f"{WIDE * abs(size):.2g}") if stated is None else stated
     return (channel_setting(cause.subject, key, toml_value(given)),)
 
 

@@ -90,7 +90,7 @@ def run(
     listen: Annotated[
         str | None,
         option(
-            "Serve /livez, /readyz, /health and /metrics (Prometheus) there while the run continues.",
+            "Serve /livez, /readyz, /health and /metrics (Prometheus) there during the run.",
             metavar="[HOST:]PORT",
         ),
     ] = None,

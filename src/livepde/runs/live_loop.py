@@ -31,8 +31,8 @@ GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two looks at the verdict
-# Keys of a stored verdict: the level that was reported last, the number of samples at the last look,
-# and another level that this look was the first to find.
+# Keys of a stored verdict: the level that was reported last, the samples at the last look, and
+# another level that this look was the first to find.
 TOLD, LOOKED, NEXT = "told", "looked", "next"
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event

@@ -50,6 +50,8 @@ BRIEF = 10  # readings that contradict the model after a pause, say
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
+FACTOR = 2.0  # by which the scale of a sensor or an input may be wrong
+LONGEST = 0.25  # of the run: how late a sensor may be
 SEEN = 4.0  # standard errors of an amplitude from which it shows
 BEYOND = 2.0  # standard deviations of a shift beyond an interval
 UNSEEN = 3  # sentences on what is not seen
@@ -168,6 +170,12 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         e = math.exp(min(evidence.total, 700.0))
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
+    order = [(w, d) for w, d in order if _possible(dictionary.directions[d], w, d, evidence, at)]
+    if not order:
+        text = "The model does not explain the data, and no single cause that is possible does."
+        e_value = math.exp(min(evidence.whitened, 700.0))
+        yield Finding("misfit", "do not trust", text, evidence=e_value, measure="e-value")
+        return
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
     shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
@@ -253,6 +261,21 @@ def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
                 best[d] = value, w
     order = sorted(best, key=lambda d: -best[d][0])
     return [(best[d][1], d) for d in order] or [(0, 0)]
+
+
+def _possible(
+    direction: ScoreDirection, window: int, number: int, evidence: CauseEvidence, at: Position
+) -> bool:
+    """Return whether equation and sensor can have a cause of the size that was found."""
+    size = float(evidence.size[window, number])
+    amount = _amount(direction, size, at)
+    if direction.kind == "loss":  # one that is known is an unknown of the model, and has no cause
+        return size > 0.0
+    if direction.kind in ("gain", "channel"):
+        return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
+    if direction.kind == "lag":
+        return abs(size) * LAG <= LONGEST * float(at.ledger.seen)
+    return direction.least <= amount <= direction.most
 
 
 def _cause(
@@ -353,7 +376,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
             "Add a source to the process, or free one.",
         ),
         "loss": (
-            f"a loss to the surroundings is {'missing' if size > 0 else 'too large'} in the model",
+            "a loss to the surroundings is missing in the model",
             "Add a loss term, or free it.",
         ),
         "flux": (

@@ -46,6 +46,7 @@ TELLING = "Longer data, with larger changes nearer to the sensors, would tell mo
 MOST = 5  # findings that are said unasked
 NAMED = 4  # causes that are kept
 HALF = 0.5  # share of a misfit
+CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
 LARGEST = 1e99  # evidence beyond is written as that
 
@@ -142,12 +143,7 @@ class Finding:
         """The finding with its causes, consequence and remedy, in plain English."""
         parts = [self.text]
         if self.causes:
-            first, *others = self.causes
-            share = "" if math.isnan(first.share) else f" (explains {first.share:.0%} of it)"
-            parts.append(f"Most likely {first.text}{share}.")
-            if others:
-                share = "" if math.isnan(others[0].share) else f" ({others[0].share:.0%})"
-                parts.append(f"Else {others[0].text}{share}.")
+            parts += self._likely()
         moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
         if moved:
             each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
@@ -156,6 +152,16 @@ class Finding:
         if remedy:
             parts.append(remedy)
         return " ".join(parts)
+
+    def _likely(self) -> list[str]:
+        """Return the likely causes as sentences; candidates where none explains half of it."""
+        first, *others = self.causes
+        if first.share < HALF:
+            each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
+            return [f"No single cause explains it. Candidates: {'; '.join(each)}."]
+        found = [f"Most likely {first.text}{_shown(first.share, 'explains {} of it')}."]
+        found += [f"Else {one.text}{_shown(one.share)}." for one in others[:1]]
+        return found
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
@@ -179,6 +185,11 @@ class Finding:
             "shift": {name: float(size) for name, size in self.shift.items()},
             "sentence": self.sentence,
         }
+
+
+def _shown(share: float, words: str = "{}") -> str:
+    """Return a share in parentheses; empty if it is not known."""
+    return "" if math.isnan(share) else f" ({words.format(f'{share:.0%}')})"
 
 
 def _number(value: float | None) -> float:
