@@ -131,6 +131,7 @@ class Filtered:
     beliefs: list[Gaussian]
     steps: list[tuple[np.ndarray, np.ndarray]]  # F and I - K H
     weights: list[tuple[np.ndarray, np.ndarray]]  # H' S^-1 H and H' S^-1 d
+    log_evidence: float  # sum of the log densities of the innovations
 
 
 def updated(
@@ -152,18 +153,28 @@ def filtered(
     rod: Rod, rows: Sequence[Row], H: np.ndarray, start: Gaussian, t0: float, inputs: Inputs
 ) -> Filtered:
     """Return the beliefs after each row; `inputs` are those at t0."""
-    belief, beliefs, steps, weights = start, [], [], []
+    belief, beliefs, steps, weights, evidence = start, [], [], [], 0.0
     for row in rows:
         F = np.eye(len(start.mean))
         if row.t > t0:
             F, g, Q = rod.linear(t0, row.t, inputs, row.inputs)
             belief = Gaussian(mean=F @ belief.mean + g, cov=F @ belief.cov @ F.T + Q)
+        evidence += log_density(belief, row, H)
         belief, left, information, score = updated(belief, row, H)
         beliefs.append(belief)
         steps.append((F, left))
         weights.append((information, score))
         t0, inputs = row.t, row.inputs
-    return Filtered(beliefs=beliefs, steps=steps, weights=weights)
+    return Filtered(beliefs=beliefs, steps=steps, weights=weights, log_evidence=evidence)
+
+
+def log_density(belief: Gaussian, row: Row, H: np.ndarray) -> float:
+    """Return the log density of the readings of a row, given those before."""
+    seen = np.isfinite(row.z)
+    S = H[seen] @ belief.cov @ H[seen].T + np.diag(row.std[seen] ** 2)
+    d = row.z[seen] - H[seen] @ belief.mean
+    size = np.linalg.slogdet(2.0 * np.pi * S)[1]
+    return float(-0.5 * (d @ np.linalg.solve(S, d) + size))
 
 
 def smoothed(run: Filtered) -> list[Gaussian]:

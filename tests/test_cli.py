@@ -30,7 +30,7 @@ COMMANDS = (
     "run",
     "fleet",
     "report",
-    "explain",
+    "compare",
     "watch",
     "export",
     "citation",

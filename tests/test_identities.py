@@ -424,8 +424,8 @@ LINEAR = {
 }
 
 
-def exact(o: Options) -> tuple[list[kalman.Gaussian], list[kalman.Gaussian]]:
-    """Return the beliefs of the independent filter and of the independent smoother."""
+def exact(o: Options) -> kalman.Filtered:
+    """Return what the independent filter finds."""
     rows = shown(o, np.random.default_rng([o.seed, 0]))
     if o.noise != "readings":
         own = o.noise == "some"
@@ -436,8 +436,7 @@ def exact(o: Options) -> tuple[list[kalman.Gaussian], list[kalman.Gaussian]]:
     mean, std = np.array([PRIOR[name] for name in "sco"]).T
     zero = np.zeros(CELLS + 1)
     start = kalman.Gaussian(mean=np.append(u, mean), cov=np.diag(np.append(zero, std**2)))
-    run = kalman.filtered(rod(o), rows, sensors(o), start, 0.0, opening(rows[0].inputs, rows[0].t))
-    return run.beliefs, kalman.smoothed(run)
+    return kalman.filtered(rod(o), rows, sensors(o), start, 0.0, opening(rows[0].inputs, rows[0].t))
 
 
 def matches(mean: Any, std: Any, belief: kalman.Gaussian) -> None:
@@ -449,7 +448,8 @@ def matches(mean: Any, std: Any, belief: kalman.Gaussian) -> None:
 def test_filter_and_smoother_are_those_of_an_independent_code(examples):
     def same(o: Options) -> None:
         assume(o.linear)
-        beliefs, all_told = exact(o)
+        independent = exact(o)
+        beliefs, all_told = independent.beliefs, kalman.smoothed(independent)
         result = identifier(o, kind=Bare).run(samples(o))
         estimates = stepped(identifier(o, kind=Bare), samples(o))
         for found, belief in zip(estimates, beliefs, strict=True):
@@ -459,5 +459,7 @@ def test_filter_and_smoother_are_those_of_an_independent_code(examples):
             means = np.append(data["u"][k], [data["s"][k], data["c"][k]])
             stds = np.append(data["u_std"][k], [data["s_std"][k], data["c_std"][k]])
             matches(means, stds, belief)
+        for found in (result.log_evidence, estimates[-1].diagnostics.log_evidence):
+            np.testing.assert_allclose(found, independent.log_evidence, rtol=1e-9)
 
     check(options(**LINEAR), examples, same)

@@ -24,13 +24,14 @@ from patience import PATIENCE
 import livepde as lp
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Event, Journal
-from livepde.runs.live_loop import Backlog, Live
+from livepde.runs.live_loop import JUDGED, Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 from livepde.stepping import Advance, ImplicitEuler
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.sources import Follow, Row, Rows, json_row
 from livepde.streams.table import Column
+from livepde.verdict import Finding, Verdict
 
 
 @pytest.fixture(autouse=True)
@@ -457,17 +458,50 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_verdict_of_no_trust_is_no_health_and_is_told(tmp_path):
-    biased = ({**row, "b": row["b"] + 0.2} for row in rows(101))
+def test_a_run_whose_model_is_wrong_is_well_and_says_so_once(tmp_path):
+    biased = ({**row, "b": row["b"] + 0.2} for row in rows(201))
     run = live(tmp_path, Rows(biased))
     run.run()
     levels = [e.message.partition(":")[0] for e in run.journal.events if e.kind == "verdict"]
-    assert levels[:2] == ["caution", "do not trust"]  # of 50 samples, which leave k well; of 100
-    grave = levels[-1] == "do not trust"
-    assert run.health["ok"] == (not grave)
-    assert health_of(run)[0] == ("unwell", "the verdict on the estimates is 'do not trust'")
-    kinds = [kind for kind, _ in health_of(run)]
-    assert kinds[-1] == ("unwell" if grave else "well")
+    assert levels[-1] in ("caution", "do not trust")
+    assert len(set(levels)) == len(levels)
+    assert run.health["ok"]
+    assert not health_of(run)
+    # One verdict, which is that of the last fit in the end.
+    assert run.health["verdict"] == run.result.verdict.level
+    assert run.health["verdict"] == json.loads(run.journal.verdict)["level"]
+    assert run.health["findings"]
+
+
+def test_a_level_counts_once_two_looks_have_found_it(tmp_path):
+    run = live(tmp_path, Rows(rows(3)))
+    run.run()
+
+    class Looked:
+        def __init__(self, level: str) -> None:
+            grave = {"trusted": [], "caution": [Finding("x", "caution", "It is off.")]}
+            self.verdict = Verdict.of(grave[level])
+
+    told = len([e for e in run.journal.events if e.kind == "verdict"])
+    found = []
+    for number, level in enumerate(
+        ["trusted", "trusted", "caution", "trusted", "caution", "caution"]
+    ):
+        run.result._count = 1000 + JUDGED * number
+        run._judge(Looked(level))
+        run._judge(Looked("trusted"))  # a sample that is taken again is not looked at again
+        found.append(run.health["verdict"])
+    assert found[1:] == ["trusted", "trusted", "trusted", "trusted", "caution"]
+    events = [e.message for e in run.journal.events if e.kind == "verdict"][told:]
+    assert [text.partition(":")[0] for text in events] == ["trusted", "caution"]
+    # Who goes on with the run knows of the last look: the next one is the second.
+    run.result._count += JUDGED
+    run._judge(Looked("trusted"))
+    run.journal.close()
+    again = live(tmp_path, Rows([]))
+    again.result._count = run.result._count + JUDGED
+    again._judge(Looked("trusted"))
+    assert again.health["verdict"] == "trusted"
 
 
 @pytest.mark.slow
@@ -630,6 +664,7 @@ def test_health_and_metrics(tmp_path):
     assert "livepde_verdict -1.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
+    assert ask("/livez") == ask("/readyz") == "ok\n"
     run.silent = True
     assert "livepde_silent 1.0" in ask("/metrics")
     assert "livepde_ok 0.0" in ask("/metrics")

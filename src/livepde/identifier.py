@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -81,7 +81,10 @@ class Identifier:
         whose value at t0 is not known hold their first one over the first interval: the estimate
         (`Estimate.held`) and the verdict name them.
     withheld
-        Sensors that are never assimilated, only scored.
+        Sensors that are never assimilated, only predicted: a run that misses them is doubted.
+    ignored
+        Names of those of `withheld` that are only shown, such as a faulty sensor: how the run
+        predicts them never counts against it.
     scheme, dt_max
         Time scheme, default that of the law (`Law.scheme`); a longer interval between samples is
         divided into substeps.
@@ -125,6 +128,7 @@ class Identifier:
         u0: Any = None,
         t0: float = 0.0,
         withheld: Observation | None = None,
+        ignored: Collection[str] = (),
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
         halvings: int = Advance.halvings,
@@ -148,6 +152,13 @@ class Identifier:
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
         self.withheld = withheld.bind(*spaces) if withheld is not None else None
+        self.ignored = tuple(ignored)
+        known_names = self.withheld.names if self.withheld is not None else ()
+        for name in self.ignored:
+            if name not in known_names:
+                raise ConfigurationError(
+                    f"ignored: '{name}' is none of the sensors in withheld, {list(known_names)}."
+                )
         self._channels = Channels(model.channels, self.observed, self.withheld)
         # Positions of moving sensors are no inputs of the process: they move on lines.
         held = Held.of(between or {}, [c for c in self.inputs if c not in self.optional_inputs])
@@ -512,14 +523,16 @@ class Identifier:
     ) -> Callable[[], Verdict]:
         """Return the verdict of the law with the findings on steps, withheld sensors and gaps."""
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
-        names = self.withheld.names if self.withheld is not None else ()
+        names, ignored = self.withheld.names if self.withheld is not None else (), self.ignored
         inputs = self._channels.inputs
         if not names and not steps.failed and gaps.silent:
             return judge
 
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
-            return judge().with_findings([*steps.findings(), *withheld.findings(names), *held])
+            return judge().with_findings(
+                [*steps.findings(), *withheld.findings(names, ignored), *held]
+            )
 
         return found
 
@@ -560,7 +573,8 @@ class Identifier:
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.
             now = self.law.diagnosed(self._work, state)
-            return replace(estimate.diagnostics, shifts=now.shifts)
+            before = estimate.diagnostics
+            return replace(before, shifts=now.shifts, log_evidence=now.log_evidence)
 
         return replace(
             estimate,
@@ -665,7 +679,9 @@ class Identifier:
         fields_every
             Keep the fields of every so many samples (scalars and innovations of all).
         """
-        result = Result(self.model, self.observed, self.withheld, fields_every)
+        result = Result(
+            self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
+        )
         begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
         for item in _watched(stream, progress, total):
@@ -722,7 +738,9 @@ class Identifier:
             if before is None:  # the law begins with the first sample
                 before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who.latent_belief().q)
-        result = Result(self.model, self.observed, self.withheld, fields_every)
+        result = Result(
+            self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
+        )
         data = run.fixed_interval(fields_every)
         beliefs = data and self.law.smoothed(self._work, before, who._state, data)
         return run.dataset(result, self.problem, beliefs or ())

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -333,6 +334,8 @@ class Result:
         Names, units and coordinates of the numbers of records; default those of model and sensors.
     count
         Number of earlier estimates, not all of which need be kept; default that of the records.
+    ignored
+        Names of withheld sensors that never count, for the default layout.
     """
 
     def __init__(
@@ -344,6 +347,7 @@ class Result:
         records: Records | None = None,
         layout: Layout | None = None,
         count: int | None = None,
+        ignored: Sequence[str] = (),
     ) -> None:
         self.model = model
         self.observed = observed
@@ -353,7 +357,7 @@ class Result:
         self._settled: Belief | None = None
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
-        self.layout = layout or layout_of(model, observed, withheld)
+        self.layout = layout or layout_of(model, observed, withheld, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
         self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
@@ -366,6 +370,17 @@ class Result:
     def verdict(self) -> Verdict:
         """The verdict on the run so far: that of the last estimate."""
         return Verdict.unjudged() if self.last is None else self.last.verdict
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the marginal likelihood of all readings; NaN for a law without covariance.
+
+        The density of the readings of the assimilated sensors, in their unit, with the unknowns
+        integrated out: after a fit of the stored samples linear about that fit, else the sum of the
+        log densities of the innovations. Readings that were refused count as if at the limit of
+        the gate. Two runs can be compared if they assimilate the same readings.
+        """
+        return math.nan if self.last is None else float(self.last.diagnostics.log_evidence)
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
@@ -451,11 +466,13 @@ class Result:
         scalar; `_modes`, the number of modes of a field that the data determine, and `_left_out`,
         the share of its mean variance in modes that the law leaves out, over `snapshot`; and
         `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
-        result of `Verdict.to_dict`, as JSON.
+        result of `Verdict.to_dict`, as JSON; `log_evidence` that of the result.
         """
         data = self.layout.dataset(*self._finished())
         if self.last is not None:
             data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
+            if math.isfinite(self.log_evidence):
+                data.attrs["log_evidence"] = self.log_evidence
         return data
 
     def _finished(self) -> tuple[RecordArrays, Snapshot | None]:
@@ -528,8 +545,16 @@ def _number(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> Layout:
-    """Return names, units and coordinates of the records of a run."""
+def layout_of(
+    model: Model, observed: Observed, withheld: Observed | None, ignored: Sequence[str] = ()
+) -> Layout:
+    """Return names, units and coordinates of the records of a run.
+
+    Parameters
+    ----------
+    ignored
+        Names of withheld sensors that never count.
+    """
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
         unknown = unknown_of(model.parameter_space, label)
@@ -557,6 +582,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         length_unit=model.length_unit,
         places={name: at.tolist() for name, at in places.items()},
         comments=_field_comments(model),
+        attrs={"ignored": "\n".join(ignored)} if ignored else {},
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -32,6 +32,7 @@ from livepde.cases.equations import resolve
 from livepde.cases.laws import law_of
 from livepde.cases.process import conditioned, drive_notes, model_of, process_notes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
+from livepde.cases.schema import SENSORS
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier, Sample
@@ -97,6 +98,7 @@ class Prepared:
             u0=self.u0,
             t0=float(self.first.t),
             withheld=case.withheld,
+            ignored=case.ignored,
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=self.assimilate_from,
@@ -138,7 +140,7 @@ class Prepared:
     def layout(self) -> Layout:
         """Layout of the records of a run, with title, start, units and references of the case."""
         who = self.identifier
-        return self.described(layout_of(who.model, who.observed, who.withheld))
+        return self.described(layout_of(who.model, who.observed, who.withheld, who.ignored))
 
     def described(self, found: Layout) -> Layout:
         """Return a layout with the references, unit of length and attributes of the case."""
@@ -150,7 +152,7 @@ class Prepared:
             found,
             numbers={**found.numbers, **references},
             length_unit=self.case.equation.length_unit,
-            attrs=self.attributes,
+            attrs={**found.attrs, **self.attributes},
         )
 
     def journal(self, path: Path | None = None) -> Journal:
@@ -175,7 +177,7 @@ def load(
     path: str | os.PathLike[str],
     *,
     allow_code: bool = False,
-    settings: Mapping[str, Any] | None = None,
+    settings: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
 ) -> Case:
     """Read and check a case file.
 
@@ -186,7 +188,8 @@ def load(
     allow_code
         Load an equation or a reader of the user's own ('module:function', 'file.py:function').
     settings
-        Key -> value that overrides that of the file, as {"law.noise": "2 K"}.
+        Key -> value that overrides that of the file, as {"law.noise": "2 K"}; several mappings are
+        applied one after the other.
 
     Raises
     ------
@@ -197,9 +200,10 @@ def load(
     # A run directory keeps the effective text: settings are written into it, too.
     text = original = read_text(file)
     document = read_toml(text, str(file))
-    if settings:
-        document = apply(document, settings, str(file))
-        text = tomlkit.dumps(document)
+    for each in (settings,) if isinstance(settings, Mapping) else settings or ():
+        if each:
+            document = apply(document, each, str(file))
+            text = tomlkit.dumps(document)
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.
@@ -237,7 +241,7 @@ class Case(CaseContent):
         """Refuse names of unknowns and channels that are reserved for other numbers of a run."""
         kinds = (
             ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
-            ("channels", "channel", self.roles("sensor", "withheld"), ROLES),
+            ("channels", "channel", self.roles(*SENSORS), ROLES),
         )
         for key, kind, given, taken in kinds:
             for name in given:
@@ -302,8 +306,13 @@ class Case(CaseContent):
 
     @cached_property
     def withheld(self) -> Observation | None:
-        """The withheld sensors, which are scored only; None if there are none."""
-        return observation_of(self, "withheld")
+        """The sensors that are predicted only, withheld or ignored; None if there are none."""
+        return observation_of(self, "withheld", "ignored")
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """Names of those of them that are shown and never count against a run."""
+        return tuple(self.roles("ignored"))
 
     @cached_property
     def law(self) -> AnyLaw:
@@ -346,7 +355,7 @@ class Case(CaseContent):
     def _expected_notes(self) -> list[str]:
         """Name expected numbers that no run of this case can have; see `runs.measures`."""
         labels = list(self.model.parameter_space.labels)
-        scored = list(self.roles("sensor", "withheld"))
+        scored = list(self.roles(*SENSORS))
         known = [
             *labels,
             *(f"{label}.std" for label in labels),

@@ -13,7 +13,7 @@ import numpy as np
 
 from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
-from livepde.cases.schema import CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
+from livepde.cases.schema import SENSORS, CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, MissingInputError, SpaceError
 from livepde.fem import (
@@ -105,9 +105,9 @@ def _noise_column(case: CaseContent, name: str, channel: ChannelSpec, factor: fl
     return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
-def observation_of(case: CaseContent, role: str) -> Observation | None:
-    """Return the observation of the channels of a role; None if there are none."""
-    channels = case.roles(role)
+def observation_of(case: CaseContent, *roles: str) -> Observation | None:
+    """Return the observation of the channels of some roles; None if there are none."""
+    channels, assimilated = case.roles(*roles), "sensor" in roles
     if not channels:
         return None
     # One observation reads all channels of a kind and a component of the state.
@@ -115,13 +115,14 @@ def observation_of(case: CaseContent, role: str) -> Observation | None:
     for name, channel in channels.items():
         kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
     names = [*chain.from_iterable(kinds.values())]
-    levels = noise_of(case, role)
+    levels = noise_of(case, *roles) if assimilated else None
     outer: dict[str, Any] = {
         "noise": levels and [levels[name] for name in names],
         "unit": case.equation.state.unit,
-        "reconstruction": _reconstruction(case) if role == "sensor" else Pseudoinverse(),
+        "reconstruction": _reconstruction(case) if assimilated else Pseudoinverse(),
     }
-    if any(item.offset or item.gain or item.correlated for item in channels.values()):
+    own = any(item.offset or item.gain or item.correlated for item in channels.values())
+    if own and assimilated:
         whole = _whole(case, kinds, {})
         return _calibrated(case, whole, names, **outer)
     return _whole(case, kinds, outer)
@@ -267,7 +268,7 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
 
 def sensor_notes(case: CaseContent) -> list[str]:
     """Return notes on positions of sensors that are allowed and yet doubtful."""
-    channels = case.roles("sensor", "withheld")
+    channels = case.roles(*SENSORS)
     if len(case.mesh.p) != 1 or any(item.at is None for item in channels.values()):
         return []
     at = {float(_position(case, name, item)) for name, item in channels.items()}
@@ -279,9 +280,9 @@ def sensor_notes(case: CaseContent) -> list[str]:
     ]
 
 
-def noise_of(case: CaseContent, role: str) -> dict[str, float] | None:
-    """Return the noise of each sensor of a role; None if none is given."""
-    channels, levels = case.roles(role), _stated(case, "noise", role)
+def noise_of(case: CaseContent, *roles: str) -> dict[str, float] | None:
+    """Return the noise of each sensor of some roles; None if none is given."""
+    channels, levels = case.roles(*roles), _stated(case, "noise", *roles)
     if levels and len(levels) < len(channels):
         missing = next(name for name, item in channels.items() if item.noise is None)
         text = "give every sensor its noise, or none and law.noise instead."

@@ -18,7 +18,7 @@ import numpy as np
 
 from livepde.cases.case_content import CaseContent
 from livepde.cases.equations import check_options, load_code, own_code
-from livepde.cases.schema import BrokerSpec, CaseSpec, DataSpec, FileSpec
+from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.cases.units import conversion
 from livepde.linalg import Mask
 from livepde.runs.live_loop import Backlog, Retention, Sink
@@ -176,7 +176,7 @@ def _joined(
             raise case.error("data.file", f"no channel has a column of {path}; leave it out.")
         tables.append(_read(path, own, clock_of(case, spec), spec))
     second = clock_of(case).second
-    sensors = case.roles("sensor", "withheld")
+    sensors = case.roles(*SENSORS)
     needed = [name for name, column in columns.items() if column.needed]
     between = {name: column.between for name, column in columns.items()}
     return join_tables(tables, second, sensors, needed, case.where("data.file"), between)
@@ -256,7 +256,7 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
         # A channel that is held may leap at any time.
         if channel is None or channel.between != "line":
             continue
-        if channel.role in ("boundary", "sensor", "withheld"):
+        if channel.role in ("boundary", *SENSORS):
             groups.setdefault(channel.of, []).append(k)
     return [*groups.values()]
 

@@ -195,7 +195,9 @@ class MemberBlock:
         path, one = self._paths[k], self._each[k]
         if self._written:
             return Journal.open(path, write=True)
-        layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
+        layout = layout_of(
+            identifier.model, identifier.observed, identifier.withheld, one.case.ignored
+        )
         journal = Journal.create(path, identifier.channels, one.described(layout))
         for (kind, channel), number in self._tables[k].remarks.items():
             journal.count(kind, channel, number)

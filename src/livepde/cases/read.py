@@ -32,6 +32,7 @@ __all__ = [
     "read_spec",
     "read_text",
     "read_toml",
+    "settings_in",
     "spec_of",
     "toml_key",
     "toml_line",
@@ -337,7 +338,8 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
         The parsed case.
     settings
         Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
-        sets the keys in it and leaves the others; None takes the key away.
+        sets the keys in it and leaves the others; None takes the key away. A table for an unknown
+        or a channel that the case has not adds it.
     where
         For messages.
 
@@ -348,13 +350,15 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():
+        adds = isinstance(given, Mapping) and len(key_path(key, where)) == 2
         for path, value in _leaves(key_path(key, where), given):
             here = changed
             for k, part in enumerate(path[:-1]):
-                if k == 1 and path[0] in NAMED and part not in here:
+                if k == 1 and path[0] in NAMED and part not in here and not adds:
                     raise CaseError(
                         f"{where}: {'.'.join(path)}: the case has no '{path[0]}.{part}'; "
-                        f"{did_you_mean(part, here)}"
+                        f"{did_you_mean(part, here).removesuffix('.')} (to add it, set all of it: "
+                        f"{path[0]}.{part}={{ ... }})"
                     )
                 if not isinstance(here.get(part), dict):
                     here[part] = {}
@@ -367,6 +371,16 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
                     f"{did_you_mean(path[-1], here)}"
                 )
     return changed
+
+
+def settings_in(text: str) -> tuple[str, ...]:
+    """Return the settings in a text that separates them by semicolons outside of quotes.
+
+    >>> settings_in('data.separator=";"; law.jumps=true')
+    ('data.separator=";"', 'law.jumps=true')
+    """
+    parts = re.findall(r"""(?:"(?:\\.|[^"\\])*"|'[^']*'|[^;])+""", text)
+    return tuple(part.strip() for part in parts if part.strip())
 
 
 def key_path(key: str, where: str) -> tuple[str, ...]:

@@ -30,7 +30,10 @@ from livepde.streams.csvfile import UTF_8
 from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
 
+SENSORS = ("sensor", "withheld", "ignored")  # roles of channels that measure the state
+
 __all__ = [
+    "SENSORS",
     "BoundarySpec",
     "CaseSpec",
     "ChannelSpec",
@@ -395,7 +398,7 @@ class CorrelatedSpec(Spec):
 class ChannelSpec(Spec):
     """One channel of the stream and its role."""
 
-    role: Literal["boundary", "sensor", "withheld", "input", "position"]
+    role: Literal["boundary", "sensor", "withheld", "ignored", "input", "position"]
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None
@@ -456,7 +459,7 @@ class ChannelSpec(Spec):
             raise ValueError(f"a channel of role {self.role} has no place: leave it out")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
-        if self.role in ("sensor", "withheld") and placed != 1:
+        if self.role in SENSORS and placed != 1:
             raise ValueError(
                 "expected one of: at = position, over = [from, to], along = [start, end], "
                 "follows = channel, each = [from, to, count], positions = file, quantity = name"
@@ -475,9 +478,10 @@ class ChannelSpec(Spec):
 
     @model_validator(mode="after")
     def _options_of_role(self) -> ChannelSpec:
-        sensor = self.role in ("sensor", "withheld")
+        sensor = self.role in SENSORS
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
-        if own and self.role != "sensor":
+        # A sensor that is ignored for a while keeps its keys.
+        if own and self.role not in ("sensor", "ignored"):
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and not sensor:
             raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")

@@ -96,10 +96,8 @@ def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> C
     return cases.load(case, allow_code=allow_code, settings=parse(settings or ()))
 
 
-def prepare_again(
-    opened: Run, data: str | None, allow_code: bool, more: Sequence[str] = ()
-) -> Prepared:
-    """Read the case and the data of a run, with its settings and more.
+def prepare_again(opened: Run, data: str | None, allow_code: bool) -> Prepared:
+    """Read the case and the data of a run, with its settings.
 
     Parameters
     ----------
@@ -110,7 +108,7 @@ def prepare_again(
 
     case = opened.case_file()
     try:
-        loaded = load_case(case, allow_code, [*opened.settings, *more])
+        loaded = load_case(case, allow_code, opened.settings)
         return loaded.prepare(data or opened.data_file)
     except CaseError as error:
         if case.parent != opened.path:

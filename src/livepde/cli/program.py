@@ -13,11 +13,12 @@ from livepde import __version__
 from livepde.cli.cases import equations, init
 from livepde.cli.check import check
 from livepde.cli.citation import citation
+from livepde.cli.compare import compare
 from livepde.cli.experiments import demo, reproduce
 from livepde.cli.export import export, fmu
 from livepde.cli.fleet_command import fleet
 from livepde.cli.printing import BAD_INPUT, terminal
-from livepde.cli.report import explain, report
+from livepde.cli.report import report
 from livepde.cli.run import run
 from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
@@ -42,7 +43,7 @@ COMMANDS = (
     fleet,
     watch,
     report,
-    explain,
+    compare,
     export,
     fmu,
     equations,

@@ -90,7 +90,7 @@ def run(
     listen: Annotated[
         str | None,
         option(
-            "Serve /health and /metrics (Prometheus) there while the run goes on.",
+            "Serve /livez, /readyz, /health and /metrics (Prometheus) there during the run.",
             metavar="[HOST:]PORT",
         ),
     ] = None,
@@ -291,6 +291,7 @@ def concluded(
     draw
         Whether to draw figures.
     """
+    from livepde.cases.remedies import with_settings
     from livepde.runs import (
         arrivals,
         checks_of,
@@ -314,7 +315,7 @@ def concluded(
 
     def judged() -> Verdict:
         found = [*clock_findings(driven.journal), *input_findings(driven.journal, driving)]
-        return verdict(dataset).with_findings(found)
+        return with_settings(prepared, verdict(dataset).with_findings(found))
 
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())

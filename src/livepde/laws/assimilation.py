@@ -21,6 +21,7 @@ from livepde.stepping import Span
 from livepde.verdict import Judge, Ledger, ScoredSample
 
 __all__ = [
+    "HALF_LOG",
     "OK",
     "Assimilation",
     "GateDecision",
@@ -32,6 +33,7 @@ __all__ = [
 
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
+HALF_LOG = 0.5 * math.log(2.0 * math.pi)
 LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fade fast
 
 
@@ -154,15 +156,12 @@ class UpdateOptions:
         Which readings are used.
     adaptive
         True if the noise is a first guess whose multiple is found from the samples.
-    scored
-        True if the likelihood of the samples is kept.
     decision
         An earlier decision of the gate on the sample, which holds again; None: the gate decides.
     """
 
     gate: Gate = field(default_factory=Gate)
     adaptive: bool = False
-    scored: bool = False
     decision: GateDecision | None = None
 
 
@@ -244,9 +243,13 @@ def absorb(
     parts["innovations"] = x.innovations.add(e, measured, newest)
     changes, made = filter_.update(x, Y, d, causes)
     parts |= changes
-    if options.scored:
-        logs = (np.log(noise) * used).sum(axis=1)
-        parts["evidence"] = x.evidence - 0.5 * made.misfit - made.spread - logs
+    logs = ((np.log(noise) + HALF_LOG) * present).sum(axis=1)
+    density = -0.5 * made.misfit - made.spread - logs
+    if np.count_nonzero(refused) and options.gate.beyond < math.inf:
+        # The same readings count whatever is refused: one that is counts as one at the limit.
+        limit = options.gate.beyond**2 * np.maximum(x.innovations.ratio, 1.0)
+        density = density - 0.5 * limit * refused.sum(axis=1)
+    parts["evidence"] = x.evidence + density
     if options.adaptive:
         parts |= _learned(x, used, d, made)
     if shadows is not None and off is not None:

@@ -59,7 +59,8 @@ class FilterState:
         Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
         many samples that stands for, shapes (members,).
     evidence
-        Logarithm of the likelihood of all samples so far, each given those before, (members,).
+        Logarithm of the likelihood of all readings so far, each sample given those before; a
+        reading that is refused counts as one at the limit of the gate, (members,).
     kept
         Warm-start data of the last stage for the next one.
     causes, ledger

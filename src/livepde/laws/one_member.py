@@ -231,7 +231,7 @@ def _most_likely(
     """
     tried = sorted({guess + shift for shift in NEAR_ONSETS} & set(range(len(known))))
     # What was refused before the first of them stays refused; all of them explain the rest.
-    open_gate = UpdateOptions(adaptive=work.options.adaptive, scored=True)
+    open_gate = UpdateOptions(adaptive=work.options.adaptive)
     searching = replace(work.unaccompanied, options=open_gate)
     x, score, best = work.filter.relinearised(unaccompanied(x)), -np.inf, guess
     for number, interval in enumerate(known):

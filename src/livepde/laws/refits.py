@@ -116,10 +116,12 @@ def _after(
 def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
     """Return the filter that continues from the end of a search; None if a step fails."""
     now = samples.state.now
-    best = samples.updated(found.best, found.used)
+    evidence = samples.state.start.evidence + samples.log_evidence(found.best, found.used)
+    best = changed(samples.updated(found.best, found.used), evidence=evidence)
     away = apart(samples.filter, best, now)
     # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
     # refit of the same samples may compute them again.
     if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
         return best
-    return samples.judged(found.best, found.used)
+    x = samples.judged(found.best, found.used)
+    return None if x is None else changed(x, evidence=evidence)

@@ -317,7 +317,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not filter_.sensors.observe(x, span.end)[1].any():
-            return state
+            # The readings count all the same: another case may assimilate them.
+            seen, _ = absorb(filter_, x, span, work.options)
+            return state.counted(seen.evidence)
         problem = filter_.problem
         form = problem.model.form_initial
         # The safeguards of a step never see a sample at the initial time: where this is not linear

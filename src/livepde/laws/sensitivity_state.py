@@ -166,6 +166,11 @@ class SensitivityState:
     def __len__(self) -> int:
         return len(self.now)
 
+    def counted(self, evidence: Array) -> SensitivityState:
+        """Return the state at the start with the evidence of readings that change nothing else."""
+        names = ("start", "now", "older", "newer")
+        return changed(self, **{n: changed(getattr(self, n), evidence=evidence) for n in names})
+
     @property
     def unaccompanied(self) -> SensitivityState:
         """The same without ledger and discretisation errors, as the filter of a search has it."""
@@ -422,12 +427,12 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
     """Return the reports of the members after a sample."""
     # Not all of the filter is kept for what may never be read.
     members, innovations, level, q, da = len(now.q), now.innovations, now.level, now.q, now.da
-    reduction, shadows = work.filter.reduction, work.filter.shadows
+    reduction, shadows, evidence = work.filter.reduction, work.filter.shadows, now.evidence
     if now.kept.q.shape[1]:
         now = changed(now, kept=now.kept.forgotten())
 
     def diagnosed() -> Diagnostics[Array]:
-        found = innovations.diagnostics
+        found = replace(innovations.diagnostics, log_evidence=evidence)
         if work.options.adaptive:
             found = replace(found, noise_level=np.sqrt(level))
         if work.options.gate.beyond < np.inf:

@@ -36,6 +36,9 @@ class Diagnostics(Generic[Number]):
         Mean normalised innovation squared (NIS) for each reading; 1 if the noise is as stated.
     innovation_correlation
         Correlation of successive innovations; 0 if the model explains the data.
+    log_evidence
+        Natural logarithm of the likelihood of all readings so far, with the unknowns integrated
+        out; see `Result.log_evidence`.
     noise_level
         Noise found, over that stated.
     refused
@@ -67,6 +70,7 @@ class Diagnostics(Generic[Number]):
 
     innovation_ratio: Number = NOT_KNOWN
     innovation_correlation: Number = NOT_KNOWN
+    log_evidence: Number = NOT_KNOWN
     noise_level: Number = NOT_KNOWN
     refused: Number = NOT_KNOWN
     bounded: Number = NOT_KNOWN

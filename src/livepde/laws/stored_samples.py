@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from livepde.laws.assimilation import absorb, assimilate
+from livepde.laws.assimilation import HALF_LOG, absorb, assimilate
 from livepde.laws.filter import Filter, contraction
 from livepde.laws.filter_state import FilterState, extended
 from livepde.laws.gate import Gate
@@ -297,6 +297,25 @@ class StoredSamples:
         parts |= {"da": (mean @ end.C[0])[None], "du": (mean @ end.U[0])[None]}
         found: FilterState = changed(now, q=end.q, u=end.u, **parts)
         return self.filter.compressed(found) if rows > self.filter.rank else found
+
+    def log_evidence(self, one: Passed, used: Mask) -> float:
+        """Return the log of the likelihood of all readings, linear about a trajectory.
+
+        The unknowns are integrated out. A reading that is not in use counts as one at the limit of
+        the gate, which is wider where the residuals in use are larger than their noise.
+        """
+        J, r, there = one.slopes[used], one.residuals[used], np.isfinite(self.readings)
+        H, g = np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
+        lowest = one.cost(used) - 0.5 * float(g @ np.linalg.solve(H, g))
+        found = -lowest - 0.5 * float(np.linalg.slogdet(H)[1])
+        found -= float((np.log(self.noise) + HALF_LOG)[there].sum())
+        refused = (there & ~used).sum(axis=0)
+        for k in np.flatnonzero(refused).tolist():
+            square = max(
+                1.0, float((one.residuals[used[:, k], k] ** 2).sum()) / max(used[:, k].sum(), 1)
+            )
+            found -= 0.5 * self.work.options.gate.beyond**2 * square * float(refused[k])
+        return found
 
     def judged(self, one: Passed, used: Mask) -> FilterState | None:
         """Return the filter that has taken the readings in use one by one, about a trajectory.

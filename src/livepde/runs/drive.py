@@ -130,7 +130,8 @@ def drive(
 
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
-    layout = layout_of(identifier.model, identifier.observed, identifier.withheld)
+    who = identifier
+    layout = layout_of(who.model, who.observed, who.withheld, who.ignored)
     return Journal.create(path, identifier.channels, layout)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import threading
@@ -22,14 +23,17 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
-from livepde.verdict import LEVELS, NOT_JUDGED
+from livepde.verdict import LEVELS, NOT_JUDGED, Verdict
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # samples between two checkpoints
-JUDGED = 50  # samples between two evaluations of the verdict; a change is an event
+JUDGED = 50  # samples between two looks at the verdict
+# Keys of a stored verdict: the level that was reported last, the samples at the last look, and
+# another level that this look was the first to find.
+TOLD, LOOKED, NEXT = "told", "looked", "next"
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
@@ -157,8 +161,8 @@ class Live:
     ----------
     ailments
         Functions that return the reason why the run is not well, in one sentence, or an empty
-        string; /health, the metrics, the log and the page report the first reason. The last ailment
-        is a verdict of "do not trust", which is evaluated every 50 samples.
+        string; /health, the metrics, the log and the page report the first reason. A verdict is no
+        ailment: the process is well while its model is not.
     """
 
     def __init__(
@@ -199,7 +203,7 @@ class Live:
         self._heard = self._taken = clock()
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
-        self._unwell, self._told, self._doubt = "", (-1, "well"), ""
+        self._unwell, self._told = "", (-1, "well")
         self._unwritten = ""  # why the journal cannot be written
         self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
         # Of the group, to be stored at its end: number of the sample, and whether with its fields.
@@ -215,7 +219,6 @@ class Live:
             lambda: self.feed.doubt,
             self._refusing,
             self._failing,
-            self._doubted,
         ]
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
@@ -223,8 +226,10 @@ class Live:
         self._uncounted: deque[Remark] = deque()
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
-        told = [event for event in journal.events if event.kind == "verdict"]
-        self._level = told[-1].message.partition(":")[0] if told else NOT_JUDGED
+        stored = json.loads(journal.verdict) if journal.verdict else Verdict.unjudged().to_dict()
+        self._verdict = Verdict.from_dict(stored)
+        self._level, self._next = stored.get(TOLD, NOT_JUDGED), stored.get(NEXT, "")
+        self._looked = stored.get(LOOKED, 0)
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -305,6 +310,7 @@ class Live:
         """Write again the events and counts that the journal has lost."""
         for event in self._events:
             self.journal.note(event)
+        self._keep_verdict(self._verdict)
         written = Counter(self.journal.counts)
         # Committed counts have survived, so only the difference is written again.
         lost = self._counts - written
@@ -381,7 +387,7 @@ class Live:
         last = self.result.last
         if last is not None:
             self.result.settle(last := self.identifier.settled(last))
-            self.journal.judge(last.verdict.to_dict())
+            self._keep_verdict(last.verdict)
         if self.journal.estimated:
             # Nothing was left to do where there is no last estimate: the fields stay the same.
             final = last or self.identifier.settled(self.identifier.estimate())
@@ -501,7 +507,7 @@ class Live:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
         counts = self._counts.copy()  # requests come from other threads
-        why, verdict = self.why, None if last is None else last.verdict
+        why, verdict = self.why, self._verdict
         return {
             "ok": not why,
             "why": why,
@@ -511,8 +517,8 @@ class Live:
             "silent": self.silent,
             "status": "" if last is None else last.status.code,
             "seconds": self._seconds,
-            "verdict": "" if verdict is None else verdict.level,
-            "findings": [] if verdict is None else verdict.sentences,
+            "verdict": verdict.level,
+            "findings": verdict.sentences,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
 
@@ -556,9 +562,6 @@ class Live:
         if self._failed > 1:
             return f"the last steps have failed; the last one: {self._failure}"
         return "" if last is None or last.status.ok else f"the last step: {last.status}"
-
-    def _doubted(self) -> str:
-        return self._doubt
 
     def _look(self) -> None:
         """Log a change of the run's health, and store it for readers of the journal."""
@@ -666,17 +669,26 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _judge(self, estimate: Estimate) -> None:
-        """Store the verdict, and report a change of its level as an event."""
-        verdict = estimate.verdict
-        self.journal.judge(verdict.to_dict())
-        grave = verdict.level == LEVELS[-1]
-        self._doubt = f"the verdict on the estimates is {verdict.level!r}" if grave else ""
-        if verdict.level != self._level:
+        """Look at the verdict: another level counts once two looks in a row have found it."""
+        if len(self.result) <= self._looked:  # samples that are taken again have been judged
+            return
+        verdict, self._looked = estimate.verdict, len(self.result)
+        before, known = self._level, verdict.level in (self._level, self._next)
+        self._next = "" if known else verdict.level
+        if known:
             self._level = verdict.level
+        self._keep_verdict(verdict if known else self._verdict)
+        if self._level != before:
             said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
             message = f"{verdict.level}: {said.removeprefix('Not judged: ')}"
             # Each sound run begins as not judged, and is trusted then: that is no warning.
             self._tell("verdict", message, harmless=verdict.level == LEVELS[0])
+
+    def _keep_verdict(self, verdict: Verdict) -> None:
+        """Make a verdict the current one, which all readers see."""
+        self._verdict = verdict
+        look = {TOLD: self._level, LOOKED: self._looked, NEXT: self._next}
+        self.journal.judge({**verdict.to_dict(), **look})
 
     def _put(self, estimate: Estimate) -> None:
         """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""

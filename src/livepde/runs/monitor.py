@@ -1,4 +1,4 @@
-"""A small HTTP endpoint beside a run: /health for watchdogs, /metrics for Prometheus."""
+"""A small HTTP endpoint beside a run: probes of the process, /health, /metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -103,14 +103,18 @@ class _Health:
 
 
 class Monitor:
-    """Serves /health and /metrics from threads of its own.
+    """Serves /livez, /readyz, /health and /metrics from threads of its own.
+
+    /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
+    else 503. A verdict changes none of these codes: it is in the content of /health, and a metric.
 
     Parameters
     ----------
     address
         Where to listen.
     health
-        Returns the content of /health as JSON; its "ok" decides between the codes 200 and 503.
+        Returns the content of /health as JSON; its "ok" decides between the codes 200 and 503, and
+        its "why" is what /readyz says.
     metrics
         The metrics that /metrics serves.
 
@@ -138,15 +142,20 @@ class Monitor:
         if path == "/metrics":
             answer: Iterable[bytes] = self._metrics(environ, start)
             return answer
-        if path == "/health":
-            found = dict(self._health())
-            start(
-                "200 OK" if found.get("ok") else "503 Service Unavailable",
-                [("Content-Type", "application/json")],
-            )
-            return [json.dumps(found).encode()]
-        start("404 Not Found", [("Content-Type", "text/plain")])
-        return [b"There are /health and /metrics.\n"]
+        plain = [("Content-Type", "text/plain")]
+        if path == "/livez":
+            start("200 OK", plain)
+            return [b"ok\n"]
+        if path not in ("/health", "/readyz"):
+            start("404 Not Found", plain)
+            return [b"There are /livez, /readyz, /health and /metrics.\n"]
+        found = dict(self._health())
+        code = "200 OK" if found.get("ok") else "503 Service Unavailable"
+        if path == "/readyz":
+            start(code, plain)
+            return [f"{found.get('why') or 'ok'}\n".encode()]
+        start(code, [("Content-Type", "application/json")])
+        return [json.dumps(found).encode()]
 
     def close(self) -> None:
         """Stop listening."""

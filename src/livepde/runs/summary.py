@@ -43,6 +43,7 @@ MOST_ROWS = 40
 DIGITS = 15  # of a number
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
 ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
+IGNORED = "ignored"  # role of channels that are shown and count in no total
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
 CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
@@ -98,6 +99,7 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
     start = float(data.attrs.get("assimilate_from", -math.inf))
     kept = data["time"].values >= start
     found, refused = {}, refused_readings(data)
+    ignored = str(data.attrs.get("ignored", "")).split("\n")
     for variable, dimension, role in CHANNELS:
         if variable not in data:
             continue
@@ -105,7 +107,8 @@ def channel_errors(data: xr.Dataset) -> dict[str, ChannelErrors]:
         for name, errors in zip(map(str, data[dimension].values), columns, strict=True):
             whole, later = (e[np.isfinite(e)] for e in (errors, errors[len(errors) // 2 :]))
             count = int(refused[name][kept].sum()) if name in refused else 0
-            found[name] = ChannelErrors(role, whole, later, count)
+            as_role = IGNORED if name in ignored else role
+            found[name] = ChannelErrors(as_role, whole, later, count)
     return found
 
 

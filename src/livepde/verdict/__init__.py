@@ -17,6 +17,7 @@ from livepde.verdict.findings import (
     Severity,
     Verdict,
     at_bound,
+    channel_setting,
     flat,
     too_few,
 )
@@ -54,6 +55,7 @@ __all__ = [
     "WithheldLedger",
     "assess",
     "at_bound",
+    "channel_setting",
     "discretised",
     "flat",
     "held_inputs",

@@ -36,6 +36,7 @@ from livepde.verdict.findings import (
     too_few,
 )
 from livepde.verdict.ledger import Ledger
+from livepde.verdict.missing_terms import GAIN, LOSS, REACH
 
 __all__ = ["Position", "assess"]
 
@@ -49,6 +50,8 @@ BRIEF = 10  # readings that contradict the model after a pause, say
 STANDS = 10  # equal readings in a row
 MOVES = 1.0  # standard deviations of a shift from which an estimate is not to be trusted
 EXPLAINED = 0.5  # share of the misfit that the first cause explains, else it is not understood
+FACTOR = 2.0  # by which the scale of a sensor or an input may be wrong
+LONGEST = 0.25  # of the run: how late a sensor may be
 SEEN = 4.0  # standard errors of an amplitude from which it shows
 BEYOND = 2.0  # standard deviations of a shift beyond an interval
 UNSEEN = 3  # sentences on what is not seen
@@ -167,6 +170,12 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         e = math.exp(min(evidence.total, 700.0))
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
+    order = [(w, d) for w, d in order if _possible(dictionary.directions[d], w, d, evidence, at)]
+    if not order:
+        text = "The model does not explain the data, and no single cause that is possible does."
+        e_value = math.exp(min(evidence.whitened, 700.0))
+        yield Finding("misfit", "do not trust", text, evidence=e_value, measure="e-value")
+        return
     causes = tuple(_cause(dictionary.directions[d], w, evidence, at, d) for w, d in order[:NAMED])
     w, d = order[0]
     shift = {name: float(moved[w, d] * evidence.size[w, d]) for name, moved in at.moved.items()}
@@ -254,6 +263,21 @@ def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
     return [(best[d][1], d) for d in order] or [(0, 0)]
 
 
+def _possible(
+    direction: ScoreDirection, window: int, number: int, evidence: CauseEvidence, at: Position
+) -> bool:
+    """Return whether equation and sensor can have a cause of the size that was found."""
+    size = float(evidence.size[window, number])
+    amount = _amount(direction, size, at)
+    if direction.kind == "loss":  # one that is known is an unknown of the model, and has no cause
+        return size > 0.0
+    if direction.kind in ("gain", "channel"):
+        return 1.0 / FACTOR <= 1.0 + amount <= FACTOR
+    if direction.kind == "lag":
+        return abs(size) * LAG <= LONGEST * float(at.ledger.seen)
+    return direction.least <= amount <= direction.most
+
+
 def _cause(
     direction: ScoreDirection, window: int, evidence: CauseEvidence, at: Position, number: int
 ) -> Cause:
@@ -262,12 +286,24 @@ def _cause(
     if window and direction.kind not in ("jump", "initial"):
         text += f" in the last {int(at.ledger.age[window])} samples"
     share = float(min(max(share, 0.0), 1.0))
-    setting = _setting(direction, float(size), at)
-    return Cause(direction.kind, direction.subject, text, share, remedy, setting)
+    setting, amount = _setting(direction, float(size), at), _amount(direction, float(size), at)
+    return Cause(direction.kind, direction.subject, text, share, remedy, setting, amount)
 
 
 def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
-    """Return how large a cause is, in units of the model; a gain as a share."""
+    """Return how large a cause is, as `Cause.size` has it."""
+    interval, typical = float(at.ledger.times[1]), float(np.median(at.noise))
+    process = {
+        "source": OFFSET * typical / (REACH * interval),
+        "flux": OFFSET * typical / (REACH * interval),
+        "loss": LOSS / (REACH * interval),
+        "boundary": -OFFSET * typical,
+        "initial": OFFSET * typical,
+        "channel": -GAIN,
+        "lag": LAG * interval,
+    }
+    if direction.kind in process:
+        return size * process[direction.kind]
     if direction.kind in ("offset", "drift"):  # by the noise that was found, where that is so
         return size * OFFSET * float(at.noise[list(at.sensors).index(direction.subject)])
     return size * direction.size
@@ -310,7 +346,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
         ),
         "drift": (
             f"sensor {name} drifts, by {amount / DRIFT:+.2g}{unit} a sample",
-            f"Calibrate {name}, or leave it out.",
+            f'Calibrate {name}, or leave it out: `role = "ignored"`.',
         ),
         "gain": (
             f"the scale of sensor {name} is {abs(100 * amount):.2g} % too "
@@ -340,7 +376,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, s
             "Add a source to the process, or free one.",
         ),
         "loss": (
-            f"a loss to the surroundings is {'missing' if size > 0 else 'too large'} in the model",
+            "a loss to the surroundings is missing in the model",
             "Add a loss term, or free it.",
         ),
         "flux": (
@@ -428,7 +464,10 @@ def _stuck(at: Position) -> Iterator[Finding]:
         if name in at.aside:  # its readings are not used
             continue
         text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
-        cause = Cause("stuck", name, f"sensor {name} stands still", remedy=f"Look at {name}.")
+        remedy = f'Check {name}. If it is faulty, set `role = "ignored"`.'
+        setting = channel_setting(name, "role", '"ignored"')
+        said = f"sensor {name} stands still"
+        cause = Cause("stuck", name, said, remedy=remedy, setting=setting)
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
 
 
@@ -441,9 +480,11 @@ def _aside(at: Position) -> Iterator[Finding]:
             f"{name} is set aside since t = {since:g}{time}: its readings disagree with the model "
             f"and with the other sensors or its own past, at last by {off:+.3g}{unit}."
         )
-        cause = Cause("sensor", name, f"sensor {name} is broken or displaced")
+        setting = channel_setting(name, "role", '"ignored"')
+        cause = Cause("sensor", name, f"sensor {name} is broken or displaced", setting=setting)
         remedy = (
-            f"Check {name}. If it shows a value that stands for no reading, add it to `missing`."
+            f"Check {name}. If it shows a value that is no reading, add it to `missing`. If it is "
+            'faulty, set `role = "ignored"`.'
         )
         yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -163,21 +163,26 @@ class WithheldLedger:
         )
         return WithheldLedger(self.sums + np.where(seen, rows, 0.0), np.where(seen, error, np.nan))
 
-    def findings(self, names: Sequence[str]) -> Iterator[Finding]:
-        """Return which sensors are missed by more than prediction and noise allow.
+    def findings(self, names: Sequence[str], ignored: Collection[str] = ()) -> Iterator[Finding]:
+        """Return which sensors, but ignored ones, are missed by more than is allowed.
+
+        That is prediction and noise.
 
         The errors of one sensor are correlated as far as they come from the unknowns: so their mean
         square over its expected value counts as one draw of chi-square. The noise is estimated from
         successive differences.
         """
+        scored = len(names) - len(ignored)
         for k, name in enumerate(names):
+            if name in ignored:
+                continue
             count, pairs, differences, squares, errors, *_, variance = self.sums[:, k]
             if count < FEWEST:
                 continue
             noise = differences / max(pairs, 1.0)
             expected = noise + variance / count
             ratio = squares / count / max(expected, 1e-300)
-            p = min(1.0, chance(ratio, 1) * len(names))
+            p = min(1.0, chance(ratio, 1) * scored)
             if p > CHANCE:
                 continue
             size, mean = math.sqrt(squares / count), errors / count
@@ -189,8 +194,8 @@ class WithheldLedger:
                 "withheld",
                 name,
                 f"the model does not hold at {name}, or its place or calibration is wrong",
-                remedy=f"Look at {name}, or assimilate it: role = 'sensor'.",
-                setting=channel_setting(name, "role", '"sensor"'),
+                remedy=f'Check {name}. If it is faulty, set `role = "ignored"`; if it is sound, '
+                "the model misses the process there.",
             )
             yield Finding("withheld", "do not trust", text, name, p, "p-value", (cause,))
 

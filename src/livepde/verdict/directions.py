@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -42,6 +42,8 @@ class ScoreDirection:
         Of the size.
     axis
         Coordinate of a position.
+    least, most
+        Bounds of the amount in its unit: a sensor is inside the body, and not beyond the next one.
     """
 
     kind: str
@@ -49,6 +51,8 @@ class ScoreDirection:
     size: float = np.nan
     unit: str = ""
     axis: int = 0
+    least: float = -np.inf
+    most: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +157,8 @@ class Dictionary:
         for kind, (size, of) in amplitudes.items():
             own = list(zip(observed.names, size.tolist(), strict=True))
             each = [(axis, name, one) for axis in range(axes[kind]) for name, one in own]
-            self._add(kind, [ScoreDirection(kind, name, one, of, k) for k, name, one in each])
+            found = [ScoreDirection(kind, name, one, of, k) for k, name, one in each]
+            self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
         self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
         self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
 
@@ -198,6 +203,28 @@ class Dictionary:
             found[:, :, own, self._changing] = signals
         found[..., self.parts["process"]] = answers.swapaxes(-1, -2) / noise[..., None]
         return found
+
+
+def _within_reach(
+    model: Model, observed: Observed, found: list[ScoreDirection]
+) -> list[ScoreDirection]:
+    """Return the directions of positions, bounded by the body and by the nearest other sensor."""
+    observation = observed.observation
+    if not isinstance(observation, Points):
+        return found
+    at = observation.positions
+    vertices = np.asarray(model.mesh.p)
+    low, high = vertices.min(axis=1), vertices.max(axis=1)
+    apart = np.linalg.norm(at[:, None] - at[None], axis=2)
+    apart[apart == 0.0] = np.inf  # itself, and sensors at the same place
+    reach = np.broadcast_to(apart.min(axis=1, initial=np.inf), len(at))
+    bounded = []
+    for number, one in enumerate(found):
+        sensor, k = number % len(at), one.axis
+        least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
+        most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
+        bounded.append(replace(one, least=least, most=most))
+    return bounded
 
 
 def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:

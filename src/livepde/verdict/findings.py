@@ -59,6 +59,7 @@ TELLING = "Longer data, with larger changes nearer to the sensors, would tell mo
 MOST = 5  # findings that are said unasked
 NAMED = 4  # causes that are kept
 HALF = 0.5  # share of a misfit
+CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
 LARGEST = 1e99  # evidence beyond is written as that
 
@@ -81,7 +82,10 @@ class Cause:
         Recommended action, as a sentence.
     setting
         "key=value" of a case that makes the cause an unknown, as `livepde run --set` takes it;
-        empty if there is none.
+        several are separated by "; ". Empty if no setting frees the cause.
+    size
+        Its size in units of the model: of a gain the share, of a source the change of the state per
+        unit of time, of a loss the rate; NaN if not known.
     """
 
     kind: str
@@ -90,6 +94,13 @@ class Cause:
     share: float = math.nan
     remedy: str = ""
     setting: str = ""
+    size: float = math.nan
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any]) -> Cause:
+        """Return the cause that `to_dict` has written; earlier versions stored no size."""
+        numbers = {name: _number(stored.get(name)) for name in ("share", "size")}
+        return cls(**{**stored, **numbers})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause as JSON can hold it."""
@@ -101,6 +112,7 @@ class Cause:
             "share": share,
             "remedy": self.remedy,
             "setting": self.setting,
+            "size": None if math.isnan(self.size) else self.size,
         }
 
 
@@ -144,12 +156,7 @@ class Finding:
         """The finding with its causes, consequence and remedy, in plain English."""
         parts = [self.text]
         if self.causes:
-            first, *others = self.causes
-            share = "" if math.isnan(first.share) else f" (explains {first.share:.0%} of it)"
-            parts.append(f"Most likely {first.text}{share}.")
-            if others:
-                share = "" if math.isnan(others[0].share) else f" ({others[0].share:.0%})"
-                parts.append(f"Else {others[0].text}{share}.")
+            parts += self._likely()
         moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
         if moved:
             each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
@@ -159,11 +166,21 @@ class Finding:
             parts.append(remedy)
         return " ".join(parts)
 
+    def _likely(self) -> list[str]:
+        """Return the likely causes as sentences; candidates where none explains half of it."""
+        first, *others = self.causes
+        if first.share < HALF:
+            each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
+            return [f"No single cause explains it. Candidates: {'; '.join(each)}."]
+        found = [f"Most likely {first.text}{_shown(first.share, 'explains {} of it')}."]
+        found += [f"Else {one.text}{_shown(one.share)}." for one in others[:1]]
+        return found
+
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Finding:
         """Return the finding that `to_dict` has written."""
         own = {name: value for name, value in stored.items() if name != "sentence"}
-        causes = tuple(Cause(**{**item, "share": _number(item["share"])}) for item in own["causes"])
+        causes = tuple(map(Cause.from_dict, own["causes"]))
         return cls(**{**own, "causes": causes, "evidence": _number(own["evidence"])})
 
     def to_dict(self) -> dict[str, Any]:
@@ -181,6 +198,11 @@ class Finding:
             "shift": {name: float(size) for name, size in self.shift.items()},
             "sentence": self.sentence,
         }
+
+
+def _shown(share: float, words: str = "{}") -> str:
+    """Return a share in parentheses; empty if it is not known."""
+    return "" if math.isnan(share) else f" ({words.format(f'{share:.0%}')})"
 
 
 def _number(value: float | None) -> float:

@@ -1,0 +1,135 @@
+"""Settings of a case that free the causes which a verdict names."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from livepde.cases.read import settings_in, toml_key, toml_value
+from livepde.verdict import Cause, Finding, Verdict, channel_setting
+
+if TYPE_CHECKING:
+    from livepde.cases.case import Case, Prepared
+
+__all__ = ["KEYS", "adding", "freed", "with_settings"]
+
+WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
+PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
+KEYS = {"offset": "offset", "gain": "gain", "position": "at_std"}
+"""Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
+NO_SETTING = "No setting of this case frees it."
+
+
+def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
+    """Return a verdict whose causes have the settings of the case that free them.
+
+    A cause that no setting frees says so in its remedy.
+    """
+
+    def named(cause: Cause) -> Cause:
+        if settings := freed(prepared, cause):
+            return replace(cause, setting="; ".join(settings))
+        plain = cause.remedy.removesuffix(NO_SETTING).strip()
+        return replace(cause, setting="", remedy=f"{plain} {NO_SETTING}".strip())
+
+    def settled(finding: Finding) -> Finding:
+        return replace(finding, causes=tuple(map(named, finding.causes)))
+
+    return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+
+
+def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the settings that make a cause an unknown of the case; empty if none does."""
+    case = prepared.case
+    if case.spec.law.kind != "sensitivity":
+        return ()
+    if cause.kind in KEYS:
+        return _of_sensor(case, cause)
+    process = {"source": _source, "loss": _loss, "flux": _flux}
+    if cause.kind in process:
+        return process[cause.kind](prepared, cause)
+    return settings_in(cause.setting)
+
+
+def adding(case: Case, name: str, std: float, **keys: float | str) -> str:
+    """Return the setting that adds an unknown about zero, in the unit of the model."""
+    known = {"prior": 0.0, "std": float(f"{std:.2g}"), **keys}
+    return f"unknowns.{toml_key(name)}={toml_value(known)}"
+
+
+def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
+    """Return the setting of an error of a sensor, with the prior that other sensors state."""
+    key, channels = KEYS[cause.kind], case.roles("sensor")
+    channel = channels.get(cause.subject)
+    if channel is None or getattr(channel, key) is not None:
+        return ()
+    if key == "at_std" and not channel.is_point:
+        return ()
+    others = (getattr(item, key) for item in channels.values())
+    stated = next((value for value in others if value is not None), None)
+    size = cause.size
+    if key == "at_std" and not math.isfinite(size):
+        size = PLACE * float(np.ptp(case.mesh.p, axis=1).max())
+    if stated is None and not math.isfinite(size):
+        return settings_in(cause.setting)
+    given = float(f"{WIDE * abs(size):.2g}") if stated is None else stated
+    return (channel_setting(cause.subject, key, toml_value(given)),)
+
+
+def _capacity(case: Case) -> float:
+    """Return the factor from the rate of the state to a source of the equation."""
+    name = case.equation.storage
+    if not name:
+        return 1.0
+    if name in case.spec.unknowns:
+        unknown = case.spec.unknowns[name]
+        return case.convert(unknown.prior, case.equation.unknowns[name].unit, f"unknowns.{name}")
+    return float(case.options[name])
+
+
+def _free(case: Case, name: str) -> bool:
+    """Return whether an unknown of the equation may be added to the case."""
+    known = case.equation.unknowns.get(name)
+    return known is not None and known.optional and name not in case.spec.unknowns
+
+
+def _source(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    case = prepared.case
+    if not (_free(case, "source") and cause.size):
+        return ()
+    return (adding(case, "source", WIDE * abs(cause.size) * _capacity(case)),)
+
+
+def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the settings of a loss to surroundings at the temperature of the first readings."""
+    case = prepared.case
+    if not (_free(case, "loss") and cause.size > 0.0):
+        return ()
+    size = float(f"{cause.size * _capacity(case):.2g}")
+    settings = [adding(case, "loss", size, prior=size, transform="log")]
+    if "ambient" not in {*case.spec.channels, *case.spec.inputs}:
+        given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
+        seen = [float(np.ravel(given[name])[0]) for name in case.sensors if name in given]
+        known = [value for value in seen if math.isfinite(value)]
+        if not known:
+            return ()
+        settings.append(f"inputs.ambient={sum(known) / len(known):.6g}")
+    return tuple(settings)
+
+
+def _flux(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the settings of an unknown flux through an end of an interval."""
+    case, name = prepared.case, cause.subject
+    taken = {*case.spec.boundary, *(item.at for item in case.roles("boundary").values())}
+    if case.equation.fluxes is None or len(case.mesh.p) != 1 or name in taken:
+        return ()
+    label = f"flux_{name}".replace("-", "_")
+    if label in case.spec.unknowns or not label.isidentifier() or not cause.size:
+        return ()
+    # What a source of this size brings into the whole interval.
+    size = WIDE * abs(cause.size) * _capacity(case) * float(np.ptp(case.mesh.p[0]))
+    return adding(case, label, size), f"boundary.{toml_key(name)}.flux={toml_value(label)}"

@@ -1,0 +1,322 @@
+"""Variants of a case: how the run of each one ends, and which one is recommended."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from livepde.cases.case import Prepared, load
+from livepde.cases.read import parse, settings_in
+from livepde.cases.remedies import with_settings
+from livepde.errors import CaseError
+from livepde.plots.dataset import interval_95, modes_told, scalars
+from livepde.records import used_errors
+from livepde.runs import verdict
+from livepde.runs.summary import channel_errors, rmse
+from livepde.verdict import Cause, Verdict
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = [
+    "AS_STATED",
+    "Interval",
+    "Variant",
+    "VariantRun",
+    "conclusions",
+    "recommended",
+    "run_variant",
+    "variant_of",
+]
+
+AS_STATED = "as stated"
+GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
+WORSE = 0.02  # share by which the error of withheld sensors may grow: about its own error
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A case with other values.
+
+    Attributes
+    ----------
+    name, settings
+        Its name, and texts "key=value" as `--set` takes them.
+    """
+
+    name: str
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Last estimate of an unknown: value, standard deviation, ends of the 95 % interval, unit."""
+
+    value: float
+    std: float
+    low: float
+    high: float
+    unit: str = ""
+
+    def overlaps(self, other: Interval) -> bool:
+        """Return whether two intervals have a point in common."""
+        return self.low <= other.high and other.low <= self.high
+
+
+@dataclass(frozen=True)
+class VariantRun:
+    """How the run of a variant ended.
+
+    Attributes
+    ----------
+    variant
+        The variant.
+    error
+        Why it failed; empty if it did not.
+    verdict
+        Its verdict, as `Verdict.to_dict` gives it.
+    log_evidence
+        Of all readings of the sensors that it assimilates: `Result.log_evidence`.
+    readings
+        Sensor that it assimilates -> number of its readings.
+    misfits
+        Sensor -> root mean square of its errors over the noise that successive errors show, one
+        step ahead, second half of the samples.
+    errors, withheld
+        Assimilated and withheld sensor -> root mean square of its errors one step ahead, second
+        half of the samples.
+    estimates
+        Unknown number -> its last estimate.
+    unknowns
+        How many numbers were unknown; of a field the number of modes.
+    """
+
+    variant: Variant
+    error: str = ""
+    verdict: Mapping[str, Any] = field(default_factory=dict)
+    log_evidence: float = math.nan
+    readings: Mapping[str, int] = field(default_factory=dict)
+    misfits: Mapping[str, float] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    withheld: Mapping[str, float] = field(default_factory=dict)
+    estimates: Mapping[str, Interval] = field(default_factory=dict)
+    unknowns: int = 0
+
+    @property
+    def level(self) -> str:
+        """Level of the verdict; "failed" of a run that failed."""
+        return "failed" if self.error else str(self.verdict["level"])
+
+    @property
+    def misfit(self) -> float:
+        """Root mean square over the sensors."""
+        return _pooled(self.misfits.values())
+
+    @property
+    def withheld_error(self) -> float:
+        """Root mean square over the withheld sensors; NaN if there are none."""
+        return _pooled(self.withheld.values())
+
+    @property
+    def causes(self) -> list[Cause]:
+        """Causes that a setting frees, the worst finding first, each once."""
+        found: dict[str, Cause] = {}
+        for finding in Verdict.from_dict(self.verdict).findings if self.verdict else ():
+            for cause in finding.causes:
+                if cause.setting:
+                    found.setdefault(cause.setting, cause)
+        return list(found.values())
+
+    def gained(self, base: VariantRun) -> float:
+        """Return log evidence minus that of another run; NaN if other readings count."""
+        if self.error or dict(self.readings) != dict(base.readings):
+            return math.nan
+        return self.log_evidence - base.log_evidence
+
+    def apart(self, base: VariantRun) -> list[str]:
+        """Return the unknowns whose intervals in both runs have no point in common."""
+        return [
+            name
+            for name, one in self.estimates.items()
+            if name in base.estimates and not one.overlaps(base.estimates[name])
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the run as JSON can hold it."""
+        numbers = {name: vars(one) for name, one in self.estimates.items()}
+        return {
+            "name": self.variant.name,
+            "settings": list(self.variant.settings),
+            "error": self.error,
+            "level": self.level,
+            "log_evidence": _number(self.log_evidence),
+            "readings": dict(self.readings),
+            "misfit": _number(self.misfit),
+            "withheld_error": _number(self.withheld_error),
+            "unknowns": self.unknowns,
+            "estimates": numbers,
+            "verdict": dict(self.verdict),
+        }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pooled(values: Iterable[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
+
+
+def variant_of(text: str) -> Variant:
+    """Return the variant in a text: 'name: key=value; key=value', the name may be missing.
+
+    Raises
+    ------
+    CaseError
+        Without a setting, or with one that is none.
+    """
+    head, colon, rest = text.partition(":")
+    named = bool(colon) and "=" not in head
+    settings = settings_in(rest if named else text)
+    if not settings:
+        raise CaseError(f"--variant {text}: expected 'name: key=value; key=value'.")
+    parse(settings)
+    return Variant(head.strip() if named else text.strip(), settings)
+
+
+def run_variant(
+    path: str | Path,
+    settings: Sequence[str],
+    variant: Variant,
+    data: str | None = None,
+    allow_code: bool = False,
+) -> VariantRun:
+    """Run a variant of a case with further settings, in memory.
+
+    A variant that cannot be run ends with its reason.
+    """
+    try:
+        every = parse(settings), parse(variant.settings)
+        prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
+        result = prepared.identifier.run(prepared.stream, fields_every=10**9)
+        return _ended(variant, prepared, result.to_xarray())
+    except Exception as error:  # noqa: BLE001  whatever it is, it is a row of the table
+        reason = str(error).strip() or "no reason given"
+        return VariantRun(variant, error=f"{type(error).__name__}: {reason}")
+
+
+def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun:
+    """Return how a run ended, from its dataset."""
+    data.attrs.update(prepared.attributes)
+    channels = channel_errors(data)
+    labels, fields = scalars(data), prepared.case.model.parameter_space.fields
+    estimates = {}
+    for label in labels:
+        low, high = (float(end[-1]) for end in interval_95(data, label))
+        value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
+        unit = str(data[label].attrs.get("units", ""))
+        estimates[label] = Interval(value, std, low, high, unit)
+    modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
+    seen = np.isfinite(data["innovation"].values).sum(axis=0)
+    return VariantRun(
+        variant,
+        verdict=with_settings(prepared, verdict(data)).to_dict(),
+        log_evidence=float(data.attrs.get("log_evidence", math.nan)),
+        readings=dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True)),
+        misfits=_misfits(data),
+        errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
+        withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "withheld"},
+        estimates=estimates,
+        unknowns=len(labels) + sum(modes),
+    )
+
+
+def _misfits(data: xr.Dataset) -> dict[str, float]:
+    """Return the misfit of each assimilated sensor over its noise."""
+    columns, found = used_errors(data, "innovation", "sensor").T, {}
+    for name, column in zip(map(str, data["sensor"].values), columns, strict=True):
+        later = column[len(column) // 2 :]
+        steps = np.diff(later)
+        steps = steps[np.isfinite(steps)]
+        noise = math.sqrt(0.5 * float((steps**2).mean())) if len(steps) else math.nan
+        found[name] = rmse(later[np.isfinite(later)]) / noise if noise > 0.0 else math.nan
+    return found
+
+
+def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
+    """Return the variant with the best evidence that predicts the withheld sensors no worse.
+
+    Of several whose evidence is no strong one against each other it is the one with the fewest
+    unknowns; the case itself if none has strong evidence against it.
+    """
+    fair = [one for one in others if not _worse(one, base)]
+    best = max((one.gained(base) for one in fair if not math.isnan(one.gained(base))), default=0.0)
+    if not best > GAINED:
+        return base
+    near = [one for one in fair if one.gained(base) > max(best - GAINED, GAINED)]
+    return min(near, key=lambda one: (one.unknowns, -one.gained(base)))
+
+
+def _worse(one: VariantRun, base: VariantRun) -> bool:
+    """Return whether a run predicts the withheld sensors worse than another one."""
+    limit = base.withheld_error * (1.0 + WORSE)
+    return math.isfinite(limit) and not one.withheld_error <= limit
+
+
+def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
+    """Return sentences on the recommendation, and on what other variants disagree about."""
+    best = recommended(base, others)
+    return [_recommendation(base, best), *_remarks(base, others), *_disagreements(best, others)]
+
+
+def _recommendation(base: VariantRun, best: VariantRun) -> str:
+    if best is base:
+        return (
+            "Recommended: the case as it is. No variant that predicts the withheld sensors as well "
+            f"gains more than {GAINED:g} of log evidence."
+        )
+    text = (
+        f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
+        f"than that of the case, and its verdict '{best.level}'."
+    )
+    if math.isfinite(base.withheld_error):
+        errors = f"{best.withheld_error:.3g} instead of {base.withheld_error:.3g}"
+        text += f" It misses the withheld sensors by {errors}."
+    return text
+
+
+def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over variants with better evidence and worse predictions, and refuted ones."""
+    for one in others:
+        if one.gained(base) > GAINED and _worse(one, base):
+            yield (
+                f"'{one.variant.name}' fits the assimilated sensors better and predicts the "
+                f"withheld ones worse ({one.withheld_error:.3g} instead of "
+                f"{base.withheld_error:.3g}): it is not recommended."
+            )
+    refuted = [f"'{one.variant.name}'" for one in others if one.gained(base) < -GAINED]
+    if refuted:
+        yield f"The data speak against {', '.join(refuted)}: less evidence than the case has."
+    apart = [one for one in others if not one.error and math.isnan(one.gained(base))]
+    if apart:
+        names = ", ".join(f"'{one.variant.name}'" for one in apart)
+        yield f"The evidence of {names} counts other readings, and is not compared."
+
+
+def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over unknowns that differ by more than the intervals between variants."""
+    found: dict[str, list[str]] = {}
+    for one in others:
+        for name in one.apart(best):
+            found.setdefault(name, []).append(one.variant.name)
+    for name, names in found.items():
+        others_say = ", ".join(f"'{one}'" for one in names)
+        yield f"{name} depends on the variant: its interval in {others_say} does not overlap."
+    if not found and any(not one.error for one in others):
+        yield "All variants agree: their intervals overlap with that of the recommended one."

@@ -1,0 +1,243 @@
+"""Variants of a case side by side."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+
+from livepde.cli.options import CodeOption, JsonOption, SetOption, argument, load_case, option
+from livepde.cli.printing import present
+from livepde.errors import CaseError, ConfigurationError, RunError
+
+if TYPE_CHECKING:
+    from livepde.cases.variants import Interval, Variant, VariantRun
+    from livepde.runs import Table
+
+__all__ = ["compare"]
+
+COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
+
+
+def compare(
+    case: Annotated[
+        Path, argument("The case file (TOML), or the directory of a run.", metavar="CASE")
+    ],
+    variants: Annotated[
+        list[str] | None,
+        option(
+            "A variant: its name, and settings as those of --set, separated by ';'. Repeat it for "
+            "more. Default: the likely causes of the first run, and what is often wrong.",
+            "--variant",
+            metavar="'NAME: KEY=VALUE; KEY=VALUE'",
+        ),
+    ] = None,
+    settings: SetOption = None,
+    data: Annotated[
+        str | None, option("Other data than the case names (.csv, .jsonl, .parquet).")
+    ] = None,
+    most: Annotated[
+        int, typer.Option(min=1, help="Variants at most, where the program chooses them.")
+    ] = 12,
+    jobs: Annotated[
+        int, option("Processes at once. Default: one for each processor.", min=1)
+    ] = os.cpu_count() or 1,
+    write: Annotated[
+        Path | None,
+        option(
+            "Write the recommended variant as a case there, with the comments of the case.",
+            metavar="FILE.toml",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="With --write: replace a file that is there.")
+    ] = False,
+    as_json: JsonOption = False,
+    allow_code: CodeOption = False,
+) -> None:
+    """Run variants of a case side by side, and recommend one.
+
+    The recommended variant has the best evidence of those that do not predict the withheld sensors
+    worse. No run directory is written.
+
+    Example:  livepde compare mycase/case.toml
+    By hand:  livepde compare mycase/case.toml --variant "offset: channels.T_10.offset='0.2 K'"
+    Of a run: livepde compare runs/mycase --write mycase/better.toml
+    """
+    from livepde.cases.proposals import proposed
+    from livepde.cases.variants import AS_STATED, Variant, conclusions, recommended, variant_of
+
+    given = [variant_of(text) for text in variants or ()]
+    named = case
+    case, settings, data = _of_run(named, settings or [], data)
+    loaded = load_case(case, allow_code, settings)
+    if loaded.goes_on(data) or data == "-":
+        raise ConfigurationError(
+            "compare requires data that are complete: add --data FILE with recorded rows."
+        )
+    if write is not None:
+        _check_target(write, case, force)
+    try:
+        prepared = loaded.prepare(data)
+    except CaseError as error:
+        if named == case:
+            raise
+        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        raise RunError(f"{error} {moved}") from error
+    run = partial(_run, case, settings, data=data, allow_code=allow_code)
+    stated = Variant(AS_STATED)
+    (base, *found) = _all(run, [stated, *given], jobs, as_json)
+    if base.error:
+        raise RunError(f"{case}: the run of the case itself failed: {base.error}")
+    chosen = [] if given else proposed(prepared, base, most)
+    found += _all(run, chosen, jobs, as_json)
+    best = recommended(base, found)
+    notes = conclusions(base, found)
+    if write is not None:
+        notes.append(_written(write, case, settings, best.variant.settings))
+    present(
+        _tables(base, found, best),
+        [],
+        notes,
+        as_json=as_json,
+        title=f"[bold]{escape(loaded.title)}[/]  {1 + len(found)} variants",
+        case=str(case),
+        recommended=best.variant.name,
+        variants=[one.to_dict() for one in (base, *found)],
+    )
+
+
+def _of_run(
+    case: Path, settings: Sequence[str], data: str | None
+) -> tuple[Path, list[str], str | None]:
+    """Return case file, settings and data: those of a run if its directory is named."""
+    if not case.is_dir():
+        return case, list(settings), data
+    from livepde import runs
+
+    opened = runs.open(case)
+    return opened.case_file(), [*opened.settings, *settings], data or opened.data_file
+
+
+def _all(run: Any, variants: Sequence[Variant], jobs: int, quiet: bool) -> list[VariantRun]:
+    """Return how the runs of variants ended, in their order; each in a process of its own."""
+    from livepde.progress import watched
+
+    def apart(variant: Variant) -> VariantRun:
+        from livepde.cases.variants import VariantRun
+
+        spawn = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(1, mp_context=spawn) as process:
+            try:
+                return process.submit(run, variant).result()
+            except BrokenProcessPool:
+                return VariantRun(variant, error="its process was killed, or out of memory")
+
+    if jobs == 1 or len(variants) < 2:
+        ended: Iterator[VariantRun] = map(run, variants)
+        return list(ended if quiet else watched(ended, len(variants)))
+    with ThreadPoolExecutor(jobs) as threads:
+        ended = threads.map(apart, variants)
+        return list(ended if quiet else watched(ended, len(variants)))
+
+
+def _run(
+    case: Path, settings: Sequence[str], variant: Variant, *, data: str | None, allow_code: bool
+) -> VariantRun:
+    """Run one variant: what a process does."""
+    from threadpoolctl import threadpool_limits
+
+    from livepde.cases.variants import run_variant
+
+    with threadpool_limits(1):
+        return run_variant(case, settings, variant, data, allow_code)
+
+
+def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> list[Table]:
+    """Return the variants, that of the best evidence first, and those that failed."""
+    import math
+
+    from livepde.runs import Table
+    from livepde.runs.summary import shown
+
+    def rank(one: VariantRun) -> tuple[bool, float]:
+        gained = one.gained(base)
+        return math.isnan(gained), -gained if math.isfinite(gained) else 0.0
+
+    labels = list(base.estimates)[:COLUMNS]
+    rows: list[tuple[Any, ...]] = []
+    ended = [one for one in (base, *found) if not one.error]
+    for one in sorted(ended, key=rank):
+        cells = [_interval(one.estimates.get(label)) for label in labels]
+        apart = one.apart(base)
+        rows.append(
+            (
+                one.variant.name + (" *" if one is best else ""),
+                one.level,
+                shown(one.gained(base), "+.1f"),
+                shown(one.misfit, ".2g"),
+                shown(one.withheld_error, ".3g"),
+                one.unknowns,
+                f"no: {', '.join(apart)}" if apart else "yes",
+                *cells,
+            )
+        )
+    columns = ("variant", "verdict", "log evidence", "misfit / noise", "withheld RMSE", "unknowns")
+    title = "Variants; * recommended; log evidence less that of the case"
+    tables = [Table(title, (*columns, "overlaps", *labels), rows)]
+    more = [
+        (one.variant.name, label, _interval(known), known.unit)
+        for one in ended
+        for label, known in one.estimates.items()
+        if label not in labels
+    ]
+    if more:
+        tables.append(Table("Other unknowns", ("variant", "unknown", "95 %", "unit"), more))
+    failed = [(one.variant.name, one.error) for one in found if one.error]
+    if failed:
+        tables.append(Table("Variants that failed", ("variant", "reason"), failed))
+    changed = [(one.variant.name, "; ".join(one.variant.settings)) for one in found]
+    return [*tables, Table("Settings of the variants", ("variant", "settings"), changed)]
+
+
+def _interval(known: Interval | None) -> str:
+    """Return an estimate with its interval as text, a dash where there is none."""
+    from livepde.runs.summary import digits
+
+    if known is None:
+        return "–"
+    low, high = (digits(end, known.std)[0] for end in (known.low, known.high))
+    return f"{digits(known.value, known.std)[0]} ({low} to {high})"
+
+
+def _check_target(target: Path, case: Path, force: bool) -> None:
+    """Refuse a file for the better case that would be wrong there, before anything runs."""
+    if target.exists() and not force:
+        raise ConfigurationError(f"{target} exists: add --force to replace it.")
+    if target.resolve() == case.resolve():
+        raise ConfigurationError(f"--write {target} is the case itself: name another file.")
+    if target.parent.resolve() != case.parent.resolve():
+        raise ConfigurationError(
+            f"--write {target}: paths in a case are relative to it; name a file in {case.parent}."
+        )
+
+
+def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:
+    """Write a case with settings, one part after the other, and return a sentence on it."""
+    from livepde.atomic_write import write_bytes
+    from livepde.cases.fill import filled
+    from livepde.cases.read import parse, read_text
+
+    text = read_text(case)
+    for each in settings:
+        text = filled(text, parse(each), str(case))
+    write_bytes(target, text.encode())
+    return f"Wrote {target}: livepde run {target}"

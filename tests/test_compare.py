@@ -1,0 +1,244 @@
+"""`livepde compare`: variants of a case side by side, and the one that is recommended."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+from commands import bad, call
+from factories import short_rod
+
+from livepde import cases
+from livepde.cases.proposals import proposed
+from livepde.cases.read import parse
+from livepde.cases.remedies import NO_SETTING, with_settings
+from livepde.cases.variants import (
+    Interval,
+    Variant,
+    VariantRun,
+    conclusions,
+    recommended,
+    run_variant,
+    variant_of,
+)
+from livepde.errors import CaseError
+from livepde.verdict import Cause, Finding, Verdict
+
+OFFSET = 0.5  # K
+FREED = "offset: channels.T_10.offset='1 K'"
+
+
+@pytest.fixture
+def biased(tmp_path, monkeypatch):
+    """Return the case of `livepde init` whose sensor T_10 reads too much."""
+    monkeypatch.chdir(tmp_path)
+    path = short_rod(tmp_path / "rod", 41)
+    table = pd.read_csv(path.parent / "rod.csv")
+    table["T_10"] += OFFSET
+    table.to_csv(path.parent / "rod.csv", index=False)
+    return path
+
+
+# --- in a terminal ------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
+    # The second is no case, the third leaves readings out, the fourth is refuted.
+    given = [FREED, "far: channels.T_10.at='9 m'", "channels.T_10.role=ignored"]
+    options = [part for text in given for part in ("--variant", text)]
+    written = biased.parent / "better.toml"
+    code, output = call("compare", biased, *options, "--json", "--jobs", "1", "--write", written)
+    assert code == 0
+    content = json.loads(output)
+    assert content["recommended"] == "offset"
+    found = {one["name"]: one for one in content["variants"]}
+    assert found["offset"]["log_evidence"] > found["as stated"]["log_evidence"] + 100.0
+    assert found["offset"]["level"] == "trusted"
+    assert found["offset"]["misfit"] < 1.5 < found["as stated"]["misfit"]
+    offset = found["offset"]["estimates"]["offset[T_10]"]
+    assert offset["low"] < OFFSET < offset["high"]
+    assert found["far"]["level"] == "failed"
+    assert "lies outside" in found["far"]["error"]
+    rows = {row[0]: row for row in content["tables"][0]["rows"]}
+    assert rows["channels.T_10.role=ignored"][2] == "–"  # other readings count
+    assert any("counts other readings" in note for note in content["notes"])
+    # The better case is the case with this key, comments included, and it runs as the variant did.
+    lines = set(biased.read_text().splitlines())
+    (line,) = (one for one in written.read_text().splitlines() if one not in lines)
+    assert line.startswith("T_10 = ") and 'offset = "1 K"' in line  # noqa: PT018  one line
+    again = run_variant(written, [], Variant("again"))
+    assert again.log_evidence == found["offset"]["log_evidence"]
+
+
+@pytest.mark.long
+def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
+    code, output = call("run", biased, "--out", "run")
+    assert code == 0, output
+    assert "add --data FILE" in bad("compare", "run")  # the copy in its directory knows no table
+    data = ["--data", biased.parent / "rod.csv"]
+    for what in ([biased], ["run", *data]):
+        code, output = call("compare", *what, "--json", "--most", "4")
+        assert code == 0
+        content = json.loads(output)
+        assert len(content["variants"]) == 5
+        assert content["recommended"] in ("offset of T_10", "offsets of all sensors")
+        best = {one["name"]: one for one in content["variants"]}[content["recommended"]]
+        assert best["level"] == "trusted"
+
+
+@pytest.mark.slow
+def test_variants_in_processes_are_those_of_this_process(biased):
+    options = ["--variant", FREED, "--json", "--jobs"]
+    each = [json.loads(call("compare", biased, *options, jobs)[1]) for jobs in ("1", "2")]
+    assert each[0]["variants"] == each[1]["variants"]
+
+
+def test_what_cannot_be_compared_or_written_is_refused_before_a_run(biased, tmp_path):
+    assert "expected 'name: key=value" in bad("compare", biased, "--variant", "offset:")
+    assert "is the case itself" in bad("compare", biased, "--write", biased, "--force")
+    assert "--force" in bad("compare", biased, "--write", biased)
+    other = tmp_path / "better.toml"
+    assert "relative to it" in bad("compare", biased, "--write", other)
+    follow = ["--set", "data.follow=true"]
+    assert "recorded rows" in bad("compare", biased, *follow)
+    shutil.rmtree(biased.parent)
+    assert "no such case file" in bad("compare", biased)
+
+
+# --- variants -----------------------------------------------------------------------------------
+
+
+def test_a_variant_has_a_name_and_settings():
+    found = variant_of("two: unknowns.k.std='1 m^2/s'; data.separator=\";\"")
+    assert found == Variant("two", ("unknowns.k.std='1 m^2/s'", 'data.separator=";"'))
+    assert variant_of("law.jumps=true") == Variant("law.jumps=true", ("law.jumps=true",))
+    assert variant_of("no offset: channels.T.offset=").settings == ("channels.T.offset=",)
+    with pytest.raises(CaseError, match="key=value"):
+        variant_of("offsets")
+
+
+def ended(name: str, evidence: float, withheld: float, unknowns: int = 2, **more) -> VariantRun:
+    return VariantRun(
+        Variant(name),
+        verdict=Verdict.of(()).to_dict(),
+        log_evidence=evidence,
+        readings=more.pop("readings", {"a": 100}),
+        withheld={"w": withheld} if math.isfinite(withheld) else {},
+        unknowns=unknowns,
+        **more,
+    )
+
+
+def test_the_best_evidence_counts_unless_withheld_sensors_are_predicted_worse():
+    base = ended("as stated", 10.0, 1.0, 1)
+    good, tied = ended("good", 50.0, 0.9), ended("tied", 51.0, 0.9, 5)
+    worse, other = ended("worse", 90.0, 1.5), ended("other", 99.0, 0.5, readings={"a": 99})
+    weak = ended("weak", 12.0, 0.9)
+    failed = VariantRun(Variant("failed"), error="no")
+    assert recommended(base, [weak, good, worse, tied, other, failed]).variant.name == "good"
+    assert recommended(base, [weak, worse, other, failed]) is base
+    notes = " ".join(conclusions(base, [good, worse, other, failed]))
+    assert "Recommended: 'good'" in notes
+    assert "'worse' fits the assimilated sensors better and predicts" in notes
+    assert "evidence of 'other' counts other readings" in notes
+
+
+def test_without_withheld_sensors_the_evidence_decides():
+    base, better = ended("as stated", 10.0, math.nan), ended("better", 50.0, math.nan)
+    assert recommended(base, [better]) is better
+
+
+def test_an_unknown_that_depends_on_the_variant_is_named():
+    near, far = Interval(1.0, 0.1, 0.8, 1.2), Interval(2.0, 0.1, 1.8, 2.2)
+    base = ended("as stated", 10.0, 1.0, estimates={"k": near, "c": near})
+    other = ended("other", 5.0, 1.0, estimates={"k": far, "c": near})
+    notes = " ".join(conclusions(base, [other]))
+    assert "k depends on the variant: its interval in 'other' does not overlap" in notes
+    assert "c depends" not in notes
+    assert "speak against 'other'" in notes
+    assert "All variants agree" in " ".join(conclusions(base, [replace(other, estimates={})]))
+
+
+# --- settings of causes -------------------------------------------------------------------------
+
+SIZES = {"offset": 0.5, "gain": 0.1, "position": 0.004, "source": 1e-3, "loss": 1e-4, "flux": 1e-3}
+ROD = {
+    "heat": [],
+    "conduction": [
+        "equation=conduction",
+        "options.C='3.6e6 J/(m^3 K)'",
+        "unknowns.alpha=",
+        "unknowns.k={ prior = 100, std = 50 }",
+    ],
+}
+
+
+def causes() -> list[Cause]:
+    sensors = [Cause(kind, "T_30", "", size=SIZES[kind]) for kind in ("offset", "gain", "position")]
+    process = [Cause(kind, "", "", size=SIZES[kind]) for kind in ("source", "loss")]
+    jump = Cause("jump", "alpha", "", setting='law.jumps=["alpha"]')
+    return [*sensors, *process, Cause("flux", "right", "", size=1e-3), jump]
+
+
+@pytest.mark.parametrize("equation", ROD)
+def test_every_cause_has_a_setting_that_makes_it_an_unknown(tmp_path, equation):
+    path = short_rod(tmp_path)
+    insulated = [*ROD[equation], "channels.T_right="]
+    prepared = cases.load(path, settings=parse(insulated)).prepare()
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=tuple(causes()))])
+    found = with_settings(prepared, verdict).findings[0].causes
+    expected = ["offset[T_30]", "gain[T_30]", "position[T_30]", "source", "loss", "flux_right"]
+    for cause, label in zip(found, expected, strict=False):
+        settings = [*insulated, *cause.setting.split("; ")]
+        again = cases.load(path, settings=parse(settings)).prepare()
+        assert label in again.case.model.parameter_space.labels
+
+
+def test_a_cause_that_no_setting_frees_says_so(tmp_path):
+    prepared = cases.load(short_rod(tmp_path)).prepare()
+    lag = Cause("lag", "T_10", "it is late", remedy="Check the clock.")
+    there = Cause("flux", "right", "a flux is missing", size=1.0)  # the boundary has a value
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(lag, there))])
+    once = with_settings(prepared, verdict)
+    for cause in once.findings[0].causes:
+        assert not cause.setting
+        assert cause.remedy.endswith(NO_SETTING)
+    assert with_settings(prepared, once) == once
+
+
+def test_an_offset_takes_the_prior_that_other_sensors_state(tmp_path):
+    stated = {"channels.T_10.offset": "0.3 K"}
+    prepared = cases.load(short_rod(tmp_path), settings=stated).prepare()
+    cause = Cause("offset", "T_30", "", size=0.5)
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    (found,) = with_settings(prepared, verdict).findings[0].causes
+    assert found.setting == 'channels.T_30.offset="0.3 K"'
+
+
+@pytest.mark.parametrize("equation", ROD)
+def test_every_proposed_variant_is_a_case(tmp_path, equation):
+    path = short_rod(tmp_path)
+    own = [*ROD[equation], "channels.T_10.offset=0.2", "unknowns.source={ prior = 0, std = 1e-3 }"]
+    prepared = cases.load(path, settings=parse(own)).prepare()
+    sizes = {"T_10": 0.5, "T_30": 0.2}
+    near = Interval(1.0, 0.1, 0.8, 1.2)
+    base = ended("as stated", 0.0, 1.0, errors=sizes, misfits=sizes, estimates={"k": near})
+    found = proposed(prepared, base)
+    names = {variant.name for variant in found}
+    assert {"loss", "no offsets", "no source", "jumps", "offsets of all sensors"} <= names
+    for variant in found:
+        settings = parse(own), parse(variant.settings)
+        assert cases.load(path, settings=settings).prepare().identifier
+
+
+def test_a_setting_adds_an_unknown_only_as_a_whole(tmp_path):
+    path = short_rod(tmp_path)
+    whole = {"unknowns.source": {"prior": "0 K/s", "std": "1e-3 K/s"}}
+    assert "source" in cases.load(path, settings=whole).model.parameter_space.labels
+    with pytest.raises(CaseError, match="to add it, set all of it"):
+        cases.load(path, settings={"unknowns.sorce.std": "1e-3 K/s"})
