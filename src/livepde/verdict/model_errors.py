@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 __all__ = ["Allowed", "ModelErrors", "Rank"]
@@ -63,6 +63,18 @@ class Allowed:
         off = max(abs(self.low - self.value), abs(self.high - self.value))
         size = max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
         return off / size if size > 0.0 else math.inf
+
+    def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
+        """Return a later estimate with an interval that is as much wider than the plain one."""
+
+        def end(wide: float, plain: float, now: float) -> float:
+            away = plain - self.value
+            return value + (wide - self.value) * ((now - value) / away if away else 1.0)
+
+        low = end(self.low, self.plain_low, plain_low)
+        high = end(self.high, self.plain_high, plain_high)
+        ends = {"plain_low": plain_low, "plain_high": plain_high}
+        return replace(self, value=value, low=low, high=high, **ends)
 
     @property
     def text(self) -> str:
@@ -126,6 +138,11 @@ class ModelErrors:
     def effect(self) -> float:
         """Largest relative effect on an unknown of the model; 0 without."""
         return max((one.effect for one in self.asked), default=0.0)
+
+    def about(self, now: Mapping[str, tuple[float, float, float]]) -> ModelErrors:
+        """Return the same for later estimates: label -> value, and ends of the plain interval."""
+        moved = [one.about(*now[one.label]) if one.label in now else one for one in self.unknowns]
+        return replace(self, unknowns=tuple(moved))
 
     def level(self, *, doubted: bool) -> Rank:
         """Return the level of a run.
