@@ -197,7 +197,11 @@ def _allowed(
     low, high = mixture.interval
     known = samples.filter.estimate(samples.state.now)[0]
     both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
-    value, *ends = (latent.value(reduction.bounded(one)) for one in both)
+    value, low_end, high_end, plain_low, plain_high = (
+        latent.value(reduction.bounded(one)) for one in both
+    )
+    # The plain interval is wider where innovations follow each other: it is a part of this one.
+    ends = np.minimum(low_end, plain_low), np.maximum(high_end, plain_high), plain_low, plain_high
     narrow = 2.0 * QUANTILE * np.sqrt(variance)
     wider = (high - low) / np.where(narrow > 0.0, narrow, np.inf)
     for name, item in latent.parts.items():

@@ -73,8 +73,8 @@ class Allowed:
 
         low = end(self.low, self.plain_low, plain_low)
         high = end(self.high, self.plain_high, plain_high)
-        ends = {"plain_low": plain_low, "plain_high": plain_high}
-        return replace(self, value=value, low=low, high=high, **ends)
+        plain = replace(self, plain_low=plain_low, plain_high=plain_high)
+        return replace(plain, value=value, low=low, high=high)
 
     @property
     def text(self) -> str:
