@@ -571,7 +571,9 @@ class Identifier:
             # What the last sample brought stays; the shifts belong to the new estimate.
             now = self.law.diagnosed(self._work, state)
             before = estimate.diagnostics
-            return replace(before, shifts=now.shifts, log_evidence=now.log_evidence)
+            return replace(
+                before, shifts=now.shifts, log_evidence=now.log_evidence, bounded=now.bounded
+            )
 
         return replace(
             estimate,

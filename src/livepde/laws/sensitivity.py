@@ -53,7 +53,7 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import judge_of, judged, with_columns, with_fit
+from livepde.laws.verdict import after_fit, judge_of, judged, with_columns, with_fit
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -511,6 +511,9 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         found = self.deferred(work, state)
+        # Of a later window the fit knows nothing of the readings before.
+        whole = state.fit.member(0) if not state.window[0] else None
+        found = found._replace(verdict=after_fit(found.verdict, whole))
         if not self.verdict:
             return found
         return found._replace(verdict=with_columns(found.verdict, Columns.of(work, state)))
