@@ -557,15 +557,21 @@ class Identifier:
         report = Report(Status(), predicted, diagnose=known)
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
-    def settled(self, estimate: Estimate) -> Estimate:
+    def settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
         """Return the last estimate after a fit of all stored samples, for the end of a run.
 
         The identifier does not change: the next sample finds it as it was. See `refit`.
+
+        Parameters
+        ----------
+        columns
+            Whether its verdict looks for errors of single columns, such as one in another unit,
+            where something speaks against the estimates.
         """
         state = self.law.settled(self._work, self._state)
         if state is self._state:
             return estimate
-        latent, judge = self.law.final(self._work, state)
+        latent, judge = self.law.final(self._work, state, columns=columns)
 
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.

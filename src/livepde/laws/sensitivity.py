@@ -509,12 +509,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         judge = with_fit(judged(work.filter, state.now, now), fit)
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
-    def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
+    def final(
+        self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
+    ) -> Deferred:
         found = self.deferred(work, state)
         # Of a later window the fit knows nothing of the readings before.
         whole = state.fit.member(0) if not state.window[0] else None
         found = found._replace(verdict=after_fit(found.verdict, whole))
-        if not self.verdict:
+        if not (self.verdict and columns):
             return found
         return found._replace(verdict=with_columns(found.verdict, Columns.of(work, state)))
 
