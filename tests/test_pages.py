@@ -66,6 +66,9 @@ ELSEWHERE = {
     "test_lean.py::test_peers_are_divided_by_the_prior": ["python -m benchmarks peers"],
     "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["python -m benchmarks fleet"],
     "test_benchmarks.py::test_steps_are_ratios": ["python -m benchmarks.suite.costs"],
+    "test_compare.py::test_the_program_finds_the_fault_from_a_case_and_from_a_run": [
+        "livepde compare"
+    ],
     "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
     "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
     "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [

@@ -9,7 +9,9 @@ import pytest
 from factories import driven_rod, observe
 
 import livepde as lp
-from livepde.verdict import Cause, Dictionary, Finding
+from livepde.laws import Fit
+from livepde.laws.verdict import after_fit
+from livepde.verdict import Cause, Dictionary, Finding, Verdict
 from livepde.verdict.assess import FACTOR, LONGEST, _possible
 from livepde.verdict.directions import GAIN, LAG, ScoreDirection
 
@@ -57,6 +59,16 @@ def test_a_sensor_is_inside_the_body_and_not_beyond_the_next_one():
     assert possible(places["c"], 0.09 / step)
     assert not possible(places["c"], 0.11 / step)
     assert not possible(places["c"], -0.11 / step)
+
+
+@pytest.mark.parametrize(("converged", "kept"), [(True, 1), (False, 2)])
+def test_refusals_count_no_longer_once_a_fit_of_all_readings_has_converged(converged, kept):
+    fit = Fit(samples=50, cost=1.0, passes=2.0, readings=100, refused=0, converged=converged)
+    other = Finding("stuck", "do not trust", "It is stuck.")
+    verdict = Verdict.of([Finding("refused", "caution", "Many were refused."), other])
+    found = after_fit(lambda: verdict, fit)()
+    assert len(found.findings) == kept
+    assert found.level == "do not trust"
 
 
 def test_below_half_of_the_misfit_no_single_cause_is_named():

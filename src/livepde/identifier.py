@@ -557,24 +557,36 @@ class Identifier:
         report = Report(Status(), predicted, diagnose=known)
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
-    def settled(self, estimate: Estimate) -> Estimate:
+    def settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
         """Return the last estimate after a fit of all stored samples, for the end of a run.
 
         The identifier does not change: the next sample finds it as it was. See `refit`.
+
+        Parameters
+        ----------
+        columns
+            Whether its verdict looks for errors of single columns, such as one in another unit,
+            where something speaks against the estimates.
         """
         if self._state is None:
             return estimate
+<<<<<<< HEAD
         state = self.law.settled(self._work, self._state)
         latent, judge = self.law.final(self._work, state)
         if state is self._state:
             known = partial(self.law.diagnosed, self._work, state)
             return replace(estimate, judge=self._judge(judge, known))
+=======
+        latent, judge = self.law.final(self._work, state, columns=columns)
+>>>>>>> c39
 
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.
             now = self.law.diagnosed(self._work, state)
             before = estimate.diagnostics
-            return replace(before, shifts=now.shifts, log_evidence=now.log_evidence)
+            return replace(
+                before, shifts=now.shifts, log_evidence=now.log_evidence, bounded=now.bounded
+            )
 
         return replace(
             estimate,

@@ -355,6 +355,7 @@ class Result:
         self.fields_every = fields_every
         self.last: Estimate | None = None
         self._settled: Belief | None = None
+        self._ended = False  # a last fit was asked for
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld, ignored)
@@ -400,11 +401,12 @@ class Result:
 
     def _follow(self, estimate: Estimate) -> None:
         self._count += 1
-        self._settled = None
+        self._settled, self._ended = None, False
         self.last = estimate
 
     def settle(self, estimate: Estimate) -> None:
         """Take the last parameter and state from `Identifier.settled`, in tables and datasets."""
+        self._ended = True
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
@@ -466,13 +468,20 @@ class Result:
         scalar; `_modes`, the number of modes of a field that the data determine, and `_left_out`,
         the share of its mean variance in modes that the law leaves out, over `snapshot`; and
         `correlation` of the last scalars, over (`unknown`, `other`). The attribute `verdict` is the
-        result of `Verdict.to_dict`, as JSON; `log_evidence` that of the result.
+        result of `Verdict.to_dict`, as JSON; `log_evidence` that of the result; and
+        `bounded_at_end`, after a last fit that has converged, the number of coefficients that a
+        bound holds there.
         """
         data = self.layout.dataset(*self._finished())
         if self.last is not None:
             data.attrs["verdict"] = json.dumps(self.verdict.to_dict())
             if math.isfinite(self.log_evidence):
                 data.attrs["log_evidence"] = self.log_evidence
+            fit = self.last.fit
+            if self._ended and fit is not None and fit.converged:
+                # What the search has met on its way is no matter of where it has ended.
+                bounded = self.last.diagnostics.bounded
+                data.attrs["bounded_at_end"] = 0.0 if math.isnan(bounded) else bounded
         return data
 
     def _finished(self) -> tuple[RecordArrays, Snapshot | None]:

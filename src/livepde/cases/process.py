@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean
-from livepde.cases.schema import BoundarySpec, EvolutionSpec, UnknownSpec
+from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, UnknownSpec
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem import (
@@ -32,9 +33,12 @@ from livepde.fem import (
 )
 from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
-from livepde.models.boundary_conditions import Amount
+from livepde.models.boundary_conditions import Amount, Multiple
 
 __all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes"]
+
+
+HELD = 1e4  # transfer coefficient at a boundary that is held, over D and the size of a cell
 
 
 def model_of(case: CaseContent) -> Model:
@@ -42,7 +46,7 @@ def model_of(case: CaseContent) -> Model:
     inputs = case.roles("input")
     case.only(inputs, case.equation.inputs, "channels (role input)")
     constants = case.constants
-    given = {*inputs, *constants}
+    given = {*inputs, *constants, *_shifted(case)}
     for name, variable in case.equation.inputs.items():
         if name not in given and not variable.optional:
             raise _without_input(case, name, f"the {variable.text}")
@@ -91,6 +95,8 @@ def _dirichlet(case: CaseContent) -> dict[str, Any]:
         case.require(name, known, "boundary", f"no boundary '{name}'")
         values[name] = value
     for name, channel in case.roles("boundary").items():
+        if channel.offset is not None:  # an exchange, see `_near`
+            continue
         key, at = f"channels.{name}.at", str(channel.at)
         case.require(at, known, key, f"no boundary '{at}'")
         if at in values:
@@ -327,20 +333,28 @@ def held(case: CaseContent) -> dict[str, Any]:
 
 def conditioned(case: CaseContent) -> CaseContent:
     """Return the case whose equation has the fluxes and sources of the case, and their names."""
+    case = _with_offsets(case)
     spec, equation = case.spec, case.equation
     given = {name: item for name, item in spec.boundary.items() if item.passes}
     per = equation.storage if equation.storage in spec.unknowns else None
     if per is not None:
         _check_drive(case, per)
-    if not (given or spec.sources):
+    shifted = _shifted(case)
+    if not (given or spec.sources or shifted):
         return case
     units = equation.fluxes
     if units is None:
-        key = f"boundary.{next(iter(given))}" if given else f"sources.{next(iter(spec.sources))}"
+        keys = [f"boundary.{name}" for name in given] + [f"sources.{n}" for n in spec.sources]
+        key = next(iter(keys), f"channels.{next(iter(shifted), '')}.offset")
         text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
         raise case.error(key, text + "'livepde equations' tells which ones do.")
     names = _ConditionNames(case)
     boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
+    for name, channel in shifted.items():
+        key, at = f"channels.{name}.at", str(channel.at)
+        if at in spec.boundary or at in boundary:
+            raise case.error(key, f"the boundary '{at}' has a condition already; keep one.")
+        boundary[at] = _near(names, name)
     sources = {
         name: (names.amount(item.value, units.source, f"sources.{name}.value"), item.over)
         for name, item in spec.sources.items()
@@ -368,6 +382,51 @@ def conditioned(case: CaseContent) -> CaseContent:
     inputs = {**equation.inputs, **names.inputs}
     changed = replace(equation, unknowns=unknowns, inputs=inputs, build=build)
     return replace(case, equation=changed)
+
+
+def _shifted(case: CaseContent) -> dict[str, ChannelSpec]:
+    """Return the boundary values with an unknown offset."""
+    return {n: one for n, one in case.roles("boundary").items() if one.offset is not None}
+
+
+def _offset_label(name: str) -> str:
+    return "offset_" + re.sub(r"\W", "_", name)
+
+
+def _with_offsets(case: CaseContent) -> CaseContent:
+    """Return the case with an unknown for each offset of a boundary value."""
+    added: dict[str, UnknownSpec] = {}
+    for name, channel in _shifted(case).items():
+        label, key = _offset_label(name), f"channels.{name}.offset"
+        if label in case.spec.unknowns or label in added:
+            raise case.error(key, f"'{label}' is its unknown; give the other one another name.")
+        std = case.positive(channel.offset, case.equation.state.unit, key)
+        added[label] = UnknownSpec(prior=0.0, std=std)
+    if not added:
+        return case
+    unknowns = {**case.spec.unknowns, **added}
+    return replace(case, spec=case.spec.model_copy(update={"unknowns": unknowns}))
+
+
+def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
+    """Return the conditions of a boundary that is held at a channel plus its unknown offset.
+
+    A boundary value knows no unknowns: D u_n = h (channel + offset - u) with a coefficient so large
+    that u differs from the value by 1e-4 of what it changes over a cell.
+    """
+    case, label = names.case, _offset_label(name)
+    state, (first, variable) = case.equation.state.unit, next(iter(case.equation.unknowns.items()))
+    names.unknowns[label] = Variable("K" if state == "degC" else state, f"offset of {name}")
+    given = case.spec.unknowns[first]
+    value = given.prior
+    if not isinstance(value, str):
+        rule = conversion(given.unit or variable.unit, variable.unit, case.where(first))
+        value = rule.factor * value + rule.offset
+    D = case.convert(value, variable.unit, f"unknowns.{first}.prior")
+    dimension, cells = len(case.mesh.p), case.mesh.t.shape[1]
+    cell = float(np.ptp(case.mesh.p, axis=1).max()) / cells ** (1.0 / dimension)
+    h = HELD * D / cell
+    return [Exchange(h, Channel(name)), Flux(Multiple(label, h))]
 
 
 def _check_drive(case: CaseContent, storage: str) -> None:

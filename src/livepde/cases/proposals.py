@@ -92,6 +92,10 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     time = SAMPLES * float(np.median(np.diff(table.t)))
     for kind, size in (("source", error / time), ("loss", 0.1 / time)):
         yield Variant(kind, freed(prepared, Cause(kind, "", "", size=size)))
+    values = [Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary")]
+    offsets = [setting for cause in values for setting in freed(prepared, cause)]
+    if offsets:
+        yield Variant("offsets of the boundary values", tuple(offsets))
     for name in map(str, prepared.case.mesh.boundaries or {}):
         flux = freed(prepared, Cause("flux", name, "", size=error / time))
         yield Variant(f"flux at {name}", flux)

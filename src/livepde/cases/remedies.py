@@ -49,7 +49,7 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return ()
     if cause.kind in KEYS:
         return _of_sensor(case, cause)
-    process = {"source": _source, "loss": _loss, "flux": _flux}
+    process = {"source": _source, "loss": _loss, "flux": _flux, "boundary": _boundary}
     if cause.kind in process:
         return process[cause.kind](prepared, cause)
     return settings_in(cause.setting)
@@ -119,6 +119,16 @@ def _loss(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
             return ()
         settings.append(f"inputs.ambient={sum(known) / len(known):.6g}")
     return tuple(settings)
+
+
+def _boundary(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
+    """Return the setting of an unknown offset of a boundary value."""
+    case = prepared.case
+    channel = case.roles("boundary").get(cause.subject)
+    if case.equation.fluxes is None or channel is None or channel.offset is not None:
+        return ()
+    size = float(f"{WIDE * abs(cause.size):.2g}")
+    return (channel_setting(cause.subject, "offset", toml_value(size)),) if size else ()
 
 
 def _flux(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

@@ -481,6 +481,8 @@ class ChannelSpec(Spec):
         sensor = self.role in SENSORS
         own = {"offset", "gain", "correlated", "at_std"} & self.model_fields_set
         # A sensor that is ignored for a while keeps its keys.
+        if self.role == "boundary":
+            own -= {"offset"}
         if own and self.role not in ("sensor", "ignored"):
             raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
         if self.of is not None and not sensor:

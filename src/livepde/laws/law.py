@@ -433,8 +433,15 @@ class Law(ABC, Generic[Work, State]):
         """Return the state after a fit of all stored samples; here the same state."""
         return state
 
-    def final(self, work: Work, state: State) -> Deferred:
-        """Return belief and verdict as `deferred`, for the end of a run; here the same."""
+    def final(self, work: Work, state: State, *, columns: bool = True) -> Deferred:
+        """Return belief and verdict as `deferred`, for the end of a run; here the same.
+
+        Parameters
+        ----------
+        columns
+            Whether the verdict looks for errors of single columns of the data, which may take
+            several times as long as the run.
+        """
         return self.deferred(work, state)
 
     def live(self) -> Law[Work, State]:

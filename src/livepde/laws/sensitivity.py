@@ -53,7 +53,11 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
+<<<<<<< HEAD
 from livepde.laws.verdict import judge_of, judged, with_columns, with_errors, with_fit
+=======
+from livepde.laws.verdict import after_fit, judge_of, judged, with_columns, with_fit
+>>>>>>> c39
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -509,9 +513,14 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         judge = with_fit(judged(work.filter, state.now, now), fit)
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
-    def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
+    def final(
+        self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
+    ) -> Deferred:
         found = self.deferred(work, state)
-        if not self.verdict:
+        # Of a later window the fit knows nothing of the readings before.
+        whole = state.fit.member(0) if not state.window[0] else None
+        found = found._replace(verdict=after_fit(found.verdict, whole))
+        if not (self.verdict and columns):
             return found
         verdict = with_columns(found.verdict, Columns.of(work, state))
         return found._replace(verdict=with_errors(verdict, work, state))

@@ -32,7 +32,7 @@ from livepde.verdict import (
     too_few,
 )
 
-__all__ = ["judge_of", "judged", "with_columns", "with_errors", "with_fit"]
+__all__ = ["after_fit", "judge_of", "judged", "with_columns", "with_errors", "with_fit"]
 
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
@@ -121,6 +121,22 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
         remedy = "Look at these readings, state a larger noise, or open the gate."
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
     return (lambda: judge().with_findings(found)) if found else judge
+
+
+def after_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+    """Return a verdict at the end of a run, where a fit of all its samples has converged.
+
+    The fit decides on all readings again: what the gate refused before it counts no longer.
+    """
+    if fit is None or not fit.converged:
+        return judge
+
+    def found() -> Verdict:
+        verdict = judge()
+        kept = [one for one in verdict.findings if one.what != "refused"]
+        return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
+
+    return found
 
 
 def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:

@@ -16,10 +16,25 @@ from livepde.errors import ModelError
 from livepde.fem import Channel, On, Place, Unknown
 from livepde.model import Model
 
-__all__ = ["Amount", "Exchange", "Flux", "Source", "with_conditions"]
+__all__ = ["Amount", "Exchange", "Flux", "Multiple", "Source", "with_conditions"]
 
-Amount: TypeAlias = "float | Channel | str"
-"""A number, an input channel, or an unknown by its name."""
+
+@dataclass(frozen=True)
+class Multiple:
+    """A multiple of an unknown.
+
+    Attributes
+    ----------
+    unknown, factor
+        Its name, and the number that it is multiplied by.
+    """
+
+    unknown: str
+    factor: float
+
+
+Amount: TypeAlias = "float | Channel | str | Multiple"
+"""A number, an input channel, an unknown by its name, or a multiple of one."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +188,9 @@ class _Terms:
             return term(None, u, v, x)
 
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
-        unknown = self.per is not None or any(isinstance(amount, str) for amount in amounts)
+        unknown = self.per is not None or any(
+            isinstance(amount, str | Multiple) for amount in amounts
+        )
         form = term if unknown else known
         (self.A if unknown else self.B).append(form if where is None else On(where, form))
 
@@ -187,6 +204,9 @@ class _Terms:
         if isinstance(value, Channel):
             self.inputs.append(value.name)
             return lambda q, x: x.inputs[value.name]
+        if isinstance(value, Multiple):
+            one = self._amount(value.unknown)
+            return lambda q, x: value.factor * one(q, x)
         if not isinstance(value, str):
             return lambda q, x: value
         if value not in self.unknowns:

@@ -182,7 +182,8 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
 def _held(data: xr.Dataset) -> list[str]:
     """Return whether latent values were held at `within` prior standard deviations."""
     at = _times(data, "bounded")
-    if not len(at):
+    # Where a last fit has converged, what counts is where it ended.
+    if not len(at) or not data.attrs.get("bounded_at_end", 1.0):
         return []
     return [
         f"In {len(at)} samples, last at {when(data, at[-1])}, the data asked for unknowns farther "

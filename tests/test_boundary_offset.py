@@ -1,0 +1,62 @@
+"""An unknown offset of a boundary value: `offset` of a channel of role boundary."""
+
+from __future__ import annotations
+
+import pandas as pd
+import pytest
+from factories import short_rod
+
+from livepde import cases
+from livepde.cases.variants import Variant, run_variant
+from livepde.errors import CaseError
+
+OFFSET = 1.5  # K
+
+
+def biased(folder):
+    path = short_rod(folder, 61)
+    table = pd.read_csv(path.parent / "rod.csv")
+    table["T_left"] += OFFSET  # the thermometer at the end reads too much
+    table.to_csv(path.parent / "rod.csv", index=False)
+    return path
+
+
+@pytest.mark.slow
+def test_the_offset_of_a_boundary_value_is_found(tmp_path):
+    path = biased(tmp_path)
+    plain = run_variant(path, [], Variant("as stated"))
+    found = run_variant(path, [], Variant("offset", ("channels.T_left.offset='2 K'",)))
+    assert not found.error
+    offset, alpha = found.estimates["offset_T_left"], found.estimates["alpha"]
+    # What has to be added to the channel.
+    assert offset.low < -OFFSET < offset.high
+    assert offset.std < 0.2
+    assert alpha.low < 9.7e-5 < alpha.high
+    assert found.gained(plain) > 100.0
+    assert found.withheld_error < plain.withheld_error
+    assert found.level == "trusted"
+
+
+@pytest.mark.slow
+def test_without_an_offset_the_boundary_is_held_as_a_value_holds_it(tmp_path):
+    path = short_rod(tmp_path, 41)
+    held = run_variant(path, [], Variant("value"))
+    near = run_variant(path, [], Variant("near", ("channels.T_left.offset='1e-6 K'",)))
+    one, other = held.estimates["alpha"], near.estimates["alpha"]
+    assert other.value == pytest.approx(one.value, rel=1e-3)
+    assert other.std == pytest.approx(one.std, rel=0.05)
+    assert near.log_evidence == pytest.approx(held.log_evidence, abs=0.5)
+
+
+def test_an_offset_needs_an_equation_with_fluxes_and_a_boundary_of_its_own(tmp_path):
+    path = short_rod(tmp_path, 11)
+    offset = {"channels.T_left.offset": "1 K"}
+    labels = cases.load(path, settings=offset).model.parameter_space.labels
+    assert "offset_T_left" in labels
+    own = {**offset, "unknowns.offset_T_left": {"prior": 0, "std": 1}}
+    with pytest.raises(CaseError, match="offset_T_left"):
+        cases.load(path, settings=own)
+    with pytest.raises(CaseError, match="has a condition already"):
+        cases.load(path, settings={**offset, "boundary.left.flux": 1.0})
+    with pytest.raises(CaseError, match="belongs to sensors"):
+        cases.load(path, settings={"channels.T_left.gain": 0.1})
