@@ -570,15 +570,11 @@ class Identifier:
         """
         if self._state is None:
             return estimate
-<<<<<<< HEAD
         state = self.law.settled(self._work, self._state)
-        latent, judge = self.law.final(self._work, state)
+        latent, judge = self.law.final(self._work, state, columns=columns)
         if state is self._state:
             known = partial(self.law.diagnosed, self._work, state)
             return replace(estimate, judge=self._judge(judge, known))
-=======
-        latent, judge = self.law.final(self._work, state, columns=columns)
->>>>>>> c39
 
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.

@@ -695,7 +695,7 @@ class Live:
         if not self.waits:  # the end is near, and has them
             return estimate.verdict
         if _due(len(self.result) // JUDGED):
-            self._errors = self.identifier.settled(estimate).verdict.errors
+            self._errors = self.identifier.settled(estimate, columns=False).verdict.errors
         if self._errors is None:
             return estimate.verdict
         values = {}
