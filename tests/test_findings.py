@@ -109,6 +109,18 @@ def mended(*, fault: bool) -> list[str]:
     return kinds(estimate.verdict)
 
 
+def ended(offset: float = 0.0) -> list[str]:
+    """Return the findings at the end of a run with an offset of one sensor."""
+    z = rods.shown() + rods.errors()
+    z[:, 1] += offset
+    sensors = lp.Points(rods.PLACES, noise=rods.NOISE)
+    identifier = lp.Identifier(rods.rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    each = zip(rods.TIMES.tolist(), z, strict=True)
+    result = identifier.run(lp.Sample(t, row, {"T_left": rods.driven(t)}) for t, row in each)
+    assert result.last is not None
+    return kinds(result.last.verdict)
+
+
 def one_column(share: float) -> list[str]:
     """Return the findings of a run without a misfit, where a column explains a share of it."""
     cause = Cause("lag", "T", "sensor T is 3 late", share)
@@ -261,6 +273,7 @@ RUNS = {
     "channel_ledgers: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
     "shifts: hold": Pair(partial(fed, between="next"), fed),
     "shifts: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
+    "findings: effect": Pair(partial(ended, 0.08), ended),
     "findings: bound": Pair(partial(warned_of, NARROW), partial(warned_of, ONE)),
     "findings: flat": Pair(partial(warned_of, BESIDE), partial(warned_of, ONE)),
     "run_verdict: input": Pair(partial(counted, spike=2), counted),

@@ -64,14 +64,14 @@ def test_the_right_model_raises_no_doubts():
 @pytest.mark.slow
 def test_a_process_that_is_missing_is_said():
     found = doubts(run(rod(lp.Normal(0.2, 0.1)), rod(lp.Normal(0.2), loss=1.0)))
-    assert "The model does not explain the data" in found[0]
+    assert any("The model does not explain the data" in text for text in found[:2])
 
 
 @pytest.mark.long
 def test_a_sensor_that_is_always_off_is_named():
     model = rod(lp.Normal(0.2, 0.1))
     found = doubts(run(model, model, shift=[0.0, 1.0, 0.0]))
-    assert "The model does not explain the data" in found[0]
+    assert any("The model does not explain the data" in text for text in found[:2])
     assert "Most likely sensor B reads" in found[0]
     assert "too much" in found[0]
     assert "sensor C" not in found[0]

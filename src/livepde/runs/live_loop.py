@@ -675,7 +675,9 @@ class Live:
         if len(self.result) <= self._looked:  # samples that are taken again have been judged
             return
         verdict, self._looked = self._with_errors(estimate), len(self.result)
-        before, known = self._level, verdict.level in (self._level, self._next)
+        before = self._level
+        # The first level that is found is told at once.
+        known = before == NOT_JUDGED or verdict.level in (before, self._next)
         self._next = "" if known else verdict.level
         if known:
             self._level = verdict.level
