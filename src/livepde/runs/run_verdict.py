@@ -379,7 +379,10 @@ def verdict_table(found: Verdict) -> Table:
         for finding in found.findings[:MOST]
     ]
     columns = ("severity", "finding", "of", "evidence", "measure", "likely causes")
-    return Table(f"Verdict: {found.level} ({PROMISES[found.level]})", columns, rows)
+    promise = PROMISES[found.level]
+    if found.level == "caution" and found.errors is not None:
+        promise += ": use the intervals with model errors"
+    return Table(f"Verdict: {found.level} ({promise})", columns, rows)
 
 
 def doubts(data: xr.Dataset) -> list[str]:

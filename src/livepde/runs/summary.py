@@ -282,13 +282,15 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
         attrs, std = data[label].attrs, float(data[f"{label}_std"][-1])
         value, deviation = digits(float(data[label][-1]), std)
         allowed = [_allowed(errors, data, label)] if errors is not None and differ else []
-        cells = (value, *allowed, deviation, _interval(data, label))
+        spread = [] if differ else [deviation]
+        cells = (value, *allowed, *spread, _interval(data, label))
         rows.append((label, *cells, attrs.get("units", "")))
         if compared:
             reference = shown(float(attrs.get("reference", math.nan)), ".5g")
             rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
-    more = ["95 % with model errors"] if differ else []
-    columns = ("unknown", "value", *more, "± std. dev.", "95 %", "unit")
+    # The wider interval comes first. The plain one tells the standard deviation, too.
+    more = ["with model errors"] if differ else ["± std. dev."]
+    columns = ("unknown", "value", *more, "95 %", "unit")
     title = f"Estimates{_first_order(data, labels)}"
     if not compared:
         return Table(title, columns, rows)
@@ -344,7 +346,7 @@ def _channels(data: xr.Dataset) -> Table:
         for name, (role, own, later, refused) in channels.items()
     ]
     more = ["refused"] if refuses else []
-    more += ["misfit / noise"] if fitted else []
+    more += ["/ noise"] if fitted else []
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
 

@@ -43,10 +43,10 @@ NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not
 """Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
 
 PROMISES: dict[Level, str] = {
-    "trusted": "nothing in the data speaks against these estimates, or not so that it matters",
-    "caution": "the model is not exact: use the interval that allows for its errors",
-    NOT_JUDGED: "nothing tested whether the model holds",
-    LEVELS[-1]: "the estimates are not to be used as they are",
+    "trusted": "nothing that matters speaks against it",
+    "caution": "the model is not exact",
+    NOT_JUDGED: "whether the model holds was not tested",
+    LEVELS[-1]: "do not use the estimates as they are",
 }
 """Level -> what it says of the estimates."""
 DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
