@@ -669,11 +669,15 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _judge(self, estimate: Estimate) -> None:
-        """Look at the verdict: another level counts once two looks in a row have found it."""
+        """Look at the verdict: another level counts once two looks in a row have found it.
+
+        The first one that is judged counts at once.
+        """
         if len(self.result) <= self._looked:  # samples that are taken again have been judged
             return
         verdict, self._looked = estimate.verdict, len(self.result)
-        before, known = self._level, verdict.level in (self._level, self._next)
+        before = self._level
+        known = before == NOT_JUDGED or verdict.level in (before, self._next)
         self._next = "" if known else verdict.level
         if known:
             self._level = verdict.level
