@@ -94,7 +94,7 @@ def run(columns: dict[str, Any], between: Any = None, **options: Any) -> lp.Resu
     return identifier.run(samples)
 
 
-OFTEN = ("input late", "input in degF", "sensors exchanged")  # the others are long tests
+OFTEN = ("input late", "input in degF")  # the others are long tests
 
 
 @pytest.mark.slow
@@ -111,7 +111,8 @@ def test_the_wrong_column_is_named_first(fault: str):
     assert first.subject == name
     assert words in first.text
     assert first.share > 0.9
-    assert first.text in verdict.sentences[0]
+    # Fit and effect are said first.
+    assert first.text in verdict.sentences[1]
     assert len({(cause.kind, cause.subject) for cause in misfit.causes}) == len(misfit.causes)
 
 
@@ -184,7 +185,7 @@ def test_slow_noise_is_no_wrong_column():
     assert not kinds & {"unit", "exchange"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_fault_that_is_in_no_column_is_not_put_on_one():
     """A loss over the whole bar: no column explains more than what the model lacks."""
     _, columns = bar(7)

@@ -169,7 +169,7 @@ def test_a_run_comes_back_as_it_was(tmp_path, driven):
     assert run.dataset.attrs["scalars"] == data.attrs["scalars"]
     assert run.dataset.alpha.attrs["units"] == "m^2/s"
     first, *others = run.summary()
-    assert first.title == f"Verdict: {verdict(data).level}"
+    assert first.title.startswith(f"Verdict: {verdict(data).level} (")
     assert [table.to_dict() for table in others] == [t.to_dict() for t in tables(data)]
     assert "| alpha |" in (tmp_path / "run" / "report.md").read_text()
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from benchmarks.census.faults import FAULTS
 from benchmarks.census.trace import VISIBLE
@@ -19,6 +20,10 @@ __all__ = ["outcome"]
 WRONG = 3.0  # standard deviations
 SILENT = 0.01  # share of all runs that are wrong and trusted, at most
 FALSE = 0.02  # share of sound runs that are doubted, at most
+COVERED = 0.90  # share of numbers of wrong runs in the interval that allows for model errors
+COVERED_CAUTION = 0.95  # the same of runs with a caution
+WIDER = 1.1, 1.15, 1.5  # median, mean and 95 % quantile of its width where nothing is wrong
+RANKED = 0.6  # rank correlation of the stated effect with the error made
 NAMED = 0.70  # share of doubted runs with a cause that can be named in which it is, at least
 
 
@@ -40,6 +45,8 @@ def outcome(scores: Sequence[Score]) -> Outcome:
         Check("cause among the first two", _share([s for s in told if s.named], told), NAMED, ">="),
         Check("runs that ended early", len(scores) - len(whole), 0, "<="),
     ]
+    allowed, found = _intervals([s for s in whole if s.fault], sound)
+    checks += found
     rows = []
     for fault in dict.fromkeys(score.fault for score in scores):
         some = [score for score in whole if score.fault == fault]
@@ -57,7 +64,7 @@ def outcome(scores: Sequence[Score]) -> Outcome:
         "delay",
         "90 %",
     ]
-    tables = [Table("What runs say of themselves", columns, rows)]
+    tables = [Table("What runs say of themselves", columns, rows), allowed]
     told_of = [*silent, *false]
     tables.append(
         Table(
@@ -96,6 +103,43 @@ def outcome(scores: Sequence[Score]) -> Outcome:
         checks,
         notes + [f"{s.problem}, {s.fault}: {s.failure}" for s in scores if s.failure],
     )
+
+
+def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, list[Check]]:
+    """Return the table of intervals that allow for errors of the model, and its checks."""
+    usable = [s for s in wrong if s.verdict in ("trusted", "caution")]
+    parts = {
+        "wrong, trusted or caution": usable,
+        "wrong, caution": [s for s in wrong if s.verdict == "caution"],
+        "wrong, do not trust": [s for s in wrong if s.verdict == "do not trust"],
+        "nothing": sound,
+    }
+    rows, numbers = [], {}
+    for name, some in parts.items():
+        each = np.array([row for score in some for row in score.allowed], dtype=float)
+        if not len(each):
+            continue
+        plain, wide, wider, *_ = each.T
+        quantiles = np.quantile(wider, 0.5), wider.mean(), np.quantile(wider, 0.95)
+        numbers[name] = float(wide.mean()), [float(number) for number in quantiles]
+        rows.append([name, len(each), round(float(plain.mean()), 2), round(float(wide.mean()), 2)])
+        rows[-1] += [round(number, 2) for number in numbers[name][1]]
+    columns = ["runs", "numbers", "plain holds", "allowing holds", "width", "mean", "95 %"]
+    nothing = (float("nan"), [float("nan")] * 3)
+    widths = numbers.get("nothing", nothing)[1]
+    every = np.array([row for score in wrong for row in score.allowed], dtype=float)
+    rank = spearmanr(every[:, 3], every[:, 4]).statistic if len(every) > 2 else float("nan")
+    held = [numbers.get(name, nothing)[0] for name in parts]
+    checks = [
+        Check("allowing interval holds the truth", held[0], COVERED, ">="),
+        Check("the same of runs with a caution", held[1], COVERED_CAUTION, ">="),
+        Check("its width where nothing is wrong, median", widths[0], WIDER[0], "<="),
+        Check("the same, mean", widths[1], WIDER[1], "<="),
+        Check("the same, 95 %", widths[2], WIDER[2], "<="),
+        Check("rank correlation of effect and error", float(rank), RANKED, ">="),
+    ]
+    title = "Intervals that allow for errors of the model (width over that of the noise alone)"
+    return Table(title, columns, rows), checks
 
 
 def _share(some: Sequence[Score], of: Sequence[Score]) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,6 +58,10 @@ class Score:
         the truth's code cannot tell: of noise, initial states and settings.
     failure
         What ended the run, if anything did.
+    allowed
+        A row for each number that is unknown: whether its plain interval, and the one that allows
+        for errors of the model, hold the truth; width of the latter over that of the noise alone;
+        its effect; and the error that was made, relative to the value.
     """
 
     problem: str
@@ -73,6 +77,7 @@ class Score:
     said: str = ""
     trace: float = np.nan
     failure: str = ""
+    allowed: tuple[tuple[bool, bool, float, float, float], ...] = ()
 
 
 def census(
@@ -177,6 +182,7 @@ def _judged(scene: Scene, score: Score) -> Score:
             delay = k - half if estimate.verdict.level != "trusted" else -1
     if estimate is None:
         raise ValueError("a run of the census has no samples.")
+    estimate = identifier.settled(estimate)  # as at the end of a run
     verdict = estimate.verdict
     kinds = about.kinds if about else ()
     return Score(
@@ -192,7 +198,28 @@ def _judged(scene: Scene, score: Score) -> Score:
         early,
         verdict.sentences[0] if verdict.sentences else "",
         trace(scene) if about and about.traced else np.nan,
+        allowed=tuple(_allowed(problem, scene, estimate)),
     )
+
+
+def _allowed(
+    problem: Problem, scene: Scene, estimate: lp.Estimate
+) -> Iterator[tuple[bool, bool, float, float, float]]:
+    """Iterate over the numbers, with what their intervals hold."""
+    errors = estimate.verdict.errors
+    if errors is None:
+        return
+    for label, latent in problem.latents.items():
+        if label not in estimate.space.labels:
+            continue
+        one = errors[label]
+        truth = float(np.ravel(latent.value(scene.theta, scene.length - 1))[0])
+        value, *ends = (
+            float(np.ravel(latent.inverse(np.array([end])))[0])
+            for end in (one.value, one.plain_low, one.plain_high, one.low, one.high)
+        )
+        plain, wide = ends[0] <= truth <= ends[1], ends[2] <= truth <= ends[3]
+        yield plain, wide, one.wider, one.effect, abs(truth - value)
 
 
 def _off(problem: Problem, scene: Scene, estimate: lp.Estimate) -> float:

@@ -568,10 +568,13 @@ class Identifier:
             Whether its verdict looks for errors of single columns, such as one in another unit,
             where something speaks against the estimates.
         """
-        state = self.law.settled(self._work, self._state)
-        if state is self._state:
+        if self._state is None:
             return estimate
+        state = self.law.settled(self._work, self._state)
         latent, judge = self.law.final(self._work, state, columns=columns)
+        if state is self._state:
+            known = partial(self.law.diagnosed, self._work, state)
+            return replace(estimate, judge=self._judge(judge, known))
 
         def diagnose() -> Diagnostics[float]:
             # What the last sample brought stays; the shifts belong to the new estimate.

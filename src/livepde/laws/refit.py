@@ -19,7 +19,7 @@ from livepde.laws.refit_options import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, Mask
 
-__all__ = ["Found", "refitted"]
+__all__ = ["Found", "plausible", "refitted"]
 
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
@@ -89,6 +89,13 @@ def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | N
         search.begin(used)
     converged = search.settled and not search.lost
     return Found(best=search.best, used=search.used, converged=converged, passes=search.passes)
+
+
+def plausible(samples: StoredSamples, options: Refit, one: Passed) -> Mask:
+    """Return the readings that a fit which has ended at a trajectory uses, (samples, sensors)."""
+    search = _Search(samples, options, last=True)
+    search.best = one
+    return search.plausible if samples.gated else search.used
 
 
 @dataclass(eq=False)

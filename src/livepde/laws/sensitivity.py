@@ -53,7 +53,14 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import after_fit, judge_of, judged, with_columns, with_fit
+from livepde.laws.verdict import (
+    after_fit,
+    judge_of,
+    judged,
+    with_columns,
+    with_errors,
+    with_fit,
+)
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -516,9 +523,12 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # Of a later window the fit knows nothing of the readings before.
         whole = state.fit.member(0) if not state.window[0] else None
         found = found._replace(verdict=after_fit(found.verdict, whole))
-        if not (self.verdict and columns):
+        if not self.verdict:
             return found
-        return found._replace(verdict=with_columns(found.verdict, Columns.of(work, state)))
+        if columns:
+            wrong = with_columns(found.verdict, Columns.of(work, state))
+            found = found._replace(verdict=wrong)
+        return found._replace(verdict=with_errors(found.verdict, work, state))
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

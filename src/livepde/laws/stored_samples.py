@@ -206,6 +206,11 @@ class StoredSamples:
                     return
             yield changed(x, u=columns[0], U=columns[1:].transpose(1, 0, 2), kept=kept), span
 
+    def along(self, one: Passed) -> Iterator[FilterState]:
+        """Yield the state and the unknowns of a trajectory at each sample."""
+        for x, _ in self._followed(self.placed(one.xi[None], rows=False)):
+            yield x
+
     def _compared(self, start: FilterState) -> Iterator[tuple[FilterState, Array, Array]]:
         """Yield trajectories after each span, with residuals and derivatives in units of the noise.
 

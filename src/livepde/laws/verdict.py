@@ -13,7 +13,10 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed
+from livepde.laws.model_errors import model_errors
 from livepde.laws.reduction import Reduction
+from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
     NOT_JUDGED,
@@ -22,13 +25,14 @@ from livepde.verdict import (
     Dictionary,
     Finding,
     Judge,
+    ModelErrors,
     Position,
     Verdict,
     assess,
     too_few,
 )
 
-__all__ = ["after_fit", "judge_of", "judged", "with_columns", "with_fit"]
+__all__ = ["after_fit", "judge_of", "judged", "with_columns", "with_errors", "with_fit"]
 
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
@@ -158,6 +162,43 @@ def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callab
         return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
 
     return found
+
+
+def with_errors(
+    judge: Callable[[], Verdict], work: SensitivityWork, state: SensitivityState
+) -> Callable[[], Verdict]:
+    """Return a verdict whose level follows from fit and effect, where these can be computed.
+
+    It holds the stored samples until then.
+    """
+
+    def found() -> Verdict:
+        verdict = judge()
+        if verdict.level == NOT_JUDGED:
+            return verdict
+        errors = _errors(work, state)
+        if isinstance(errors, str):
+            return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
+        return verdict.with_errors(errors)
+
+    return found
+
+
+def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
+    """Return misfit and effects of one member, or why there are none."""
+    if work.refit is None:
+        return "the law stores no samples"
+    if not work.fits:
+        return "unknowns move, inputs have noise, or the past fades"
+    if not state.log.shape[1]:
+        return "no sample is stored"
+    filter_ = work.filter
+    Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, state.now)
+    shift = np.zeros(len(Phi))
+    if filter_.shadows is not None:
+        shift = Phi @ filter_.shadows.widening(state.now)[1][0, 0]
+    std = np.linalg.norm(Phi @ C[0].T, axis=1)
+    return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

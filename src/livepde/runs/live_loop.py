@@ -23,7 +23,7 @@ from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
 from livepde.streams.intake import Ready, Remark
-from livepde.verdict import LEVELS, NOT_JUDGED, Verdict
+from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
 __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
@@ -31,9 +31,10 @@ GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # samples between two checkpoints
 JUDGED = 50  # samples between two looks at the verdict
-# Keys of a stored verdict: the level that was reported last, the samples at the last look, and
-# another level that this look was the first to find.
-TOLD, LOOKED, NEXT = "told", "looked", "next"
+SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
+# Keys of a stored verdict: the level that was reported last, the samples at the last look, another
+# level that this look was the first to find, and the errors of the model as they were computed.
+TOLD, LOOKED, NEXT, ERRORS = "told", "looked", "next", "computed_errors"
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
@@ -230,6 +231,7 @@ class Live:
         self._verdict = Verdict.from_dict(stored)
         self._level, self._next = stored.get(TOLD, NOT_JUDGED), stored.get(NEXT, "")
         self._looked = stored.get(LOOKED, 0)
+        self._errors = ModelErrors.from_dict(stored.get(ERRORS))
         self._seconds = 0.0  # spent in steps
         self.fields_every = fields_every
         self.result = self._read()
@@ -675,7 +677,7 @@ class Live:
         """
         if len(self.result) <= self._looked:  # samples that are taken again have been judged
             return
-        verdict, self._looked = estimate.verdict, len(self.result)
+        verdict, self._looked = self._with_errors(estimate), len(self.result)
         before = self._level
         known = before == NOT_JUDGED or verdict.level in (before, self._next)
         self._next = "" if known else verdict.level
@@ -688,10 +690,30 @@ class Live:
             # Each sound run begins as not judged, and is trusted then: that is no warning.
             self._tell("verdict", message, harmless=verdict.level == LEVELS[0])
 
+    def _with_errors(self, estimate: Estimate) -> Verdict:
+        """Return the verdict whose level follows from fit and effect, once these are known.
+
+        They are computed at doublings of the number of samples. In between an interval is as much
+        wider than the plain one as it was then.
+        """
+        if not self.waits:  # the end is near, and has them
+            return estimate.verdict
+        if _due(len(self.result) // JUDGED):
+            self._errors = self.identifier.settled(estimate).verdict.errors
+        if self._errors is None:
+            return estimate.verdict
+        values = {}
+        for label in estimate.space.labels:
+            unknown = estimate[label]
+            low, high = unknown.interval()
+            values[label] = float(unknown.median), float(low), float(high)
+        return estimate.verdict.with_errors(self._errors.about(values))
+
     def _keep_verdict(self, verdict: Verdict) -> None:
         """Make a verdict the current one, which all readers see."""
         self._verdict = verdict
-        look = {TOLD: self._level, LOOKED: self._looked, NEXT: self._next}
+        errors = None if self._errors is None else self._errors.to_dict()
+        look = {TOLD: self._level, LOOKED: self._looked, NEXT: self._next, ERRORS: errors}
         self.journal.judge({**verdict.to_dict(), **look})
 
     def _put(self, estimate: Estimate) -> None:
@@ -712,3 +734,8 @@ class Live:
             self._heard, self.silent = now, False
         elif now - self._heard > self.silence:
             self.silent = True
+
+
+def _due(look: int) -> bool:
+    """Return whether a look at the verdict computes errors of the model."""
+    return look > 1 and (look & (look - 1) == 0 or look % SELDOM == 0)

@@ -21,6 +21,7 @@ from livepde.runs.summary import digits, jumps, shown
 from livepde.verdict import (
     FLAT,
     MOST,
+    PROMISES,
     REFINE,
     REFUSED,
     Finding,
@@ -378,7 +379,7 @@ def verdict_table(found: Verdict) -> Table:
         for finding in found.findings[:MOST]
     ]
     columns = ("severity", "finding", "of", "evidence", "measure", "likely causes")
-    return Table(f"Verdict: {found.level}", columns, rows)
+    return Table(f"Verdict: {found.level} ({PROMISES[found.level]})", columns, rows)
 
 
 def doubts(data: xr.Dataset) -> list[str]:

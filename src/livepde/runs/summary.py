@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from livepde.plots.dataset import field_names, interval_95, modes_told, note, pr
 from livepde.records import refused_readings, used_errors
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
+from livepde.verdict import ModelErrors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -180,6 +182,22 @@ def _interval(data: xr.Dataset, label: str) -> str:
     return f"{low} to {high}"
 
 
+def _errors(data: xr.Dataset) -> ModelErrors | None:
+    """Return misfit and effects that the verdict of a run has stated; None without."""
+    stored = data.attrs.get("verdict")
+    return ModelErrors.from_dict(json.loads(stored).get("errors")) if stored else None
+
+
+def _allowed(errors: ModelErrors, data: xr.Dataset, label: str) -> str:
+    """Return the interval that allows for errors of the model as text."""
+    known = {one.label: one for one in errors.unknowns}.get(label)
+    if known is None:
+        return "–"
+    std = float(data[f"{label}_std"][-1])
+    low, high = (digits(end, std)[0] for end in (known.low, known.high))
+    return f"{low} to {high}"
+
+
 def _error(data: xr.Dataset, label: str) -> float:
     """Return the relative error of the last estimate to the reference, NaN without one."""
     reference = float(data[label].attrs.get("reference", math.nan))
@@ -257,15 +275,20 @@ def tables(data: xr.Dataset) -> list[Table]:
 def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     """Return the table of the last estimates, with references where any is given."""
     compared = any("reference" in data[label].attrs for label in labels)
+    errors = _errors(data)
+    differ = errors is not None and errors.differ
     rows: list[tuple[Any, ...]] = []
     for label in labels:
         attrs, std = data[label].attrs, float(data[f"{label}_std"][-1])
-        cells = (*digits(float(data[label][-1]), std), _interval(data, label))
+        value, deviation = digits(float(data[label][-1]), std)
+        allowed = [_allowed(errors, data, label)] if errors is not None and differ else []
+        cells = (value, *allowed, deviation, _interval(data, label))
         rows.append((label, *cells, attrs.get("units", "")))
         if compared:
             reference = shown(float(attrs.get("reference", math.nan)), ".5g")
             rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
-    columns = ("unknown", "value", "± std. dev.", "95 %", "unit")
+    more = ["95 % with model errors"] if differ else []
+    columns = ("unknown", "value", *more, "± std. dev.", "95 %", "unit")
     title = f"Estimates{_first_order(data, labels)}"
     if not compared:
         return Table(title, columns, rows)
@@ -302,21 +325,26 @@ def _channels(data: xr.Dataset) -> Table:
     """Return the table of one-step errors of each channel, with the readings that were refused."""
     channels = _grouped(channel_errors(data))
     refuses = any(item.refused for item in channels.values())
+    errors = _errors(data)
+    fits = {} if errors is None else errors.sensors
+    fitted = [name for name in channels if name in fits]
     unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
         (
             name,
             role,
-            f"{rmse(errors):.4g}",
+            f"{rmse(own):.4g}",
             shown(rmse(later), ".4g"),
-            shown(float(errors.mean()) if len(errors) else math.nan, "+.3g"),
-            len(errors),
+            shown(float(own.mean()) if len(own) else math.nan, "+.3g"),
+            len(own),
             *([refused] if refuses else []),
+            *([shown(fits.get(name, math.nan), ".2g")] if fitted else []),
             unit,
         )
-        for name, (role, errors, later, refused) in channels.items()
+        for name, (role, own, later, refused) in channels.items()
     ]
     more = ["refused"] if refuses else []
+    more += ["misfit / noise"] if fitted else []
     columns = ("channel", "role", "RMSE", "2nd half", "mean", "samples", *more, "unit")
     return Table("Measured minus predicted, one step ahead", columns, rows)
 

@@ -10,6 +10,7 @@ from livepde.verdict.findings import (
     MOST,
     NOT_JUDGED,
     NUMBERS,
+    PROMISES,
     TELLING,
     Cause,
     Finding,
@@ -22,6 +23,7 @@ from livepde.verdict.findings import (
 )
 from livepde.verdict.judge import Judge, ScoredSample
 from livepde.verdict.ledger import WINDOWS, Ledger
+from livepde.verdict.model_errors import Allowed, ModelErrors
 from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
 
 __all__ = [
@@ -31,16 +33,19 @@ __all__ = [
     "MOST",
     "NOT_JUDGED",
     "NUMBERS",
+    "PROMISES",
     "REFINE",
     "REFUSED",
     "TELLING",
     "WINDOWS",
+    "Allowed",
     "Cause",
     "Dictionary",
     "Finding",
     "InputLedger",
     "Judge",
     "Ledger",
+    "ModelErrors",
     "Position",
     "ScoreDirection",
     "ScoredSample",

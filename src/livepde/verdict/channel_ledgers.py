@@ -11,7 +11,8 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray
 from livepde.verdict.evidence import chance
-from livepde.verdict.findings import FEWEST, Cause, Finding, channel_setting
+from livepde.verdict.findings import FEWEST, Cause, Finding, Severity, channel_setting
+from livepde.verdict.model_errors import FAILED, OF_SIGNAL
 from livepde.verdict.shifts import Shifts
 
 __all__ = ["InputLedger", "WithheldLedger"]
@@ -197,7 +198,16 @@ class WithheldLedger:
                 remedy=f'Check {name}. If it is faulty, set `role = "ignored"`; if it is sound, '
                 "the model misses the process there.",
             )
-            yield Finding("withheld", "do not trust", text, name, p, "p-value", (cause,))
+            # Missed a little it says that the model is not exact, missed grossly that it is wrong.
+            gross = size > FAILED * math.sqrt(noise) and size > OF_SIGNAL * self._scatter(k)
+            severity: Severity = "do not trust" if gross or cause.kind == "unit" else "caution"
+            yield Finding("withheld", severity, text, name, p, "p-value", (cause,))
+
+    def _scatter(self, k: int) -> float:
+        """Return the standard deviation of the readings of a sensor."""
+        count, _, _, squares, errors, p, pp, pz, _ = self.sums[:, k]
+        mean = (errors + p) / count
+        return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
 
     def _unit(self, k: int, name: str) -> Cause | None:
         """Return the cause that a sensor has another unit, if its values say so."""

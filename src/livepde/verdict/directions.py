@@ -14,7 +14,7 @@ from livepde.model import Model
 from livepde.observation import Observed, Points
 from livepde.verdict.missing_terms import Process
 
-__all__ = ["Dictionary", "ScoreDirection"]
+__all__ = ["Dictionary", "ScoreDirection", "sensor_shifts"]
 
 OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
 DRIFT = 64.0  # ... a drift in so many samples
@@ -139,7 +139,7 @@ class Dictionary:
     def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
         """Append the directions of single sensors, as many kinds as there is room for."""
         sensors, unit = observed.size, observed.observation.unit
-        shifts, step = _positions(model, observed)
+        shifts, step = sensor_shifts(model, observed)
         amplitudes = {  # of each sensor, with their unit; where room is short the last go first
             "offset": (OFFSET * noise, unit),
             "lag": (np.full(sensors, np.nan), ""),
@@ -227,7 +227,7 @@ def _within_reach(
     return bounded
 
 
-def _positions(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
+def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
     """Return how readings change if sensors are shifted along each axis, and by how much.
 
     No axes for sensors that have no position, or an uncertain one that is estimated anyway.

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
+from livepde.verdict.model_errors import ModelErrors
+
 __all__ = [
     "FEWEST",
     "FLAT",
@@ -16,6 +18,7 @@ __all__ = [
     "MOST",
     "NOT_JUDGED",
     "NUMBERS",
+    "PROMISES",
     "TELLING",
     "Cause",
     "Finding",
@@ -39,6 +42,16 @@ LEVELS: tuple[Level, ...] = ("trusted", "caution", NOT_JUDGED, "do not trust")
 NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not trust": 2}
 """Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
 
+PROMISES: dict[Level, str] = {
+    "trusted": "nothing in the data speaks against these estimates, or not so that it matters",
+    "caution": "the model is not exact: use the interval that allows for its errors",
+    NOT_JUDGED: "nothing tested whether the model holds",
+    LEVELS[-1]: "the estimates are not to be used as they are",
+}
+"""Level -> what it says of the estimates."""
+DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
+RANKED = (*DOUBTS, "following", "stuck")  # those whose severity follows from fit and effect
+NAMES: dict[str, Severity] = {"trusted": "note", "caution": "caution", LEVELS[-1]: "do not trust"}
 WORST: dict[Severity, Level] = {"note": "trusted", "caution": "caution", "do not trust": LEVELS[-1]}
 FEWEST = 20  # samples before which there is nothing to judge by
 FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
@@ -222,6 +235,27 @@ def flat(label: str, left: float) -> Finding:
     return Finding("flat", "caution", text, label, left, remedy=TELLING)
 
 
+def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
+    """Return findings whose severities follow from fit and effect, with what these are."""
+    given = [finding for finding in findings if finding.what != "effect"]
+    doubted = any(finding.what in DOUBTS for finding in given)
+    level = errors.level(doubted=doubted)
+    ranked = [
+        replace(one, severity=NAMES[level]) if one.what in RANKED and not _gross(one) else one
+        for one in given
+    ]
+    text = errors.sentence(doubted=doubted)
+    severity = NAMES[level]
+    effect = Finding("effect", severity, text, evidence=errors.effect, remedy=errors.remedy)
+    return ranked if level == "trusted" else [effect, *ranked]
+
+
+def _gross(finding: Finding) -> bool:
+    """Whether a column is in another unit, or of another sensor: then no estimate is right."""
+    first = finding.causes[0] if finding.causes else None
+    return first is not None and first.kind in GROSS and first.share >= HALF
+
+
 @dataclass(frozen=True)
 class Verdict:
     """Whether the estimates of a run are to be believed.
@@ -241,6 +275,10 @@ class Verdict:
     judged
         Whether the main tests were made: what is left of the readings, or of the equation, is noise
         if the model is right.
+    errors
+        Misfit of the model, and intervals that allow for its errors; None if not computed. With
+        them the level follows from fit and effect: however much speaks against a model, its
+        estimates may be of use.
     """
 
     level: Level
@@ -248,6 +286,7 @@ class Verdict:
     untested: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
     judged: bool = True
+    errors: ModelErrors | None = None
 
     @classmethod
     def of(
@@ -257,8 +296,11 @@ class Verdict:
         unseen: Iterable[str] = (),
         *,
         judged: bool = True,
+        errors: ModelErrors | None = None,
     ) -> Verdict:
         """Return the verdict of some findings: the worst of them counts."""
+        if errors is not None:
+            findings = _ranked(findings, errors)
 
         def rank(finding: Finding) -> int:
             return LEVELS.index(WORST[finding.severity])
@@ -271,6 +313,7 @@ class Verdict:
             untested=tuple(dict.fromkeys(untested)),
             unseen=tuple(unseen),
             judged=judged,
+            errors=errors,
         )
 
     @classmethod
@@ -280,7 +323,8 @@ class Verdict:
         # Earlier versions stored no "judged", but said in `untested` that nothing was.
         told = any(text.startswith(("innovations", "everything")) for text in stored["untested"])
         judged = stored.get("judged", not told)
-        return cls.of(findings, stored["untested"], stored["unseen"], judged=judged)
+        errors = ModelErrors.from_dict(stored.get("errors"))
+        return cls.of(findings, stored["untested"], stored["unseen"], judged=judged, errors=errors)
 
     @classmethod
     def unjudged(cls) -> Verdict:
@@ -296,12 +340,22 @@ class Verdict:
         new = [finding for finding in more if finding.text not in said]
         later = {(finding.what, finding.subject) for finding in new if finding.subject}
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
-        return Verdict.of([*kept, *new], self.untested, self.unseen, judged=self.judged)
+        return self._with([*kept, *new])
+
+    def with_errors(self, errors: ModelErrors) -> Verdict:
+        """Return the verdict whose level follows from fit and effect."""
+        return Verdict.of(
+            self.findings, self.untested, self.unseen, judged=self.judged, errors=errors
+        )
+
+    def _with(self, findings: Iterable[Finding], *untested: str) -> Verdict:
+        """Return the verdict with other findings, and more that was not tested."""
+        more = (*self.untested, *untested)
+        return Verdict.of(findings, more, self.unseen, judged=self.judged, errors=self.errors)
 
     def with_untested(self, untested: str) -> Verdict:
         """Return the verdict with one more thing that was not tested."""
-        more = (*self.untested, untested)
-        return Verdict.of(self.findings, more, self.unseen, judged=self.judged)
+        return self._with(self.findings, untested)
 
     def with_causes(self, causes: Sequence[Cause]) -> Verdict:
         """Return the verdict with other causes of its misfit, the likeliest first.
@@ -342,7 +396,7 @@ class Verdict:
             shift=misfit.shift if same else {},
         )
         kept = [better, *(one for one in self.findings if one is not misfit)]
-        return Verdict.of(kept, self.untested, self.unseen, judged=self.judged)
+        return self._with(kept)
 
     @property
     def every_sentence(self) -> list[str]:
@@ -367,6 +421,7 @@ class Verdict:
             "untested": list(self.untested),
             "unseen": list(self.unseen),
             "judged": self.judged,
+            "errors": None if self.errors is None else self.errors.to_dict(),
         }
 
     def __str__(self) -> str:

@@ -1,0 +1,376 @@
+"""Answers of the process to errors of the model, along the stored samples.
+
+Errors of amplitude one are sources, losses, flows, conductivities that vary, boundary values, and
+unknowns that change. Their answers p go on by one implicit Euler step between two samples,
+
+    M (p' - p)/h + (B + A q)' p' = load(u),
+
+which is exact enough for an error of which neither place nor size is known.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from livepde.fem import Inputs, Moment, On, dot, grad
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.linalg import Array
+from livepde.model import Model
+from livepde.stepping import ForwardStage
+
+__all__ = ["FULL", "SMALL", "Course", "ErrorColumns", "hats"]
+
+MOST_WORK = 1e8  # coefficients of answers that a pass may compute
+MOST_UNKNOWNS = 4  # that may jump or drift
+STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
+PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
+NARROW = 0.03  # of the length: a contact
+
+Load: TypeAlias = Callable[["Now"], Array]
+Weight: TypeAlias = Callable[[float], Array]
+
+
+class Now(NamedTuple):
+    """State, latent unknowns, time and inputs, and the change of the inputs in a unit of time."""
+
+    u: Array
+    q: Array
+    moment: Moment
+    rates: dict[str, float]
+
+
+class Answer(NamedTuple):
+    """A shape of error of the process, with columns that differ by their course in time.
+
+    Attributes
+    ----------
+    kind, subject
+        What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
+        "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
+    mode
+        Number of its shape in space.
+    load, lift, start
+        Its load, its boundary values, and its value at the start, (n,); None for zero.
+    """
+
+    kind: str
+    subject: str = ""
+    mode: int = 0
+    load: Load | Array | None = None
+    lift: Load | Array | None = None
+    start: Array | None = None
+
+
+class Course(NamedTuple):
+    """Courses in time of an answer: number of columns, and their values at a share of the run."""
+
+    size: int
+    at: Callable[[float], Array]
+
+
+def hats(count: int) -> Course:
+    """Return hat functions on the run."""
+    nodes = np.arange(count) / (count - 1)
+    return Course(count, lambda s: np.maximum(1.0 - np.abs(s - nodes) * (count - 1), 0.0))
+
+
+ALWAYS = Course(1, lambda s: np.ones(1))
+SWITCHED = Course(1 + len(STARTS), lambda s: np.array([1.0, *(float(s > one) for one in STARTS)]))
+CHANGES = Course(1 + len(STARTS), lambda s: np.array([s, *(float(s > one) for one in STARTS)]))
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """How many shapes in space and time the families have."""
+
+    source: tuple[int, int]
+    conductivity: tuple[int, int]
+    flow: tuple[int, int]
+    noise: int
+
+
+FULL = _Numbers((6, 17), (5, 9), (3, 9), 17)
+SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
+
+
+class ErrorColumns:
+    """Errors that a model and its sensors can have.
+
+    Parameters
+    ----------
+    samples
+        The samples, which tell the length of the run.
+    numbers
+        How many shapes the families have.
+    """
+
+    def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
+        self.samples, self.numbers = samples, numbers
+        problem = samples.filter.problem
+        self.model, self.observed = problem.model, problem.observed
+        vertices = np.asarray(self.model.mesh.p)
+        self.low, self.high = vertices.min(axis=1), vertices.max(axis=1)
+        self.answers: list[tuple[Answer, Course]] = [*self._sources(), *self._initial()]
+        self.answers += [*self._boundaries(), *self._unknowns()]
+        if self._scalar:
+            self.answers += [*self._operators(), *self._fluxes()]
+
+    @property
+    def _scalar(self) -> bool:
+        model = self.model
+        if not model.state_space.single or len(model.algebraic):
+            return False
+        return not next(iter(model.state_space.fields.values())).vector
+
+    @property
+    def count(self) -> int:
+        """Number of columns of the process."""
+        return sum(course.size for _, course in self.answers)
+
+    def _mode(self, number: int) -> Callable[[Any], Any]:
+        """Return a product of cosines over the box of the domain, the smoothest first."""
+        dim = len(self.low)
+        some = itertools.product(range(number + 1), repeat=dim)
+        powers = sorted(some, key=lambda one: (sum(one), [-part for part in one]))[number]
+        low, span = self.low, self.high - self.low
+
+        def shape(x: Any) -> Any:
+            found = 1.0
+            for axis, power in enumerate(powers):
+                found = found * np.cos(power * np.pi * (x[axis] - low[axis]) / span[axis])
+            return found
+
+        return shape
+
+    def _sources(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over sources: of a family, and switched on at some time."""
+        model, (modes, times) = self.model, self.numbers.source
+        for name, block in model.state_space.fields.items():
+            if block.vector:
+                continue
+            for k in range(modes):
+                u = model.state_space.interpolate({name: self._mode(k)})
+                load = np.asarray(model.mass @ (u - model.state_space.prior))
+                yield Answer("source", name, k, load), hats(times)
+                if k == 0:
+                    yield Answer("switched", name, 0, load), SWITCHED
+
+    def _initial(self) -> Iterator[tuple[Answer, Course]]:
+        free = self.model.X.free
+        for name, block in self.model.state_space.fields.items():
+            if block.vector:
+                continue
+            for k in range(2):
+                u = self.model.state_space.interpolate({name: self._mode(k)})
+                yield Answer("initial", name, k, start=u * free), ALWAYS
+
+    def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over boundary values and channels that are off, and late."""
+        model = self.model
+        zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
+        rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
+        for name in model.channels:
+            moved = Moment(0.0, Inputs({**known, name: 1.0}))
+            lift = model.impose(zero, moved) - rest
+            if lift.any():
+                fixed &= lift == 0.0
+                yield Answer("boundary", name, lift=lift), ALWAYS
+                yield Answer("late boundary", name, lift=_late(lift, name)), ALWAYS
+            else:
+                yield Answer("channel", name, load=_scaled(model, name)), ALWAYS
+        if fixed.any():
+            yield Answer("boundary", "the fixed boundary", lift=fixed.astype(float)), ALWAYS
+
+    def _fluxes(self) -> Iterator[tuple[Answer, Course]]:
+        model = self.model
+        ones = model.state_space.interpolate(1.0)
+        for name in [str(one) for one in model.mesh.boundaries or {}]:
+            form: Any = On(name, lambda u, v, x: u * v)
+            load = model.bilinear(form) @ ones
+            if not load[model.X.free == 0.0].any() and load.any():
+                yield Answer("flux", name, load=load), ALWAYS
+
+    def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over unknowns that drift or jump during the run."""
+        reduction = self.samples.filter.reduction
+        for label, place in reduction.stay[:MOST_UNKNOWNS]:
+            load = _changed(self.model, reduction.Phi[:, place])
+            yield Answer("unknown", label, load=load), CHANGES
+
+    def _operators(self) -> Iterator[tuple[Answer, Course]]:
+        """Iterate over flows, losses, and conductivities that vary in space and with the state."""
+        model, (modes, times) = self.model, self.numbers.conductivity
+        low, span = float(self.low[0]), float(self.high[0] - self.low[0])
+
+        def stiffness(shape: Callable[[Any], Any]) -> Any:
+            return model.bilinear(lambda u, v, x: shape(x) * dot(grad(u), grad(v)))
+
+        for k in range(1, 1 + modes):
+            load = _minus(stiffness(self._mode(k)))
+            yield Answer("conductivity", "", k, load), hats(times)
+        plain = stiffness(self._mode(0))
+        yield Answer("state", load=lambda now: -0.5 * (plain @ (now.u - now.u.mean()) ** 2)), ALWAYS
+        half = stiffness(lambda x: np.asarray((x[0] - low) / span > 0.5, dtype=float))
+        yield Answer("layer", load=_minus(half)), ALWAYS
+        wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
+        for k, place in enumerate(PLACES):
+            matrix = stiffness(_band(low + place * span, wide * span))
+            yield Answer("contact", "", k, _minus(matrix)), ALWAYS
+        modes, times = self.numbers.flow
+        axes = len(self.low)
+        for k in range(max(modes, axes)):
+            axis = k % axes
+            matrix = self._flow(axis, self._mode(k // axes))
+            yield Answer("flow", "", k, _minus(matrix)), hats(times)
+            if k < axes:
+                yield Answer("steady flow", "xyz"[axis], k, _minus(matrix)), ALWAYS
+        mass = model.mass
+        yield Answer("loss", load=lambda now: -(mass @ (now.u - now.u.mean()))), SWITCHED
+
+    def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
+        return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
+
+    def followed(self, one: Passed) -> tuple[Array, list[Array], Array]:
+        """Return the readings of all answers, states at samples, and predicted readings.
+
+        Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
+
+        Parameters
+        ----------
+        one
+            The trajectory about which they are linear.
+        """
+        samples, model = self.samples, self.model
+        stage, free = ForwardStage(model), model.X.free
+        spans = samples.spans
+        steps = max(len(spans), 1)
+        stride = math.ceil(steps * self.count * model.X.dim / MOST_WORK)
+        begin, end = float(spans[0].start), float(spans[-1].t1)
+        p = self._start()
+        found = np.full((len(spans), self.observed.size, self.count), np.nan)
+        states: list[Array] = []
+        predicted = np.empty(found.shape[:2])
+        last = begin
+        for number, (x, span) in enumerate(zip(samples.along(one), spans, strict=True)):
+            states.append(x.u[0])
+            predicted[number] = samples.filter.sensors.observe(x, span.end)[0][0]
+            t, q = float(span.t1), x.q[0]
+            due = (number + 1) % stride == 0 or number + 1 == len(spans) or number == 0
+            if due:
+                moment = span.end.member(0)
+                now = Now(x.u[0], q, moment, _rates(span))
+                if t > last:
+                    share = (0.5 * (t + last) - begin) / (end - begin)
+                    p = self._advanced(stage, p, now, t - last, share, free)
+                    last = t
+                H, _ = self.observed.jacobian(now.u, model.latent.value(q), moment)
+                found[number] = np.asarray(H @ p.T)
+        times = np.array([float(span.t1) for span in spans])
+        return _filled(found, times), states, predicted
+
+    def _start(self) -> Array:
+        p = np.zeros((self.count, self.model.X.dim))
+        for column, (answer, _) in zip(self.first, self.answers, strict=True):
+            if answer.start is not None:
+                p[column] = answer.start
+        return p
+
+    @cached_property
+    def first(self) -> list[int]:
+        """Number of the first column of each answer."""
+        ends = itertools.accumulate((course.size for _, course in self.answers), initial=0)
+        return list(ends)[:-1]
+
+    def _advanced(
+        self, stage: ForwardStage, p: Array, now: Now, h: float, share: float, free: Array
+    ) -> Array:
+        """Return the answers a time h later, shape (columns, n)."""
+        factor, rows = stage.linearised(now.u, now.q, h, now.moment)
+        known = np.asarray((self.model.mass @ p.T).T) / h
+        lifts = np.zeros_like(p)
+        for first, (answer, course) in zip(self.first, self.answers, strict=True):
+            own, weights = slice(first, first + course.size), course.at(share)[:, None]
+            if answer.load is not None:
+                load = answer.load(now) if callable(answer.load) else answer.load
+                known[own] += weights * load
+            if answer.lift is not None:
+                lift = answer.lift(now) if callable(answer.lift) else answer.lift
+                lifts[own] = weights * lift
+        if lifts.any():
+            known -= np.asarray((rows @ lifts.T).T)
+        solved: Array = factor.solve((known * free).T).T
+        return solved * free + lifts
+
+
+def _band(place: float, wide: float) -> Callable[[Any], Any]:
+    """Return a hat function of the first coordinate."""
+    return lambda x: np.maximum(1.0 - np.abs(x[0] - place) / wide, 0.0)
+
+
+def _minus(matrix: Any) -> Load:
+    return lambda now: -(matrix @ now.u)
+
+
+def _late(lift: Array, name: str) -> Load:
+    return lambda now: -now.rates.get(name, 0.0) * lift
+
+
+def _residual(model: Model, u: Array, q: Array, moment: Moment) -> Array:
+    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
+    found: Array = model.F(moment) - model.B(u, moment) - driven
+    return found
+
+
+def _scaled(model: Model, name: str) -> Load:
+    """Return the change of the load with a channel that is larger by its own size."""
+
+    def load(now: Now) -> Array:
+        inputs = now.moment.inputs
+        more = Moment(now.moment.t, Inputs({**inputs, name: 1.001 * inputs[name]}))
+        return 1e3 * (
+            _residual(model, now.u, now.q, more) - _residual(model, now.u, now.q, now.moment)
+        )
+
+    return load
+
+
+def _changed(model: Model, direction: Array) -> Load:
+    """Return the derivative of the load by a latent unknown."""
+
+    def load(now: Now) -> Array:
+        more, less = now.q + 0.01 * direction, now.q - 0.01 * direction
+        up, down = (_residual(model, now.u, q, now.moment) for q in (more, less))
+        return 50.0 * (up - down)
+
+    return load
+
+
+def _rates(span: Any) -> dict[str, float]:
+    """Return the change of each input in a unit of time over an interval."""
+    h = float(span.t1 - span.start)
+    if not h > 0.0:
+        return {}
+    change = np.broadcast_to((span.inputs1 - span.inputs0) / h, (1, len(span.channels)))[0]
+    return dict(zip(span.channels, change.tolist(), strict=True))
+
+
+def _filled(values: Array, times: Array) -> Array:
+    """Return values along axis 0 with straight lines where they are NaN."""
+    known = np.isfinite(values[:, 0, 0]) if values.size else np.ones(len(values), dtype=bool)
+    if known.all():
+        return values
+    flat = values.reshape(len(values), -1)
+    places = np.interp(times, times[known], np.arange(known.sum()))
+    low = np.floor(places).astype(int)
+    high = np.minimum(low + 1, known.sum() - 1)
+    share = (places - low)[:, None]
+    some = flat[known]
+    found: Array = (1.0 - share) * some[low] + share * some[high]
+    return found.reshape(values.shape)

@@ -1,0 +1,293 @@
+"""Intervals of the unknowns that allow for errors of the model, from the stored samples.
+
+What errors would do to the readings makes the columns of a linear model: those of the process are
+answers to it (`livepde.laws.error_columns`), those of sensors are added here. Single causes have
+one column each, families many, with an amplitude for each shape in space and course in time. See
+`livepde.verdict.averaged` for the average over them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import TypeAlias
+
+import numpy as np
+
+from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
+from livepde.laws.refit import plausible
+from livepde.laws.refit_options import Refit
+from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
+from livepde.observation import Points
+from livepde.verdict.averaged import Causes, Family, LinearModel, Mixture, averaged
+from livepde.verdict.directions import sensor_shifts
+from livepde.verdict.model_errors import Allowed, ModelErrors
+
+__all__ = ["linear_model", "model_errors"]
+
+MOST_COLUMNS = 250  # of the process in the full list
+MOST_WORK = 1e8  # coefficients of answers that a pass may compute with the full list
+MOST_SENSORS = 12  # with slow noise of their own
+CAUSE_SIZES = (1.0, 4.0, 16.0, 64.0, 256.0)  # standard deviations of the noise
+FAMILY_SIZES = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+JOINT_SIZES = (1.0, 10.0, 100.0)
+JOINT = (("source", "conductivity"), ("source", "sensors"), ("source", "sensors", "conductivity"))
+BESIDE_SIZES = (4.0, 64.0)  # of a family beside a single cause
+BESIDE = (("source",), ("common",), ("sensors",))
+TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the length of the run
+MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
+FARTHEST = 0.1  # the same of its place, over the length of the domain
+FEWEST = 20  # readings
+QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
+SHRINK = 10.0  # pairs of readings that the stated noise counts
+LEAST_LEVEL = 0.01  # least variance of the noise over the stated one that is believed
+
+
+def _sensor_columns(
+    samples: StoredSamples, predicted: Array, states: Sequence[Array]
+) -> Iterator[tuple[Array, float]]:
+    """Iterate over errors of single sensors, and of all: effect on readings, largest size.
+
+    Effects have shape (samples, sensors), in the unit of the readings. The largest size is a
+    standard deviation of the amplitude that is plausible.
+    """
+    times = np.array([float(span.t1) for span in samples.spans])
+    share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
+    count, sensors = predicted.shape
+    rate = np.gradient(predicted, times, axis=0) if count > 1 else np.zeros_like(predicted)
+    change = predicted - predicted[0]
+    problem = samples.filter.problem
+    each = [
+        (np.ones_like(predicted), math.inf),
+        (np.broadcast_to(share[:, None], predicted.shape), math.inf),
+        (change, MOST_GAIN),
+        (-rate, math.inf),
+    ]
+    common = [(change, MOST_GAIN), (-rate, math.inf)]
+    observation = problem.observed.observation
+    shifts, step = sensor_shifts(problem.model, problem.observed)
+    for axis, matrix in enumerate(shifts if isinstance(observation, Points) else ()):
+        slope = np.array([matrix @ u for u in states]) / step
+        vertices = np.asarray(problem.model.mesh.p)[axis]
+        length = float(np.ptp(vertices))
+        each.append((slope, FARTHEST * length))
+        depth = observation.positions[:, axis] - float(vertices.min())  # type: ignore[attr-defined]
+        common.append((slope * depth, FARTHEST))
+    for effect, most in each:
+        for k in range(sensors):
+            own = np.zeros_like(predicted)
+            own[:, k] = effect[:, k]
+            yield own, most
+    for effect, most in common:
+        yield effect, most
+
+
+def _slow_noise(times: Array, sensors: int, count: int) -> tuple[Array, Array]:
+    """Return slow noise common to all sensors, and of each, (samples, sensors, columns)."""
+    share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
+    each = np.array([hats(count).at(s) for s in share.tolist()])
+    together = np.repeat(each[:, None, :], sensors, axis=1)
+    own = np.einsum("tc,sk->tskc", each, np.eye(sensors)).reshape(len(times), sensors, -1)
+    return together, own
+
+
+def _root(modes: Array, count: int, time: float) -> Array:
+    """Return a square root of the covariance of amplitudes of hat functions in time.
+
+    For each mode in space, with variance 1/(1 + mode)^2, an Ornstein-Uhlenbeck process, or a
+    constant.
+    """
+    nodes = np.arange(count) / max(count - 1, 1)
+    each = np.ones((count, count))
+    if not math.isinf(time):
+        each = np.exp(-np.abs(nodes[:, None] - nodes) / time)
+    sizes, axes = np.linalg.eigh(each)
+    one = axes * np.sqrt(np.maximum(sizes, 0.0))
+    found: Array = np.kron(np.diag(1.0 / (1.0 + modes)), one)
+    return found
+
+
+Roots: TypeAlias = Callable[[float], Array]
+
+
+def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
+    """Iterate over random errors: each kind, and several at once."""
+    groups: list[tuple[tuple[str, ...], tuple[float, ...]]]
+    groups = [((name,), FAMILY_SIZES) for name in known]
+    groups += [(names, JOINT_SIZES) for names in JOINT if set(names) <= set(known)]
+    for names, sizes in groups:
+        beside = BESIDE_SIZES if names in BESIDE else ()
+        for time in TIMES:
+            parts = tuple((known[name][0], known[name][1](time)) for name in names)
+            yield Family(parts, sizes, beside)
+
+
+@nonfinite_allowed()  # a hypothesis that overflows has no evidence
+def model_errors(
+    samples: StoredSamples, options: Refit, std: Array, shift: Array
+) -> ModelErrors | str:
+    """Return misfit and intervals that allow for errors of the model, or why there are none.
+
+    Parameters
+    ----------
+    std, shift
+        Reported standard deviations of the latent unknowns, and their shifts by the discretisation,
+        (m,).
+    """
+    one = samples.about(samples.reached)
+    if one is None:
+        return "a step of the model fails at the best fit"
+    used = plausible(samples, options, one) & np.isfinite(one.residuals)
+    if used.sum() < FEWEST:
+        return f"fewer than {FEWEST} readings are in use"
+    start, reduction = samples.state.start, samples.filter.reduction
+    T = reduction.Phi @ start.C[0].T
+    model, causes, families = linear_model(samples, one, used, T)
+    mixture = averaged(model, causes, families).widened(shift)
+    level = _level(one.residuals, used)
+    variance = model.asked[1] + shift**2
+    return ModelErrors(
+        misfit=_rms(one.residuals[used]) / level,
+        of_signal=_of_signal(samples.readings, one.residuals, used),
+        sensors={
+            name: _rms(column[there]) / level
+            for name, column, there in zip(
+                samples.filter.problem.observed.names, one.residuals.T, used.T, strict=True
+            )
+            if there.any()
+        },
+        unknowns=tuple(_allowed(samples, mixture, variance, std)),
+    )
+
+
+def _rms(values: Array) -> float:
+    return math.sqrt(float((values**2).mean()))
+
+
+def _of_signal(readings: Array, residuals: Array, used: Mask) -> float:
+    """Return the misfit over the scatter of the readings of each sensor about their mean."""
+    about = [column[there] - column[there].mean() for column, there in _columns(readings, used)]
+    signal = _rms(np.concatenate(about))
+    return _rms(residuals[used]) / signal if signal > 0.0 else math.inf
+
+
+def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
+    """Iterate over the sensors that have readings in use."""
+    for column, there in zip(values.T, used.T, strict=True):
+        if there.any():
+            yield column, there
+
+
+def _allowed(
+    samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
+) -> Iterator[Allowed]:
+    """Iterate over the unknowns with their intervals.
+
+    Parameters
+    ----------
+    variance, std
+        Variance that the noise alone leaves of the latent unknowns, and their reported standard
+        deviations, (m,).
+    """
+    problem, reduction = samples.filter.problem, samples.filter.reduction
+    latent, base = problem.model.latent, samples.state.start.q[0]
+    own = set(problem.observed.observation.unknowns)
+    low, high = mixture.interval
+    known = samples.filter.estimate(samples.state.now)[0]
+    both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
+    value, low_end, high_end, plain_low, plain_high = (
+        latent.value(reduction.bounded(one)) for one in both
+    )
+    # The plain interval is wider where innovations follow each other: it is a part of this one.
+    ends = np.minimum(low_end, plain_low), np.maximum(high_end, plain_high), plain_low, plain_high
+    narrow = 2.0 * QUANTILE * np.sqrt(variance)
+    wider = (high - low) / np.where(narrow > 0.0, narrow, np.inf)
+    for name, item in latent.parts.items():
+        part = slice(item.part.start, item.part.start + item.size)
+        labels = item.block.labels(name)
+        unit = item.unknown.unit
+        if len(labels) == item.size:
+            rows = zip(labels, range(part.start, part.stop), strict=True)
+            for label, k in rows:
+                numbers = [float(value[k]), *(float(end[k]) for end in ends), float(wider[k])]
+                yield Allowed.of(label, unit, numbers, of_sensor=name in own)
+            continue
+        size = float(np.sqrt((value[part] ** 2).mean()))
+        off = [float(np.sqrt(((end[part] - value[part]) ** 2).mean())) for end in ends]
+        numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
+        numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
+        yield Allowed.of(name, unit, numbers, of_sensor=name in own)
+
+
+def linear_model(
+    samples: StoredSamples, one: Passed, used: Mask, T: Array
+) -> tuple[LinearModel, Causes, list[Family]]:
+    """Return the readings in use as a linear model, and what may be wrong.
+
+    Parameters
+    ----------
+    one, used
+        The best fit, and the readings that it uses.
+    T
+        What is asked for, as rows on the coordinates xi, (numbers, r).
+    """
+    work = len(samples.spans) * samples.filter.problem.model.X.dim
+    numbers = FULL if work * MOST_COLUMNS < MOST_WORK else SMALL
+    errors = ErrorColumns(samples, numbers)
+    answers, states, predicted = errors.followed(one)
+    noise = samples.noise
+    level = _level(one.residuals, used)
+    parts: list[Array] = []
+    causes: list[tuple[int, float]] = []
+    families: dict[str, tuple[IntArray, Roots]] = {}
+    place = 0
+
+    def add(columns: Array) -> IntArray:
+        nonlocal place
+        flat = (columns / (level * noise[:, :, None]))[used]
+        parts.append(flat)
+        place += flat.shape[1]
+        return np.arange(place - flat.shape[1], place)
+
+    own = add(answers)
+    family: dict[str, list[tuple[int, IntArray, int]]] = {}
+    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
+        columns = own[first : first + course.size]
+        if answer.kind in ("source", "conductivity", "flow"):
+            family.setdefault(answer.kind, []).append((answer.mode, columns, course.size))
+            continue
+        causes += [(column, math.inf) for column in columns.tolist()]
+    for kind, members in family.items():
+        modes = np.array([mode for mode, _, _ in members], dtype=float)
+        modes -= modes.min()
+        count = members[0][2]
+        columns = np.concatenate([one for _, one, _ in members])
+        families[kind] = (columns, partial(_root, modes, count))
+    for effect, largest in _sensor_columns(samples, predicted, states):
+        causes.append((int(add(effect[:, :, None])[0]), largest))
+    times = np.array([float(span.t1) for span in samples.spans])
+    sensors = predicted.shape[1]
+    together, apart = _slow_noise(times, sensors, numbers.noise)
+    families["common"] = (add(together), partial(_root, np.zeros(1), numbers.noise))
+    if 1 < sensors <= MOST_SENSORS:
+        families["sensors"] = (add(apart), partial(_root, np.zeros(sensors), numbers.noise))
+    J = (one.slopes / level)[used]
+    z = (one.residuals / level)[used] + J @ one.xi
+    Z = np.concatenate(parts, axis=1)
+    columns = np.array([column for column, _ in causes])
+    most = np.array([largest for _, largest in causes])
+    single = Causes(columns, most, CAUSE_SIZES)
+    return LinearModel(J=J, Z=Z, z=z, T=T), single, list(_families(families))
+
+
+def _level(residuals: Array, used: Mask) -> float:
+    """Return the noise that successive residuals show, over the noise that is stated."""
+    found = []
+    for k, column in enumerate(residuals.T):
+        r = column[used[:, k]]
+        if len(r) > 1:
+            pairs = len(r) - 1
+            found.append((0.5 * float((np.diff(r) ** 2).sum()) + SHRINK) / (pairs + SHRINK))
+    return math.sqrt(max(float(np.median(found)), LEAST_LEVEL)) if found else 1.0

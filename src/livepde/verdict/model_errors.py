@@ -1,0 +1,198 @@
+"""How far a model is from the data, and by how much its errors may have moved the unknowns."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal, TypeAlias
+
+__all__ = ["FAILED", "OF_SIGNAL", "Allowed", "ModelErrors", "Rank"]
+
+Rank: TypeAlias = Literal["trusted", "caution", "do not trust"]
+
+FAILED = 5.0  # misfit over noise, and ...
+OF_SIGNAL = 0.1  # ... misfit over signal from which a fit has failed
+HARMLESS = 0.02  # relative effect of an error that the data show, but that does no harm
+USELESS = 0.5  # relative effect from which an interval is too wide to use
+HIDDEN = 0.1  # relative effect of errors that the data do not show
+WIDER = 2.0  # width over that of the noise alone from which such effects count
+DIFFERENT = 1.1  # the same from which the interval is shown
+MOST = 3  # unknowns in a sentence
+
+
+@dataclass(frozen=True)
+class Allowed:
+    """An unknown with an interval that allows for errors of the model.
+
+    Attributes
+    ----------
+    label, unit
+        The unknown; of a field the root mean square over the domain.
+    value
+        The estimate.
+    low, high
+        The 95 % interval that allows for errors of the model.
+    plain_low, plain_high
+        The 95 % interval if the model is exact.
+    wider
+        Width over that of the noise alone.
+    of_sensor
+        Whether it belongs to a sensor, as an offset does.
+    """
+
+    label: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    plain_low: float
+    plain_high: float
+    wider: float
+    of_sensor: bool = False
+
+    @classmethod
+    def of(cls, label: str, unit: str, numbers: Iterable[float], *, of_sensor: bool) -> Allowed:
+        """Return an unknown with its numbers in the order of the attributes."""
+        names = ("value", "low", "high", "plain_low", "plain_high", "wider")
+        return cls(label, unit, **dict(zip(names, numbers, strict=True)), of_sensor=of_sensor)
+
+    @property
+    def effect(self) -> float:
+        """By how much the value may be off, relative to it."""
+        off = max(abs(self.low - self.value), abs(self.high - self.value))
+        size = max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
+        return off / size if size > 0.0 else math.inf
+
+    def about(self, value: float, plain_low: float, plain_high: float) -> Allowed:
+        """Return a later estimate with an interval that is as much wider than the plain one."""
+
+        def end(wide: float, plain: float, now: float) -> float:
+            away = plain - self.value
+            return value + (wide - self.value) * ((now - value) / away if away else 1.0)
+
+        low = end(self.low, self.plain_low, plain_low)
+        high = end(self.high, self.plain_high, plain_high)
+        plain = replace(self, plain_low=plain_low, plain_high=plain_high)
+        return replace(plain, value=value, low=low, high=high)
+
+    @property
+    def text(self) -> str:
+        """The unknown with its interval, and its effect in per cent."""
+        unit = f" {self.unit}" if self.unit else ""
+        off = f"up to {self.effect:.2g} times its size off"
+        if self.effect < 1.0:
+            off = f"up to {100.0 * self.effect:.2g} % off"
+        return f"{self.label} between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
+
+
+@dataclass(frozen=True)
+class ModelErrors:
+    """Misfit of a model, and intervals of its unknowns that allow for its errors.
+
+    Attributes
+    ----------
+    misfit
+        Root mean square of what the best fit leaves of the readings, over the noise that
+        successive readings show.
+    of_signal
+        The same over the standard deviation of the readings in time.
+    sensors
+        Sensor -> its own misfit over noise.
+    unknowns
+        The unknowns, those of sensors as well.
+    """
+
+    misfit: float
+    of_signal: float
+    sensors: Mapping[str, float] = field(default_factory=dict)
+    unknowns: tuple[Allowed, ...] = ()
+
+    @property
+    def failed(self) -> bool:
+        """Whether the model misses the readings grossly."""
+        return self.misfit > FAILED and self.of_signal > OF_SIGNAL
+
+    @property
+    def asked(self) -> list[Allowed]:
+        """Unknowns of the model, the one that may be off the most first."""
+        own = [one for one in self.unknowns if not one.of_sensor]
+        return sorted(own, key=lambda one: -one.effect)
+
+    @property
+    def differ(self) -> bool:
+        """Whether an interval differs from the plain one by more than a tenth of its width."""
+
+        def far(one: Allowed) -> bool:
+            ends = (one.low - one.plain_low, one.high - one.plain_high)
+            width = one.plain_high - one.plain_low
+            return max(map(abs, ends)) > (DIFFERENT - 1.0) * width
+
+        return any(map(far, self.unknowns))
+
+    def __getitem__(self, label: str) -> Allowed:
+        """Return the unknown with a label."""
+        return next(one for one in self.unknowns if one.label == label)
+
+    @property
+    def effect(self) -> float:
+        """Largest relative effect on an unknown of the model; 0 without."""
+        return max((one.effect for one in self.asked), default=0.0)
+
+    def about(self, now: Mapping[str, tuple[float, float, float]]) -> ModelErrors:
+        """Return the same for later estimates: label -> value, and ends of the plain interval."""
+        moved = [one.about(*now[one.label]) if one.label in now else one for one in self.unknowns]
+        return replace(self, unknowns=tuple(moved))
+
+    def level(self, *, doubted: bool) -> Rank:
+        """Return the level of a run.
+
+        Parameters
+        ----------
+        doubted
+            Whether a test speaks against the model.
+        """
+        if self.failed:
+            return "do not trust"
+        wide = [one.effect for one in self.asked if one.wider > WIDER]
+        if not doubted:
+            return "caution" if max(wide, default=0.0) > HIDDEN else "trusted"
+        if max(wide, default=0.0) > USELESS:
+            return "do not trust"
+        return "trusted" if self.effect <= HARMLESS else "caution"
+
+    def sentence(self, *, doubted: bool) -> str:
+        """Return fit and effect in words."""
+        fit = (
+            f"What is left of the readings is {self.misfit:.2g} times their noise, and "
+            f"{self.of_signal:.1%} of the signal."
+        )
+        if self.failed:
+            return f"The fit failed. {fit}"
+        # Of many unknowns those are said that may be off the most.
+        some = [one.text for one in self.asked[:MOST]]
+        more = f"; {len(self.asked) - MOST} more are in the table" if len(self.asked) > MOST else ""
+        why = "Errors of the model" if doubted else "Errors of the model that the data do not show"
+        return f"{fit} {why} leave {', '.join(some)}{more}." if some else fit
+
+    @property
+    def remedy(self) -> str:
+        """What to do with such intervals."""
+        if self.failed:
+            return "Do not use the estimates: find what is wrong with the model or the data."
+        if self.effect > USELESS:
+            return "These intervals hold, but are too wide to use: find the error first."
+        return "Use these intervals instead of the plain ones."
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the value as JSON can hold it."""
+        own = {**asdict(self), "unknowns": [asdict(one) for one in self.unknowns]}
+        return {**own, "sensors": dict(self.sensors)}
+
+    @classmethod
+    def from_dict(cls, stored: Mapping[str, Any] | None) -> ModelErrors | None:
+        """Return the value that `to_dict` has written; None if there is none."""
+        if stored is None:
+            return None
+        unknowns: Iterable[Any] = stored["unknowns"]
+        return cls(**{**stored, "unknowns": tuple(Allowed(**one) for one in unknowns)})

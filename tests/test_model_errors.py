@@ -1,0 +1,314 @@
+"""Intervals that allow for errors of the model, and the level that follows from fit and effect."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+
+import livepde as lp
+from livepde.laws.error_columns import SMALL, ErrorColumns
+from livepde.laws.stored_samples import StoredSamples
+from livepde.verdict import Allowed, Cause, Finding, ModelErrors, Verdict
+from livepde.verdict.averaged import NU, TEMPER, Causes, Family, LinearModel, averaged
+
+# --- the average --------------------------------------------------------------------------------
+
+
+def dense(model: LinearModel, tried: list[tuple[Any, Any, float]]) -> tuple[Any, Any, Any]:
+    """Return log evidence, mean and deviation of each hypothesis with dense matrices.
+
+    A hypothesis is: columns, square root of the covariance of their amplitudes, and its prior mass.
+    """
+    n, logs, means, deviations = len(model.z), [], [], []
+    for columns, root, _ in tried:
+        B = np.hstack([model.J, model.Z[:, columns] @ root])
+        H = np.eye(B.shape[1]) + B.T @ B
+        squares = model.z @ np.linalg.solve(np.eye(n) + B @ B.T, model.z)
+        logs.append(-0.5 * (NU + n) * math.log(NU + squares) - 0.5 * np.linalg.slogdet(H)[1])
+        P = np.linalg.inv(H)
+        T = np.hstack([model.T, np.zeros((len(model.T), B.shape[1] - model.T.shape[1]))])
+        means.append(T @ P @ B.T @ model.z)
+        level = max(1.0, (NU + squares) / (NU + n))
+        deviations.append(np.sqrt(level * np.diag(T @ P @ T.T)))
+    return np.array(logs), np.array(means), np.array(deviations)
+
+
+@pytest.mark.parametrize("strength", [0.3, 30.0])
+def test_the_average_is_that_of_dense_normal_models(strength):
+    rng = np.random.default_rng(1)
+    n, p = 40, 3
+    J, Z = strength * rng.standard_normal((n, p)), rng.standard_normal((n, 9))
+    z = J @ rng.standard_normal(p) + strength * Z[:, 3] + rng.standard_normal(n)
+    model = LinearModel(J=J, Z=Z, z=z, T=rng.standard_normal((2, p)))
+    most = np.array([math.inf, 0.5, math.inf])
+    causes = Causes(np.array([0, 1, 2]), most, (1.0, 16.0))
+    first, second = np.arange(3, 6), np.arange(6, 9)
+    roots = rng.standard_normal((3, 2)), np.diag([1.0, 0.5, 0.2])
+    families = [
+        Family(((first, roots[0]),), (1.0, 10.0), (4.0,)),
+        Family(((first, roots[0]), (second, roots[1])), (3.0,)),
+    ]
+
+    def scaled(columns: Any, root: Any) -> Any:
+        return root / np.sqrt(((Z[:, columns] @ root) ** 2).sum() / n)
+
+    def cause(k: int, size: float) -> Any:
+        usual = np.sqrt((Z[:, k] ** 2).mean())
+        return np.array([[min(size / usual, most[k])]])
+
+    nothing = np.zeros(0, dtype=int)
+    single = [(np.array([k]), cause(k, size)) for size in (1.0, 16.0) for k in range(3)]
+    one = scaled(first, roots[0])
+    both = scipy.linalg.block_diag(one, scaled(second, roots[1])) / math.sqrt(2.0)
+    several = [(first, one), (first, 10.0 * one)]
+    several += [
+        (np.array([*first, k]), scipy.linalg.block_diag(4.0 * one, cause(k, 4.0))) for k in range(3)
+    ]
+    several.append((np.arange(3, 9), 3.0 * both))
+    tried = [(nothing, np.zeros((0, 0)), 0.5)]
+    tried += [(*item, 0.25 / len(single)) for item in single]
+    tried += [(*item, 0.25 / len(several)) for item in several]
+
+    logs, means, deviations = dense(model, tried)
+    prior = np.log([mass for *_, mass in tried])
+    excess = (logs + prior).max() - logs[0] - prior[0]
+    eta = 1.0 if excess <= TEMPER else TEMPER / excess
+    weights = np.exp(prior + eta * (logs - logs[0]))
+    found = averaged(model, causes, families)
+    assert found.weights == pytest.approx(weights / weights.sum(), rel=1e-6)
+    assert found.means == pytest.approx(means, rel=1e-8)
+    assert found.deviations == pytest.approx(deviations, rel=1e-8)
+    # Quantiles are those of the mixture.
+    for share in (0.025, 0.5, 0.975):
+        at = scipy.special.ndtr((found.quantile(share) - means) / deviations)
+        assert found.weights @ at == pytest.approx(share, abs=1e-9)
+
+
+# --- the answers of the process ------------------------------------------------------------------
+
+LENGTH, STEP, COUNT = 1.0, 0.02, 120
+
+
+PRIOR = lp.LogNormal(0.1, std=0.05)
+
+
+def rod(
+    prior: Any = PRIOR, source: float = 0.0, loss: float = 0.0, flow: float = 0.0, bent: float = 0.0
+) -> lp.Model:
+    mesh = lp.interval(0.0, LENGTH, 40)
+    ends = {"left": lp.Channel("left"), "right": lp.Channel("right")}
+    more: dict[str, Any] = {}
+    if source or loss or flow or bent:
+        more["B"] = lambda u, v, x: (
+            (loss * u - source) * v
+            + flow * lp.grad(u)[0] * v
+            + bent * np.cos(np.pi * x[0]) * lp.dot(lp.grad(u), lp.grad(v))
+        )
+    return lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh), dirichlet=ends),
+        prior,
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        **more,
+    )
+
+
+def ends(t: Any) -> dict[str, Any]:
+    return {"left": np.sin(5.0 * t), "right": 0.3 * np.sin(2.0 * t) ** 2}
+
+
+SENSORS = {"T_2": 0.2, "T_5": 0.5, "T_7": 0.7}
+TIMES = (STEP * np.arange(COUNT)).tolist()
+EULER = lp.ImplicitEuler()
+
+
+def readings(model: lp.Model, q: float = 0.12) -> Any:
+    """Return the readings without noise, (samples, sensors)."""
+    spaces = model.state_space, model.X, model.parameter_space
+    observed = lp.Points(SENSORS, noise=0.01).bind(*spaces)
+    control = lp.stepping.Advance(EULER)
+    parameter = np.array([q])
+    latent = np.log(parameter)
+    return np.array(
+        [
+            observed.predict(u, parameter, lp.fem.Moment(t, lp.fem.Inputs(ends(t))))
+            for t, u in lp.stepping.simulate(model, latent, 0.0, TIMES, control, ends)
+        ]
+    )
+
+
+def identified(z: Any) -> lp.Identifier:
+    """Return the identifier of a model without errors after some readings."""
+    sensors = lp.Points(SENSORS, noise=0.01)
+    found = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, scheme=EULER)
+    for t, row in zip(TIMES, z, strict=True):
+        found.step(t, row, ends(t))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("kind", "mode", "size"),
+    [
+        ("source", 0, {"source": 1.0}),
+        ("flow", 0, {"flow": 1e-6}),
+        ("conductivity", 1, {"bent": 1e-6}),
+    ],
+)
+def test_an_answer_is_the_change_of_the_readings_by_that_error(kind, mode, size):
+    identifier = identified(readings(rod()))
+    samples = StoredSamples.of(identifier._work, identifier._state)
+    one = samples.about(samples.reached)
+    assert one is not None
+    errors = ErrorColumns(samples, SMALL)
+    answers, _, predicted = errors.followed(one)
+    (x, *_) = samples.along(one)
+    q = float(identifier.model.latent.value(x.q[0])[0])
+    # The first steps of the law are shorter than those of `readings`.
+    assert predicted == pytest.approx(readings(rod(), q)[1:], abs=0.01)
+    # The hat functions of a family add up to one.
+    found = 0.0
+    for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
+        if (answer.kind, answer.mode) == (kind, mode):
+            columns = range(first, first + course.size)
+            found = found + sum(answers[:, :, k] for k in columns)
+    ((_, amplitude),) = size.items()
+    change = (readings(rod(**size), q) - readings(rod(), q)) / amplitude
+    scale = np.abs(change).max()
+    assert found == pytest.approx(change[1:], abs=0.02 * scale)
+
+
+# --- runs ----------------------------------------------------------------------------------------
+
+
+@cache
+def truth(seed: int, *wrong: tuple[str, float]) -> Any:
+    """Return readings of a finer model by another scheme, with noise."""
+    errors = dict(wrong)
+    cells = 200
+    x = (np.arange(cells) + 0.5) / cells
+    q, h = 0.12, STEP / 8
+    main = np.full(cells, -2.0)
+    main[[0, -1]] = -3.0
+    ones = np.ones(cells - 1)
+    L = q * cells**2 * scipy.sparse.diags_array([ones, main, ones], offsets=[-1, 0, 1])
+    L = L - errors.get("loss", 0.0) * scipy.sparse.eye_array(cells)
+    flow = errors.get("flow", 0.0) * cells / 2.0
+    L = L - flow * scipy.sparse.diags_array([-ones, ones], offsets=[-1, 1])
+    one = scipy.sparse.eye_array(cells)
+    solver = scipy.sparse.linalg.splu(scipy.sparse.csc_array(one - 0.5 * h * L))
+    right, u, shown = one + 0.5 * h * L, np.zeros(cells), [np.zeros(3)]
+    for k in range(8 * (COUNT - 1)):
+        t = h * (k + 0.5)
+        # Inputs are straight lines between readings, as the model takes them.
+        at = {name: np.interp(t, TIMES, [ends(s)[name] for s in TIMES]) for name in ends(0.0)}
+        b = np.full(cells, errors.get("source", 0.0))
+        b[0] += 2.0 * q * cells**2 * at["left"] + flow * 2.0 * at["left"]
+        b[-1] += 2.0 * q * cells**2 * at["right"] - flow * 2.0 * at["right"]
+        u = solver.solve(right @ u + h * b)
+        if (k + 1) % 8 == 0:
+            shown.append(np.interp(list(SENSORS.values()), x, u))
+    return np.array(shown) + 0.01 * np.random.default_rng(seed).standard_normal((COUNT, 3))
+
+
+def ended(z: Any) -> lp.Estimate:
+    sensors = lp.Points(SENSORS, noise=0.01)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
+    samples = [(t, row, ends(t)) for t, row in zip(TIMES, z, strict=True)]
+    return identifier.run(samples).last
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
+    verdict = ended(truth(seed)).verdict
+    assert verdict.level == "trusted"
+    assert verdict.errors is not None
+    assert verdict.errors.misfit == pytest.approx(1.0, abs=0.15)
+    (one,) = verdict.errors.unknowns
+    assert one.low < 0.12 < one.high
+    assert one.wider < 1.3
+
+
+@pytest.mark.parametrize("wrong", [("source", 0.06), ("loss", 0.5), ("flow", 0.15)])
+def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
+    verdict = ended(truth(3, wrong)).verdict
+    assert verdict.errors is not None
+    (one,) = verdict.errors.unknowns
+    assert one.low < 0.12 < one.high
+    assert verdict.level == "caution"
+    first = verdict.sentences[0]
+    assert "times their noise" in first
+    assert "interval" in first
+
+
+def test_readings_that_no_model_explains_are_not_trusted():
+    z = truth(1) + 0.3 * np.sin(9.0 * np.array(TIMES)[:, None] + np.array([0.0, 2.0, 4.0]))
+    verdict = ended(z).verdict
+    assert verdict.errors is not None
+    assert verdict.errors.failed
+    assert verdict.level == "do not trust"
+    assert verdict.sentences[0].startswith("The fit failed.")
+
+
+def test_an_unknown_that_moves_has_no_such_interval_and_the_run_says_so():
+    walk = lp.Scalar(PRIOR, evolution=lp.RandomWalk(0.01))
+    identifier = lp.Identifier(
+        rod(walk), lp.Points(SENSORS, noise=0.01), lp.SensitivityLaw(), u0=0.0
+    )
+    samples = [(t, row, ends(t)) for t, row in zip(TIMES, truth(1), strict=True)]
+    verdict = identifier.run(samples).last.verdict
+    assert verdict.errors is None
+    assert any("unknowns move" in text for text in verdict.untested)
+
+
+# --- levels --------------------------------------------------------------------------------------
+
+
+def errors(effect: float, wider: float, misfit: float = 1.0, of_signal: float = 0.01) -> Any:
+    one = Allowed("k", "W/m/K", 1.0, 1.0 - effect, 1.0 + effect, 0.999, 1.001, wider)
+    offset = Allowed("T.offset", "K", 0.0, -9.0, 9.0, -0.1, 0.1, 90.0, of_sensor=True)
+    return ModelErrors(misfit, of_signal, {"T": misfit}, (one, offset))
+
+
+@pytest.mark.parametrize(
+    ("of", "doubted", "level"),
+    [
+        (errors(0.3, 1.1), False, "trusted"),
+        (errors(0.05, 5.0), False, "trusted"),
+        (errors(0.2, 3.0), False, "caution"),
+        (errors(0.01, 9.0), True, "trusted"),
+        (errors(0.2, 9.0), True, "caution"),
+        (errors(0.8, 1.5), True, "caution"),
+        (errors(0.8, 9.0), True, "do not trust"),
+        (errors(0.01, 1.0, misfit=9.0), True, "trusted"),
+        (errors(0.01, 1.0, misfit=9.0, of_signal=0.4), True, "do not trust"),
+    ],
+)
+def test_the_level_follows_from_fit_and_effect(of, doubted, level):
+    cause = Cause("source", "", "a source is missing in the model", 0.8)
+    misfit = Finding(
+        "misfit", "do not trust", "The model does not explain the data.", causes=(cause,)
+    )
+    verdict = Verdict.of([misfit] if doubted else []).with_errors(of)
+    assert verdict.level == level
+    # Once more, after a file, and with more findings, it is the same.
+    again = Verdict.from_dict(json.loads(json.dumps(verdict.to_dict())))
+    assert again == verdict
+    assert verdict.with_errors(of) == verdict
+    more = again.with_findings([Finding("input", "note", "Channel a has gaps.")])
+    assert more.level == level
+    assert sum(finding.what == "effect" for finding in more.findings) == (level != "trusted")
+
+
+def test_other_findings_keep_their_severity():
+    held = Finding("held", "do not trust", "The unknowns were held.")
+    assert Verdict.of([held]).with_errors(errors(0.01, 1.0)).level == "do not trust"
+    unit = Cause("unit", "T", "the values of sensor T are in degF", 0.99)
+    gross = Finding(
+        "misfit", "do not trust", "The model does not explain the data.", causes=(unit,)
+    )
+    assert Verdict.of([gross]).with_errors(errors(0.01, 1.0)).level == "do not trust"
