@@ -203,11 +203,13 @@ def test_a_cause_that_no_setting_frees_says_so(tmp_path):
     prepared = cases.load(short_rod(tmp_path)).prepare()
     lag = Cause("lag", "T_10", "it is late", remedy="Check the clock.")
     there = Cause("flux", "right", "a flux is missing", size=1.0)  # the boundary has a value
-    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(lag, there))])
+    swapped = Cause("exchange", "T_10", "they are exchanged", remedy="Exchange the columns.")
+    causes = lag, there, swapped
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=causes)])
     once = with_settings(prepared, verdict)
-    for cause in once.findings[0].causes:
-        assert not cause.setting
-        assert cause.remedy.endswith(NO_SETTING)
+    remedies = [cause.remedy for cause in once.findings[0].causes]
+    assert not any(cause.setting for cause in once.findings[0].causes)
+    assert remedies == [f"Check the clock. {NO_SETTING}", NO_SETTING, "Exchange the columns."]
     assert with_settings(prepared, once) == once
 
 

@@ -491,7 +491,7 @@ def test_a_level_counts_once_two_looks_have_found_it(tmp_path):
         run._judge(Looked(level))
         run._judge(Looked("trusted"))  # a sample that is taken again is not looked at again
         found.append(run.health["verdict"])
-    assert found[1:] == ["trusted", "trusted", "trusted", "trusted", "caution"]
+    assert found == ["trusted"] * 5 + ["caution"]
     events = [e.message for e in run.journal.events if e.kind == "verdict"][told:]
     assert [text.partition(":")[0] for text in events] == ["trusted", "caution"]
     # Who goes on with the run knows of the last look: the next one is the second.

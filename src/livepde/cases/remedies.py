@@ -21,6 +21,8 @@ WIDE = 2.0  # prior standard deviation of what is freed, over the size that was 
 PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
 KEYS = {"offset": "offset", "gain": "gain", "position": "at_std"}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
+# Errors with a size that a fit could find.
+SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
 NO_SETTING = "No setting of this case frees it."
 
 
@@ -34,7 +36,8 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
         if settings := freed(prepared, cause):
             return replace(cause, setting="; ".join(settings))
         plain = cause.remedy.removesuffix(NO_SETTING).strip()
-        return replace(cause, setting="", remedy=f"{plain} {NO_SETTING}".strip())
+        more = f" {NO_SETTING}" if cause.kind in SIZED else ""
+        return replace(cause, setting="", remedy=f"{plain}{more}".strip())
 
     def settled(finding: Finding) -> Finding:
         return replace(finding, causes=tuple(map(named, finding.causes)))

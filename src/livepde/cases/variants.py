@@ -57,7 +57,10 @@ class Variant:
 
 @dataclass(frozen=True)
 class Interval:
-    """Last estimate of an unknown: value, standard deviation, ends of the 95 % interval, unit."""
+    """Last estimate of an unknown: value, standard deviation, ends of the 95 % interval, unit.
+
+    The interval allows for errors of the model where the verdict knows it.
+    """
 
     value: float
     std: float
@@ -87,8 +90,8 @@ class VariantRun:
     readings
         Sensor that it assimilates -> number of its readings.
     misfits
-        Sensor -> root mean square of its errors over the noise that successive errors show, one
-        step ahead, second half of the samples.
+        Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
+        one step ahead, second half of the samples.
     errors, withheld
         Assimilated and withheld sensor -> root mean square of its errors one step ahead, second
         half of the samples.
@@ -227,9 +230,13 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     """Return how a run ended, from its dataset."""
     channels = channel_errors(data)
     labels, fields = scalars(data), prepared.case.model.parameter_space.fields
-    estimates = {}
+    found = with_settings(prepared, verdict(data))
+    errors, estimates = found.errors, {}
+    allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
     for label in labels:
         low, high = (float(end[-1]) for end in interval_95(data, label))
+        if label in allowed:
+            low, high = allowed[label].low, allowed[label].high
         value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
         unit = str(data[label].attrs.get("units", ""))
         estimates[label] = Interval(value, std, low, high, unit)
@@ -237,10 +244,10 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     seen = np.isfinite(data["innovation"].values).sum(axis=0)
     return VariantRun(
         variant,
-        verdict=with_settings(prepared, verdict(data)).to_dict(),
+        verdict=found.to_dict(),
         log_evidence=float(data.attrs.get("log_evidence", math.nan)),
         readings=dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True)),
-        misfits=_misfits(data),
+        misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
         withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "withheld"},
         estimates=estimates,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
@@ -127,7 +127,9 @@ def _of_run(
     return opened.case_file(), [*opened.settings, *settings], data or opened.data_file
 
 
-def _all(run: Any, variants: Sequence[Variant], jobs: int, quiet: bool) -> list[VariantRun]:
+def _all(
+    run: Callable[[Variant], VariantRun], variants: Sequence[Variant], jobs: int, quiet: bool
+) -> list[VariantRun]:
     """Return how the runs of variants ended, in their order; each in a process of its own."""
     from livepde.progress import watched
 

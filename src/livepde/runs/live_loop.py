@@ -671,7 +671,10 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _judge(self, estimate: Estimate) -> None:
-        """Look at the verdict: another level counts once two looks in a row have found it."""
+        """Look at the verdict: another level counts once two looks in a row have found it.
+
+        The first one that is judged counts at once.
+        """
         if len(self.result) <= self._looked:  # samples that are taken again have been judged
             return
         verdict, self._looked = self._with_errors(estimate), len(self.result)
