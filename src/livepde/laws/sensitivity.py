@@ -53,7 +53,13 @@ from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.verdict import judge_of, judged, with_columns, with_fit
+from livepde.laws.verdict import (
+    judge_of,
+    judged,
+    with_columns,
+    with_discretisation,
+    with_fit,
+)
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import (
     Alexander2,
@@ -505,6 +511,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
         judge = with_fit(judged(work.filter, state.now, now), fit)
+        if self.verdict:
+            judge = with_discretisation(judge, work.filter.shadows)
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:

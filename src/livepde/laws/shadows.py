@@ -520,7 +520,7 @@ class ShadowSet:
     shadows
         One for each row of `ShadowState.u`.
     refused
-        Why the mesh has no shadow; empty if it has one, or none was asked for.
+        Why the mesh has no shadow; empty if it has one.
     """
 
     problem: Problem
@@ -541,17 +541,18 @@ class ShadowSet:
         moves: bool,
     ) -> ShadowSet:
         """Return the shadows of a filter with that implicit stage; `moves`: whether unknowns do."""
-        process, refused = MeanProcess(problem.control, stage, reduction, moves), ""
+        process = MeanProcess(problem.control, stage, reduction, moves)
+        refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
         found: list[Shadow] = []
         if options.step:
             found.append(StepShadow.of(process))
-        if options.mesh and not (refused := refusal(problem, options.largest)):
+        if not refused:
             # An identification must not fail because its mesh error cannot be estimated: a note
             # says so.
             try:
                 found.append(MeshShadow.of(process, problem))
             except LivepdeError as error:
-                refused = f"on the halved mesh: {error}"
+                refused = f"there is no halved mesh: {str(error).rstrip('.')}"
         if options.inputs and problem.model.channels:
             held, own = problem.control.held, problem.model.channels
             signs = {name: 1.0 if name in held.next else -1.0 for name in (*held.next, *held.last)}
@@ -562,6 +563,19 @@ class ShadowSet:
             if of_held.any():
                 found.append(HeldInputShadow(process, of_held))
         return cls(problem, reduction, rows, tuple(found), refused)
+
+    @property
+    def unfollowed(self) -> str:
+        """Which errors are not followed, why, and what to do instead; empty if none is left out."""
+        missing = []
+        if self.refused:
+            missing.append(
+                f"the error of the mesh ({self.refused}); compare with a run on more cells, "
+                "`mesh.cells`"
+            )
+        if "step" not in self.kinds:
+            missing.append("the error of the time step (step = false)")
+        return "; ".join(missing)
 
     @cached_property
     def counted(self) -> slice:

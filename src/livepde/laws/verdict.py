@@ -14,6 +14,7 @@ from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
+from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
     NOT_JUDGED,
@@ -28,7 +29,7 @@ from livepde.verdict import (
     too_few,
 )
 
-__all__ = ["judge_of", "judged", "with_columns", "with_fit"]
+__all__ = ["judge_of", "judged", "with_columns", "with_discretisation", "with_fit"]
 
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
@@ -117,6 +118,27 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
         remedy = "Look at these readings, state a larger noise, or open the gate."
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
     return (lambda: judge().with_findings(found)) if found else judge
+
+
+def with_discretisation(
+    judge: Callable[[], Verdict], shadows: ShadowSet | None
+) -> Callable[[], Verdict]:
+    """Return a verdict that names the errors of the discretisation which are not followed.
+
+    `shadows` are those of the filter; None: it follows no such error.
+    """
+    missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
+    if not missing:
+        return judge
+
+    def found() -> Verdict:
+        verdict = judge()
+        if not verdict.judged:
+            return verdict
+        more = Finding("untested", "note", f"Not tested: {missing}.", "discretisation")
+        return verdict.with_untested(missing).with_findings([more])
+
+    return found
 
 
 def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:
