@@ -228,7 +228,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             ),
         )
         if self.shadows is not None:
-            parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
+            parts = problem, reduction, filter_.sensors.rows, noise, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
         # Unknowns that move, or that may jump, follow a change of the process themselves.
@@ -267,6 +267,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             age=0.0 * one,
             rate=0.0 * one,
             innovations=Innovations.start(sensors),
+            parts=np.ones(1, dtype=np.int64),
             screened=Screened.start(sensors),
             level=one,
             samples=GUESS * one,
@@ -320,7 +321,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> SensitivityState:
         filter_, x, interval = work.filter, state.now, work.filter.problem.unread(interval)
         span = filter_.span(interval)
-        state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
+        state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool), x.parts))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not filter_.sensors.observe(x, span.end)[1].any():
             return state
@@ -512,7 +513,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
         judge = with_fit(judged(work.filter, state.now, now), fit)
         if self.verdict:
-            judge = with_discretisation(judge, work.filter.shadows)
+            judge = with_discretisation(judge, work.filter.shadows, state.now.shadows)
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(self, work: SensitivityWork, state: SensitivityState) -> Deferred:

@@ -14,7 +14,9 @@ from livepde.laws.input_noise import input_rank
 from livepde.laws.law import Fit, Problem
 from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
+from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import ShadowSet
+from livepde.laws.step_tolerance import ALLOWED
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
     NOT_JUDGED,
@@ -24,6 +26,7 @@ from livepde.verdict import (
     Finding,
     Judge,
     Position,
+    Severity,
     Verdict,
     assess,
     too_few,
@@ -31,6 +34,7 @@ from livepde.verdict import (
 
 __all__ = ["judge_of", "judged", "with_columns", "with_discretisation", "with_fit"]
 
+COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
 
@@ -121,24 +125,46 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
 
 
 def with_discretisation(
-    judge: Callable[[], Verdict], shadows: ShadowSet | None
+    judge: Callable[[], Verdict], shadows: ShadowSet | None, s: ShadowState
 ) -> Callable[[], Verdict]:
-    """Return a verdict that names the errors of the discretisation which are not followed.
+    """Return a verdict that names the errors of the discretisation which are not held.
 
-    `shadows` are those of the filter; None: it follows no such error.
+    Parameters
+    ----------
+    shadows
+        Those of the filter; None: it follows no such error.
+    s
+        Their state.
     """
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
-    if not missing:
+    coarse = 0 if shadows is None else int(s.coarse[0])
+    if not missing and not coarse:
         return judge
 
     def found() -> Verdict:
         verdict = judge()
-        if not verdict.judged:
+        if coarse and shadows is not None:
+            verdict = verdict.with_findings([_coarse(s, shadows.most)])
+        if not missing or not verdict.judged:
             return verdict
         more = Finding("untested", "note", f"Not tested: {missing}.", "discretisation")
         return verdict.with_untested(missing).with_findings([more])
 
     return found
+
+
+def _coarse(s: ShadowState, most: int) -> Finding:
+    """Return the finding of steps that would have to be shorter than is allowed."""
+    coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
+    text = (
+        f"{coarse} of {int(s.count[0])} steps have an error of up to {ALLOWED * worst:.2g} times "
+        f"the noise; {ALLOWED:g} is allowed. Their substeps were divided into {most} parts, which "
+        "is the limit."
+    )
+    remedy = "Take a smaller `steps.dt_max`, or allow more parts with `law.shadows.parts`."
+    # The shift by errors that are so large is estimated with few correct digits.
+    severity: Severity = "caution" if worst > COARSE else "note"
+    return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
 def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:
