@@ -204,11 +204,13 @@ class Filter:
         The process noise of the unknowns is independent from substep to substep. Where the division
         of the substeps is not chosen yet (`Span.parts`), the error of the time step decides.
         """
-        if span.parts is not None:
-            return self._by_parts(x, span, span.parts)
-        shadows, parts = self.shadows, x.parts
+        shadows, parts = self.shadows, x.parts if span.parts is None else span.parts
         if shadows is None:
             return self._by_parts(x, span, parts)
+        if span.parts is not None:
+            end, taken, failure = self._by_parts(x, span, parts)
+            kept = end if failure else changed(end, shadows=shadows.chosen(x, end))
+            return kept, taken, failure
         parts = shadows.first_parts(x)
         end, taken, failure = self._by_parts(x, span, parts)
         while failure is None:

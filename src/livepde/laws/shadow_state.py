@@ -57,8 +57,7 @@ class ShadowState:
     excess
         Error of the last step that the step shadow took, over what is allowed, shape (members,).
     coarse, coarsest
-        How many steps had a larger one though they were divided as often as is allowed, and the
-        largest `excess` of them, shapes (members,).
+        How many steps were left with a larger one, and the largest `excess` of them, (members,).
     """
 
     u: Array

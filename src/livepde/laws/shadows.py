@@ -735,7 +735,7 @@ class ShadowSet:
         """Return the shadows after a span whose division is chosen; `x` is the filter before it."""
         s = end.shadows
         coarse = (s.last == s.count) & (s.excess > 1.0)
-        if self.most == 1 or not np.count_nonzero(coarse):
+        if not np.count_nonzero(coarse):
             return s
         more, worst = coarse * (s.count - x.shadows.last), np.where(coarse, s.excess, 0.0)
         return changed(s, coarse=s.coarse + more, coarsest=np.maximum(s.coarsest, worst))

@@ -158,8 +158,7 @@ def _coarse(s: ShadowState, most: int) -> Finding:
     coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
     text = (
         f"{coarse} of {int(s.count[0])} steps have an error of up to {ALLOWED * worst:.2g} times "
-        f"the noise; {ALLOWED:g} is allowed. Their substeps were divided into {most} parts, which "
-        "is the limit."
+        f"the noise, more than {ALLOWED:g} of it. A substep is divided into {most} parts at most."
     )
     remedy = "Take a smaller `steps.dt_max`, or allow more parts with `law.shadows.parts`."
     # The shift by errors that are so large is estimated with few correct digits.
