@@ -305,6 +305,33 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert ran(given, samples()[:10]).diagnostics.mesh_unfollowed == 1.0
     few = lp.SensitivityLaw(shadows=lp.laws.Shadows(largest=10))
     assert ran(identifier(8, few), samples()[:10]).diagnostics.mesh_unfollowed == 1.0
+    for law, why in (
+        (few, "more than `largest` = 10 of the shadows"),
+        (lp.SensitivityLaw(shadows=lp.laws.Shadows(mesh=False)), "(mesh = false)"),
+        (PLAIN, "shadows = None"),
+    ):
+        verdict = ran(identifier(8, law), samples()[:30]).verdict
+        (told,) = verdict.untested
+        assert why in told
+        assert any(told in finding.text for finding in verdict.findings)
+    for sensors in (lp.Subdomain(lambda x: x[0] > 0.3, noise=NOISE), lp.Full(noise=NOISE)):
+        whole = lp.Identifier(rod(8), sensors, lp.SensitivityLaw(), u0=0.0)
+        for t, _, inputs in samples()[:25]:
+            estimate = whole.step(t, np.zeros(whole.observed.size), inputs)
+        assert "coefficients of the given mesh" in estimate.verdict.untested[0]
+        assert "more cells" in estimate.verdict.untested[0]
+    assert not ran(identifier(8), samples()[:30]).verdict.untested
+
+
+@pytest.mark.slow
+def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
+    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (10, 10, 10))
+    model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})
+    sensors = lp.Points([(0.3, 0.5, 0.5)], noise=NOISE)
+    given = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
+    for t, _, inputs in samples()[:22]:
+        estimate = given.step(t, [0.0], inputs)
+    assert any("more cells" in text for text in estimate.verdict.untested)
 
 
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:

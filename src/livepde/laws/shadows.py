@@ -111,7 +111,8 @@ class Shadows:
             raise LawError("Shadows: none is left; write shadows=None to follow no error.")
         if self.largest < 1:
             raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
-        if not (isinstance(self.parts, int) and self.parts >= 1):
+        given: Any = self.parts
+        if not (isinstance(given, int) and given >= 1):
             raise LawError(
                 f"Shadows: parts must be a whole number of at least 1; got {self.parts!r}."
             )
