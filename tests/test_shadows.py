@@ -325,7 +325,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
 
 @pytest.mark.slow
 def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
-    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (10, 10, 10))
+    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (8, 8, 8))
     model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})
     sensors = lp.Points([(0.3, 0.5, 0.5)], noise=NOISE)
     given = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
