@@ -1,9 +1,9 @@
 """The walks of docs/first-hour.md with data of other truths: how often their intervals hold.
 
 Truths come from codes of their own: finite volumes with exponentials in time for the walls, the
-ground and the aquifer, finite differences with small steps for the plate, and the solution of Ogata
-and Banks (1961) for the column. Nothing is shared with livepde but the priors that they are drawn
-from. `write` makes the tables of examples/first_hour.
+ground and the aquifer, finite differences with small steps for the plate, the solution of Ogata and
+Banks (1961) for the column, and for the pipe cells that move with the water. Nothing is shared with
+livepde but the priors that they are drawn from. `write` makes the tables of examples/first_hour.
 """
 
 from __future__ import annotations
@@ -20,6 +20,8 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.linalg import solve_banded
+from scipy.signal import lfilter
 from scipy.sparse.linalg import splu
 from scipy.special import erfc, erfcx
 
@@ -35,7 +37,7 @@ __all__ = ["FOLDER", "WALKS", "first_hour", "write"]
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"
-WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater", "wall")
+WALKS = ("furnace", "borehole", "plate", "pumping", "column", "heater", "wall", "pipe")
 WRITTEN = 0  # seed of the tables in the examples
 SHARE = 0.9  # of the vertices of a field whose interval has to hold
 HELD = 0.9  # of the seeds: 18 of 20
@@ -64,6 +66,13 @@ DRAWDOWN = 0.01  # m, noise of its loggers
 # The column.
 OUTLET = 10.0  # cm, place of its probe
 CONCENTRATION = 0.01  # noise of the probe
+
+# The buried pipe, read once a minute.
+PIPE, PIPE_SENSORS = 400.0, (130.0, 270.0, 400.0)  # m
+PIPE_CELL = 0.5  # m, of the truth
+PIPE_AREA, WATER, SOIL = 7.854e-3, 4.1e6, 9.0  # m^2, J/(m^3 K), degC
+VALVE = 120.0  # s, in which its supply follows a new set point
+PIPE_KELVIN, SUPPLY_KELVIN = 0.15, 0.03
 
 # The heated wall, with a heater that a controller switches.
 BRICK, BRICK_CAPACITY, BRICK_DEPTHS = 0.1, 1.4e6, (0.01, 0.03, 0.06)
@@ -248,6 +257,72 @@ def heater(seed: int) -> tuple[list[str], Array, dict[str, float]]:
     return header, np.column_stack([times, logged, shown]), truths
 
 
+def moved(K: float, D: float, flow: Any, supply: Any, until: float) -> tuple[Array, Array]:
+    """Return times, and the temperatures at the sensors, of water that moves by whole cells.
+
+    A step lasts until the water has moved by one cell, so that advection is exact. Dispersion is
+    that of Crank and Nicolson between two halves of the loss, which is exact.
+
+    Parameters
+    ----------
+    flow, supply
+        Functions of the time: m^3/h and degC.
+    """
+    cells = round((PIPE + 50.0) / PIPE_CELL)  # the outlet is beyond the last sensor
+    x = PIPE_CELL * (np.arange(cells) + 0.5)
+    u, t = SOIL + (supply(0.0) - SOIL) * np.exp(-K * x / (WATER * flow(0.0) / 3600.0)), 0.0
+    times, shown = [t], [np.interp(PIPE_SENSORS, x, u)]
+    bands = np.zeros((3, cells))
+    while t < until:
+        step = PIPE_CELL * PIPE_AREA / (flow(t) / 3600.0)
+        fed = supply(t + 0.5 * step)
+        u = np.append(fed, u[:-1])
+        kept = np.exp(-0.5 * step * K / (WATER * PIPE_AREA))
+        u = SOIL + (u - SOIL) * kept
+        r = 0.5 * D * step / PIPE_CELL**2
+        bands[0, 1:] = bands[2, :-1] = -r
+        bands[1] = 1.0 + 2.0 * r
+        bands[1, -1] = 1.0 + r
+        bands[1, 0] = 1.0 + 3.0 * r  # the inlet is half a cell away
+        change = np.diff(u, prepend=2.0 * fed - u[0], append=u[-1])
+        right = u + r * np.diff(change)
+        right[0] += 2.0 * r * fed
+        u = solve_banded((1, 1), bands, right)
+        u = SOIL + (u - SOIL) * kept
+        t += step
+        times.append(t)
+        shown.append(np.interp(PIPE_SENSORS, x, u))
+    return np.array(times), np.array(shown)
+
+
+def pipe(seed: int, minutes: int = 300) -> tuple[list[str], Array, dict[str, float]]:
+    """Return the table of a pipe whose supply changes between set points, and its truths."""
+    rng = np.random.default_rng([seed, 8])
+    K, D = 1.0 * np.exp(0.3 * rng.standard_normal()), 0.1 * np.exp(0.4 * rng.standard_normal())
+    fine = np.arange(0.0, 60.0 * minutes + 121.0)
+    changes = np.cumsum(rng.uniform(1200.0, 3600.0, minutes))
+    points = rng.uniform(65.0, 85.0, minutes + 1)
+    wanted = points[np.searchsorted(changes, fine, side="right")]
+    supply = lfilter([1.0 / VALVE], [1.0, 1.0 / VALVE - 1.0], wanted - wanted[0]) + wanted[0]
+    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    flow = 10.0 + 1.5 * np.sin(2 * np.pi * fine / 5400.0 + phase[0])
+    flow += 0.5 * np.sin(2 * np.pi * fine / 1500.0 + phase[1])
+    read = 60.0 * np.arange(minutes + 1.0)
+    times, shown = moved(
+        K,
+        D,
+        lambda t: float(np.interp(t, fine, flow)),
+        lambda t: float(np.interp(t, fine, supply)),
+        float(read[-1]),
+    )
+    seen = np.column_stack([np.interp(read, times, column) for column in shown.T])
+    seen += PIPE_KELVIN * rng.standard_normal(seen.shape)
+    fed = np.interp(read, fine, supply) + SUPPLY_KELVIN * rng.standard_normal(len(read))
+    header = ["time_s", "flow_m3_h", "T_supply", *(f"T_{x:g}" for x in PIPE_SENSORS)]
+    table = np.column_stack([read, np.interp(read, fine, flow), fed, seen])
+    return header, table, {"K": float(K), "D": float(D)}
+
+
 def diffusivity(seed: int) -> Any:
     """Return the diffusivity of the plate as a function of x and y: a drawn sum of cosines."""
     rng = np.random.default_rng([seed, 3])
@@ -332,6 +407,7 @@ TABLES = {
     "column": column,
     "heater": heater,
     "wall": wall,
+    "pipe": pipe,
 }
 
 
@@ -393,7 +469,7 @@ def _scores(walk: str, seed: int) -> dict[str, float]:
         truths = write(folder, walk, seed)
         if walk == "plate":
             return _plate_scores(Path(place), folder / "plate.py", seed)
-        prepared = load(folder / f"{walk}.toml").prepare()
+        prepared = load(folder / f"{walk}.toml", allow_code=True).prepare()
         step = prepared.identifier.step
         steps = (step(item.t, item.z, item.inputs) for item in prepared.stream)
         (estimate,) = deque(steps, maxlen=1)

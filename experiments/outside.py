@@ -158,7 +158,7 @@ class Informed(SensitivityLaw):
         sensors = MemberSensors(problem, reduction)
         filter_ = replace(work.filter, reduction=reduction, sensors=sensors, rank=k, judge=None)
         if self.shadows is not None:
-            parts = problem, reduction, sensors.rows, filter_.stage, self.shadows
+            parts = problem, reduction, sensors.rows, filter_.noise, filter_.stage, self.shadows
             filter_ = replace(filter_, shadows=ShadowSet.of(*parts, moves=filter_.moves))
         return replace(work, filter=filter_)
 

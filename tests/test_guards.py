@@ -235,8 +235,9 @@ def test_a_log_that_is_continued_twice_keeps_both_apart():
         Interval(t0=0.0, t1=1.0, inputs0={}, inputs1={}, z0=np.zeros(1), z1=np.full(1, 2.0)), ()
     )
     taken = np.ones(1, dtype=bool)
-    log = added(opened(empty_log(1, 1, 0), span), span, taken)
-    one, two = added(log, span, taken), added(log, other, taken)
+    whole = np.ones(1, dtype=np.int64)
+    log = added(opened(empty_log(1, 1, 0), span), span, taken, whole)
+    one, two = added(log, span, taken, whole), added(log, other, taken, whole)
     assert one[0, -1, 1] == 1.0
     assert two[0, -1, 1] == 2.0
     assert log.shape[1] == 2

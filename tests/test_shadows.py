@@ -82,6 +82,8 @@ def assert_predicts(predicted: Any, actual: Any, std: Any, band: float) -> None:
 
 
 PLAIN = lp.SensitivityLaw(shadows=None)
+# The error that a stated step makes: steps are not divided.
+STATED = lp.SensitivityLaw(shadows=lp.laws.Shadows(parts=1))
 
 
 @cache
@@ -92,7 +94,7 @@ def reference(width: float = WIDTH) -> Any:
 
 @pytest.mark.slow
 def test_predicts_the_shift_by_the_step() -> None:
-    estimate = ran(identifier(scheme=ImplicitEuler()), samples())
+    estimate = ran(identifier(law=STATED, scheme=ImplicitEuler()), samples())
     actual = estimate.q - reference().q
     assert np.abs(actual / reference().q_std).max() > 8.0
     assert_predicts(shifts(estimate, "step"), actual, reference().q_std, 0.2)
@@ -120,7 +122,7 @@ def test_predicts_the_shift_by_steps_across_jumps() -> None:
     )
     rows, ends = list(truth), []
     for width in (30.0, 2.0):
-        given = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=20.0, dt_max=width)
+        given = lp.Identifier(model, sensors, STATED, u0=20.0, dt_max=width)
         ends.append([given.step(sample.t, sample.z) for sample in rows][-1])
     coarse, fine = ends
     (label,) = coarse.parameters
@@ -134,14 +136,14 @@ def test_the_shift_of_an_unknown_that_hardly_moves_is_that_of_a_constant_one() -
     """Richardson's two steps halve that of an unknown that moves as well, and do not quarter it."""
     found = []
     for k in ({}, {"evolution": lp.RandomWalk(1e-9)}):
-        given = lp.Identifier(rod(10, **k), SENSORS, lp.SensitivityLaw(), u0=0.0)
+        given = lp.Identifier(rod(10, **k), SENSORS, STATED, u0=0.0)
         found.append(shifts(ran(given, samples()[:60]), "step"))
     np.testing.assert_allclose(found[1], found[0], rtol=0.05)
 
 
 @pytest.mark.slow
 def test_the_second_order_scheme_is_shifted_little() -> None:
-    given = identifier()
+    given = identifier(law=STATED)
     estimate = given.settled(
         ran(given, samples())
     )  # else the last refit leaves as much to a later one
@@ -199,7 +201,7 @@ def test_predicts_the_shift_by_input_lines() -> None:
 @pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.01)])
 def test_no_number_of_the_filter_moves(evolution: Any) -> None:
     found = []
-    for law in (lp.SensitivityLaw(), PLAIN):
+    for law in (STATED, PLAIN):
         more = {} if evolution is None else {"evolution": evolution}
         given = lp.Identifier(rod(10, **more), SENSORS, law, u0=0.0)
         found.append((ran(given, samples()[:60]), given._state.now))
@@ -303,6 +305,33 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert ran(given, samples()[:10]).diagnostics.mesh_unfollowed == 1.0
     few = lp.SensitivityLaw(shadows=lp.laws.Shadows(largest=10))
     assert ran(identifier(8, few), samples()[:10]).diagnostics.mesh_unfollowed == 1.0
+    for law, why in (
+        (few, "more than `largest` = 10 of the shadows"),
+        (lp.SensitivityLaw(shadows=lp.laws.Shadows(mesh=False)), "(mesh = false)"),
+        (PLAIN, "shadows = None"),
+    ):
+        verdict = ran(identifier(8, law), samples()[:30]).verdict
+        (told,) = verdict.untested
+        assert why in told
+        assert any(told in finding.text for finding in verdict.findings)
+    for sensors in (lp.Subdomain(lambda x: x[0] > 0.3, noise=NOISE), lp.Full(noise=NOISE)):
+        whole = lp.Identifier(rod(8), sensors, lp.SensitivityLaw(), u0=0.0)
+        for t, _, inputs in samples()[:25]:
+            estimate = whole.step(t, np.zeros(whole.observed.size), inputs)
+        assert "coefficients of the given mesh" in estimate.verdict.untested[0]
+        assert "more cells" in estimate.verdict.untested[0]
+    assert not ran(identifier(8), samples()[:30]).verdict.untested
+
+
+@pytest.mark.slow
+def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
+    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (8, 8, 8))
+    model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})
+    sensors = lp.Points([(0.3, 0.5, 0.5)], noise=NOISE)
+    given = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
+    for t, _, inputs in samples()[:22]:
+        estimate = given.step(t, [0.0], inputs)
+    assert any("more cells" in text for text in estimate.verdict.untested)
 
 
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:

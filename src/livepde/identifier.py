@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 10  # of the checkpoint
+FORMAT = 11  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
@@ -374,7 +374,7 @@ class Identifier:
             self._known = Inputs({**self._known, **last})
         held = (*held, *unstated)
         estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
-        return estimate, interval
+        return estimate, replace(interval, parts=report.parts)
 
     def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
         """Return all inputs, and those whose missing value is replaced by the last one."""

@@ -51,12 +51,15 @@ class MemberReports:
         Substeps taken, shape (members,).
     diagnose
         Function that returns the diagnostics, numbers of shape (members,); called when read.
+    parts
+        In how many parts the substeps were divided, shape (members,); None: not at all.
     """
 
     statuses: tuple[Status, ...]
     predicted: Array
     steps: Array
     diagnose: Callable[[], Diagnostics[Array]] = Diagnostics
+    parts: IntArray | None = None
 
     @cached_property
     def diagnostics(self) -> Diagnostics[Array]:
@@ -66,8 +69,9 @@ class MemberReports:
     def member(self, k: int) -> Report:
         """Return the report of one member."""
         steps = int(self.steps[k])
+        parts = 1 if self.parts is None else int(self.parts[k])
         return Report(
-            self.statuses[k], self.predicted[k], steps, lambda: self.diagnostics.member(k)
+            self.statuses[k], self.predicted[k], steps, lambda: self.diagnostics.member(k), parts
         )
 
     def updated(self, more: Diagnostics[Array]) -> MemberReports:
@@ -86,7 +90,7 @@ class MemberReports:
             each = (reports.get(k, self.member(k)) for k in range(len(statuses)))
             return stacked([one.diagnostics for one in each])
 
-        return MemberReports(tuple(statuses), predicted, steps, diagnosed)
+        return MemberReports(tuple(statuses), predicted, steps, diagnosed, self.parts)
 
 
 class GateDecision(NamedTuple):

@@ -15,7 +15,7 @@ For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any, NamedTuple, TypeAlias
 
@@ -201,8 +201,54 @@ class Filter:
 
         That number is one for each member if they differ.
 
-        The process noise of the unknowns is independent from substep to substep.
+        The process noise of the unknowns is independent from substep to substep. Where the division
+        of the substeps is not chosen yet (`Span.parts`), the error of the time step decides.
         """
+        shadows, parts = self.shadows, x.parts if span.parts is None else span.parts
+        if shadows is None:
+            return self._by_parts(x, span, parts)
+        if span.parts is not None:
+            end, taken, failure = self._by_parts(x, span, parts)
+            kept = end if failure else changed(end, shadows=shadows.chosen(x, end))
+            return kept, taken, failure
+        parts = shadows.first_parts(x)
+        end, taken, failure = self._by_parts(x, span, parts)
+        while failure is None:
+            better = shadows.finer_parts(end, parts)
+            group = np.flatnonzero(better != parts)
+            if not len(group):
+                return changed(end, shadows=shadows.chosen(x, end)), taken, None
+            parts = better
+            if len(group) == len(x):
+                end, taken, failure = self._by_parts(x, span, parts)
+                continue
+            some = take(x, group), span.part(group), parts[group]
+            after, steps, failure = self._by_parts(*some)
+            end, taken = put(end, group, after), np.broadcast_to(taken, (len(x),)).copy()
+            taken[group] = steps
+        return x, taken, failure
+
+    def _by_parts(
+        self, x: FilterState, span: Span, parts: IntArray
+    ) -> tuple[FilterState, Steps, StepFailed | None]:
+        """Return the same with substeps in so many parts, (members,)."""
+        if (parts == parts[0]).all():
+            end, taken, failure = self._predicted(x, replace(span, parts=parts))
+            return changed(end, parts=parts), taken, failure
+        end, steps = x, np.zeros(len(x), dtype=np.int64)
+        for count in sorted(set(parts.tolist())):
+            group = np.flatnonzero(parts == count)
+            some = take(x, group), span.part(group), parts[group]
+            after, steps[group], failure = self._by_parts(*some)
+            if failure is not None:
+                return x, steps, failure
+            end = put(end, group, after)
+        return end, steps, None
+
+    def _predicted(
+        self, x: FilterState, span: Span
+    ) -> tuple[FilterState, Steps, StepFailed | None]:
+        """Return the same of members that divide their substeps alike."""
         x, end, taken, failure = self._divided(x, span)
         if failure is None and self.problem.input_noise:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
@@ -310,7 +356,7 @@ class Filter:
         if shadows:
             last.append(end.shadows.u.transpose(1, 0, 2))
         columns = np.concatenate([end.u[None], end.U.transpose(1, 0, 2), *last])
-        control, count = self.problem.control, end.U.shape[1]
+        control, count = self.problem.control.divided(span.division), end.U.shape[1]
         columns, steps, failure = advance(control, stage, columns, start, stop, begin)
         if failure is not None:
             return x, steps, failure

@@ -53,6 +53,8 @@ class FilterState:
     rate
         How fast the readings forget the process noise of unknowns that move, by which steps are
         divided, shape (members,).
+    parts
+        In how many parts the substeps since the sample before were divided, shape (members,).
     screened
         What the gate remembers of each sensor.
     level, samples
@@ -83,6 +85,7 @@ class FilterState:
     age: Array
     rate: Array
     innovations: Innovations
+    parts: IntArray
     screened: Screened
     level: Array
     samples: Array

@@ -135,7 +135,10 @@ def refusal(problem: Problem, largest: int) -> str:
     model = problem.model
     size = model.X.dim * 2 ** model.mesh.dim()
     if size > largest:
-        return f"the state has about {size} coefficients there, more than {largest}"
+        return (
+            f"the state has about {size} coefficients on the halved mesh, more than `largest` = "
+            f"{largest} of the shadows"
+        )
     if not problem.observed.observation.portable:
         return "the readings of its sensors are coefficients of the given mesh"
     return ""

@@ -1,7 +1,8 @@
 """The samples since a law may have to begin again, of all members: a log that only grows.
 
-A log has the shape (members, rows, 1 + 2 sensors + channels): time, measurements, their noise (NaN:
-that of the sensor) and inputs. Rows of a member that did not take a sample have the time NaN.
+A log has the shape (members, rows, 2 + 2 sensors + channels): time, measurements, their noise (NaN:
+that of the sensor), inputs, and in how many parts the substeps since the row before were divided.
+Rows of a member that did not take a sample have the time NaN.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 
 from livepde.fem import Inputs
-from livepde.laws.law import Problem
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import End, Interval, Span, own_noise
 
@@ -20,12 +20,10 @@ __all__ = [
     "added",
     "empty_log",
     "first_interval",
-    "following",
     "intervals_since",
     "opened",
     "reaching",
     "skipped",
-    "span_between",
     "trimmed",
     "with_readings",
     "withdrawn",
@@ -37,7 +35,7 @@ ROWS = 64  # least room of a log
 
 def empty_log(members: int, sensors: int, channels: int) -> Array:
     """Return a log without rows."""
-    return np.zeros((members, 0, 1 + 2 * sensors + channels))
+    return np.zeros((members, 0, 2 + 2 * sensors + channels))
 
 
 def opened(log: Array, span: Span) -> Array:
@@ -49,18 +47,26 @@ def opened(log: Array, span: Span) -> Array:
     row[:] = np.nan
     row[:, 0] = span.t0
     # Withheld sensors of a fleet may read more channels, which come last.
-    row[:, 1 + 2 * sensors :] = span.inputs0[:, : log.shape[2] - 1 - 2 * sensors]
+    row[:, 1 + 2 * sensors : -1] = span.inputs0[:, : log.shape[2] - 2 - 2 * sensors]
+    row[:, -1] = 1.0
     return begun
 
 
-def added(log: Array, span: Span, taken: Mask) -> Array:
-    """Return a log with the sample at the end of a span, of those members that took it."""
+def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
+    """Return a log with the sample at the end of a span, of those members that took it.
+
+    Parameters
+    ----------
+    parts
+        In how many parts the substeps of the span were divided, shape (members,).
+    """
     longer = _extended(log)
     row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
     row[:, 1 : 1 + sensors] = span.z1
     row[:, 1 + sensors : 1 + 2 * sensors] = np.nan if span.noise is None else span.noise
-    row[:, 1 + 2 * sensors :] = span.stated[:, : log.shape[2] - 1 - 2 * sensors]
+    row[:, 1 + 2 * sensors : -1] = span.stated[:, : log.shape[2] - 2 - 2 * sensors]
+    row[:, -1] = parts
     if np.count_nonzero(taken) < len(taken):
         row[~taken] = np.nan
     return longer
@@ -117,12 +123,13 @@ def trimmed(log: Array, first: int) -> Array:
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
     """Return the rows that the one member of a log took."""
-    sensors = (log.shape[2] - 1 - len(channels)) // 2
+    sensors = (log.shape[2] - 2 - len(channels)) // 2
     found = []
     for row in log[0][np.isfinite(log[0, :, 0])]:
-        t, z, noise, inputs = np.split(row, [1, 1 + sensors, 1 + 2 * sensors])
+        t, z, noise, inputs = np.split(row[:-1], [1, 1 + sensors, 1 + 2 * sensors])
         named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
-        found.append(End(t=float(t[0]), inputs=named, z=z, noise=own_noise(noise)))
+        parts = int(row[-1])
+        found.append(End(t=float(t[0]), inputs=named, z=z, noise=own_noise(noise), parts=parts))
     return found
 
 
@@ -153,31 +160,3 @@ def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
     """
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])
-
-
-def following(log: Array, row: int) -> int:
-    """Return the next row of one member, shape (rows, ...), that it took; their number if none."""
-    row += 1
-    while row < len(log) and not np.isfinite(log[row, 0]):
-        row += 1
-    return row
-
-
-def span_between(log: Array, rows: IntArray, row: int, problem: Problem) -> Span:
-    """Return one row of each member, with the row before it, as an interval."""
-    sensors = problem.observed.size
-    first, last = log[np.arange(len(log)), rows], log[:, row]
-    inputs0, inputs1 = first[:, 1 + 2 * sensors :], last[:, 1 + 2 * sensors :]
-    z0, z1 = first[:, 1 : 1 + sensors], last[:, 1 : 1 + sensors]
-    noise = own_noise(last[:, 1 + sensors : 1 + 2 * sensors])
-    span = Span(
-        t0=first[:, 0],
-        t1=float(last[0, 0]),
-        channels=problem.channels,
-        inputs0=inputs0,
-        inputs1=inputs1,
-        z0=z0,
-        z1=z1,
-        noise=noise,
-    )
-    return span.driven(problem.control.held)

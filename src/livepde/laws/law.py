@@ -312,12 +312,15 @@ class Report:
         Substeps taken.
     diagnose
         Function that returns the diagnostics; it is called when they are first read.
+    parts
+        In how many parts the substeps were divided.
     """
 
     status: Status
     predicted: Array
     steps: int = 0
     diagnose: Callable[[], Diagnostics[float]] = Diagnostics
+    parts: int = 1
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:

@@ -58,6 +58,7 @@ from livepde.laws.verdict import (
     judge_of,
     judged,
     with_columns,
+    with_discretisation,
     with_errors,
     with_fit,
 )
@@ -229,7 +230,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             ),
         )
         if self.shadows is not None:
-            parts = problem, reduction, filter_.sensors.rows, filter_.stage, self.shadows
+            parts = problem, reduction, filter_.sensors.rows, noise, filter_.stage, self.shadows
             followed = ShadowSet.of(*parts, moves=filter_.moves)
             filter_ = replace(filter_, shadows=followed)
         # Unknowns that move, or that may jump, follow a change of the process themselves.
@@ -268,6 +269,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             age=0.0 * one,
             rate=0.0 * one,
             innovations=Innovations.start(sensors),
+            parts=np.ones(1, dtype=np.int64),
             screened=Screened.start(sensors),
             level=one,
             samples=GUESS * one,
@@ -321,7 +323,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     ) -> SensitivityState:
         filter_, x, interval = work.filter, state.now, work.filter.problem.unread(interval)
         span = filter_.span(interval)
-        state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool)))
+        state = changed(state, log=added(state.log, span, np.ones(1, dtype=bool), x.parts))
         # A state that is known, seen by sensors that see no unknown, has nothing to learn.
         if not filter_.sensors.observe(x, span.end)[1].any():
             # The readings count all the same: another case may assimilate them.
@@ -514,6 +516,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
         judge = with_fit(judged(work.filter, state.now, now), fit)
+        if self.verdict:
+            judge = with_discretisation(judge, work.filter.shadows, state.now.shadows)
         return Deferred(lambda: self.member_belief(work, now, 0), judge)
 
     def final(

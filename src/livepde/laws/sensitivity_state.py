@@ -345,7 +345,7 @@ def stored(
     """
     if not work.keeps_log:
         return changed(state, now=now, **parts)
-    log = added(state.log, span, taken)
+    log = added(state.log, span, taken, now.parts)
     # A sensor that is set aside brings no measurements, from the first one that misfitted on.
     if np.count_nonzero(now.screened.aside):
         aside = now.screened.aside & taken[:, None]
@@ -449,7 +449,7 @@ def reports_of(work: SensitivityWork, now: FilterState, told: Assimilation) -> M
         return found
 
     steps = np.full(members, told.steps)
-    return MemberReports((OK,) * members, told.predicted, steps, diagnosed)
+    return MemberReports((OK,) * members, told.predicted, steps, diagnosed, now.parts)
 
 
 def _with_refused(

@@ -54,6 +54,10 @@ class ShadowState:
         then, shape (members, sensors, k); without sensors if no shadow needs it.
     failed
         How many shadow steps had no solution, shape (members,).
+    excess
+        Error of the last step that the step shadow took, over what is allowed, shape (members,).
+    coarse, coarsest
+        How many steps were left with a larger one, and the largest `excess` of them, (members,).
     """
 
     u: Array
@@ -80,6 +84,9 @@ class ShadowState:
     seen: Array
     gains: Array
     failed: IntArray
+    excess: Array
+    coarse: IntArray
+    coarsest: Array
 
     def __len__(self) -> int:
         return len(self.count)
@@ -116,6 +123,9 @@ class ShadowState:
             seen=nothing,
             gains=np.zeros((members, 0, k)),
             failed=zero,
+            excess=time,
+            coarse=zero,
+            coarsest=time,
         )
 
     def without_stages(self) -> ShadowState:

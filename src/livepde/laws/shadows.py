@@ -34,6 +34,7 @@ from livepde.laws.process_noise import grades, pieces
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
+from livepde.laws.step_tolerance import StepTolerance
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import (
     TINY,
@@ -63,6 +64,7 @@ MESH = 4.0 / 3.0  # error of elements of first order over its difference to the 
 KINDS = ("step", "mesh", "input")
 HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
 SHORT = 1.0 / 16.0  # of the interval before: a shorter one shows no curvature
+AT_ONCE = 3  # halvings of a step, as powers of two, before its error is estimated again
 SMOOTH = 0.5  # differences of changes over changes, squared: below, an input changes smoothly
 
 
@@ -71,7 +73,8 @@ class Shadows:
     """Discretisation errors that the sensitivity law follows beside its estimates.
 
     Their signed shifts are summed, and widen the reported covariance: variance plus square of the
-    sum. The estimate itself, and the filter, stay as they are.
+    sum. The filter takes shorter steps where the error of the time step asks for it (`parts`); else
+    it stays as it is.
 
     The first 16 steps are shadowed, later one of eight, which stands for those around it: an error
     of step or input lines that changes much faster is found on average only. The mesh is followed
@@ -92,18 +95,27 @@ class Shadows:
     largest
         Coefficients of the state on the halved mesh beyond which it is not followed, because that
         would cost more than the filter.
+    parts
+        A step whose error is larger than 3 % of the noise of the readings is taken again in 2, 4,
+        ... parts, at most in so many, and so are the next ones as long as they need it. 1: none is.
     """
 
     step: bool = True
     mesh: bool = True
     inputs: bool = True
     largest: int = 4000
+    parts: int = 16
 
     def __post_init__(self) -> None:
         if not (self.step or self.mesh or self.inputs):
             raise LawError("Shadows: none is left; write shadows=None to follow no error.")
         if self.largest < 1:
             raise LawError(f"Shadows: largest must be at least 1; got {self.largest}.")
+        given: Any = self.parts
+        if not (isinstance(given, int) and given >= 1):
+            raise LawError(
+                f"Shadows: parts must be a whole number of at least 1; got {self.parts!r}."
+            )
 
 
 class ShadowedSteps(NamedTuple):
@@ -218,7 +230,8 @@ class MeanProcess:
 
         first, columns = span.start, u[None]
         for stop in times:
-            columns, _, failure = advance(self.control, stage, columns, first, stop)
+            control = self.control.divided(span.division)
+            columns, _, failure = advance(control, stage, columns, first, stop)
             if failure is not None:
                 return u, kept, ~no
             first = stop
@@ -278,22 +291,25 @@ class StepShadow(Shadow):
         The process by halved steps.
     factor
         2^p/(2^p - 1) for a scheme of order p.
+    tolerance
+        What is allowed of an error.
     """
 
     halves: MeanProcess
     factor: float
+    tolerance: StepTolerance
 
     kind = "step"
 
     @classmethod
-    def of(cls, process: MeanProcess) -> StepShadow:
+    def of(cls, process: MeanProcess, tolerance: StepTolerance) -> StepShadow:
         """Return the shadow of a process."""
-        control = replace(process.control, parts=2 * process.control.parts)
+        control = process.control.divided(2)
         # Richardson: e(h) = c h^p, so that e(h) - e(h/2) = (1 - 2^-p) e(h).
         ratio = 2.0**control.scheme.order
         # Halved steps have matrices of their own: in a common cache both would factorise anew.
         halves = replace(process, control=control, stage=process.stage.twin())
-        return cls(halves, ratio / (ratio - 1.0))
+        return cls(halves, ratio / (ratio - 1.0), tolerance)
 
     def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
@@ -309,6 +325,8 @@ class StepShadow(Shadow):
         weight = 1.0 + (0.5 * (block.waited + block.next) - 1.0) * alike
         # The error of a step with a jump is exceptional and no measure for the next ones.
         parts = {"halves": kept, "size": np.where(block.jumps | failed, s.size, size)}
+        excess = self.tolerance.excess(error, block.end, block.step.end)
+        parts["excess"] = np.where(failed, 0.0, excess)
         return ErrorIncrement(failed, parts, u=weight[:, None] * error)
 
 
@@ -520,14 +538,17 @@ class ShadowSet:
     shadows
         One for each row of `ShadowState.u`.
     refused
-        Why the mesh has no shadow; empty if it has one, or none was asked for.
+        Why the mesh has no shadow; empty if it has one.
+    most
+        Parts of a substep at most.
     """
 
     problem: Problem
     reduction: Reduction
     rows: Callable[[FilterState, Array, Array, Moments], Array]
     shadows: tuple[Shadow, ...]
-    refused: str = ""
+    refused: str
+    most: int
 
     @classmethod
     def of(
@@ -535,23 +556,33 @@ class ShadowSet:
         problem: Problem,
         reduction: Reduction,
         rows: Callable[[FilterState, Array, Array, Moments], Array],
+        noise: Array,
         stage: MemberStage,
         options: Shadows,
         *,
         moves: bool,
     ) -> ShadowSet:
-        """Return the shadows of a filter with that implicit stage; `moves`: whether unknowns do."""
-        process, refused = MeanProcess(problem.control, stage, reduction, moves), ""
+        """Return the shadows of a filter.
+
+        Parameters
+        ----------
+        noise, stage
+            Standard deviation of each sensor, shape (sensors,), and the implicit stage.
+        moves
+            Whether unknowns move.
+        """
+        process = MeanProcess(problem.control, stage, reduction, moves)
+        refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
         found: list[Shadow] = []
         if options.step:
-            found.append(StepShadow.of(process))
-        if options.mesh and not (refused := refusal(problem, options.largest)):
+            found.append(StepShadow.of(process, StepTolerance(problem, rows, noise)))
+        if not refused:
             # An identification must not fail because its mesh error cannot be estimated: a note
             # says so.
             try:
                 found.append(MeshShadow.of(process, problem))
             except LivepdeError as error:
-                refused = f"on the halved mesh: {error}"
+                refused = f"there is no halved mesh: {str(error).rstrip('.')}"
         if options.inputs and problem.model.channels:
             held, own = problem.control.held, problem.model.channels
             signs = {name: 1.0 if name in held.next else -1.0 for name in (*held.next, *held.last)}
@@ -561,7 +592,23 @@ class ShadowSet:
                 found.append(InputShadow(process, lines))
             if of_held.any():
                 found.append(HeldInputShadow(process, of_held))
-        return cls(problem, reduction, rows, tuple(found), refused)
+        # Without a step shadow nothing tells how short steps have to be. Where steps are to be
+        # those of the samples and no others (no halvings), they stay so.
+        most = options.parts if options.step and problem.control.halvings else 1
+        return cls(problem, reduction, rows, tuple(found), refused, most)
+
+    @property
+    def unfollowed(self) -> str:
+        """Which errors are not followed, why, and what to do instead; empty if none is left out."""
+        missing = []
+        if self.refused:
+            missing.append(
+                f"the error of the mesh ({self.refused}); compare with a run on more cells, "
+                "`mesh.cells`"
+            )
+        if "step" not in self.kinds:
+            missing.append("the error of the time step (step = false)")
+        return "; ".join(missing)
 
     @cached_property
     def counted(self) -> slice:
@@ -634,6 +681,8 @@ class ShadowSet:
             span = replace(step, t0=s.begun, inputs0=s.inputs0, interval=None)
         wait = np.where(s.count < FIRST, 1, LATER[s.count // 8 % len(LATER)])
         wait = np.where(s.count - s.jumped < CALM, 1, wait)
+        # The error of the steps that follow is another one where the division has changed.
+        wait = np.where(x.parts != step.division, 1, wait)
         block = ShadowedSteps(x, end, step, span, waited, wait, jumps)
         u, a, failed = s.u.copy(), s.a.copy(), s.failed
         parts: dict[str, Any] = {}
@@ -652,6 +701,45 @@ class ShadowSet:
         begun = np.full(len(s), step.t1)
         parts |= {"begun": begun, "last": s.count, "due": s.count + wait, "failed": failed}
         return changed(s, u=u, a=a, **parts)
+
+    def first_parts(self, x: FilterState) -> IntArray:
+        """Return in how many parts the substeps of the next span are divided at first, (members,).
+
+        As those of the span before, or half as many where its error was far smaller than allowed.
+        """
+        s, order = x.shadows, self.problem.control.scheme.order
+        if self.most == 1 or not np.count_nonzero(x.parts > 1):
+            return x.parts
+        spare = (s.last == s.count) & (s.excess < 0.5 ** (order + 2))
+        return np.where(spare, np.maximum(x.parts // 2, 1), x.parts)
+
+    def finer_parts(self, end: FilterState, parts: IntArray) -> IntArray:
+        """Return in how many parts the substeps of a span have to be divided, (members,).
+
+        Parameters
+        ----------
+        end
+            The state after the span, with its error where that has been estimated.
+        parts
+            In how many parts its substeps are divided there.
+        """
+        s = end.shadows
+        coarse = (s.last == s.count) & (s.excess > 1.0) & (parts < self.most)
+        if not np.count_nonzero(coarse):
+            return parts
+        # The error goes with the power `order` of the step once that is short enough.
+        power = np.log2(np.where(coarse, s.excess, 2.0)) / self.problem.control.scheme.order
+        more = 2 ** np.clip(np.ceil(power - 1e-9), 1, AT_ONCE).astype(np.int64)
+        return np.where(coarse, np.minimum(parts * more, self.most), parts)
+
+    def chosen(self, x: FilterState, end: FilterState) -> ShadowState:
+        """Return the shadows after a span whose division is chosen; `x` is the filter before it."""
+        s = end.shadows
+        coarse = (s.last == s.count) & (s.excess > 1.0)
+        if not np.count_nonzero(coarse):
+            return s
+        more, worst = coarse * (s.count - x.shadows.last), np.where(coarse, s.excess, 0.0)
+        return changed(s, coarse=s.coarse + more, coarsest=np.maximum(s.coarsest, worst))
 
     def in_readings(self, x: FilterState, at: Moments) -> tuple[FilterState, Array]:
         """Return by how much predictions are off, (members, shadows, sensors), and the filter.

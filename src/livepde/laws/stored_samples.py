@@ -200,7 +200,7 @@ class StoredSamples:
                 return y
 
             if span.t1 > span.start:
-                control = filter_.problem.control
+                control = filter_.problem.control.divided(span.division)
                 columns, _, failure = advance(control, stage, columns, span.start, span.t1)
                 if failure is not None:
                     return

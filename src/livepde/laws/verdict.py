@@ -16,6 +16,9 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import model_errors
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
+from livepde.laws.shadow_state import ShadowState
+from livepde.laws.shadows import ShadowSet
+from livepde.laws.step_tolerance import ALLOWED
 from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import (
@@ -27,13 +30,23 @@ from livepde.verdict import (
     Judge,
     ModelErrors,
     Position,
+    Severity,
     Verdict,
     assess,
     too_few,
 )
 
-__all__ = ["after_fit", "judge_of", "judged", "with_columns", "with_errors", "with_fit"]
+__all__ = [
+    "after_fit",
+    "judge_of",
+    "judged",
+    "with_columns",
+    "with_discretisation",
+    "with_errors",
+    "with_fit",
+]
 
+COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 
 
@@ -137,6 +150,48 @@ def after_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Ver
         return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
 
     return found
+
+
+def with_discretisation(
+    judge: Callable[[], Verdict], shadows: ShadowSet | None, s: ShadowState
+) -> Callable[[], Verdict]:
+    """Return a verdict that names the errors of the discretisation which are not held.
+
+    Parameters
+    ----------
+    shadows
+        Those of the filter; None: it follows no such error.
+    s
+        Their state.
+    """
+    missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
+    coarse = 0 if shadows is None else int(s.coarse[0])
+    if not missing and not coarse:
+        return judge
+
+    def found() -> Verdict:
+        verdict = judge()
+        if coarse and shadows is not None:
+            verdict = verdict.with_findings([_coarse(s, shadows.most)])
+        if not missing or not verdict.judged:
+            return verdict
+        more = Finding("untested", "note", f"Not tested: {missing}.", "discretisation")
+        return verdict.with_untested(missing).with_findings([more])
+
+    return found
+
+
+def _coarse(s: ShadowState, most: int) -> Finding:
+    """Return the finding of steps that would have to be shorter than is allowed."""
+    coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
+    text = (
+        f"{coarse} of {int(s.count[0])} steps have an error of up to {ALLOWED * worst:.2g} times "
+        f"the noise, more than {ALLOWED:g} of it. A substep is divided into {most} parts at most."
+    )
+    remedy = "Take a smaller `steps.dt_max`, or allow more parts with `law.shadows.parts`."
+    # The shift by errors that are so large is estimated with few correct digits.
+    severity: Severity = "caution" if worst > COARSE else "note"
+    return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
 def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:

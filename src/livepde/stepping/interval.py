@@ -27,7 +27,7 @@ class End:
     ----------
     t, inputs, z
         Time, input channels, and measurements, shape (sensors,), NaN where missing.
-    noise, gaps
+    noise, gaps, parts
         As of an `Interval` that ends here.
     """
 
@@ -36,6 +36,7 @@ class End:
     z: Array
     noise: Array | None = None
     gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
+    parts: int = 0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -58,6 +59,8 @@ class Interval:
     row
         Inputs of the sample at the end, which sensors read and the next interval begins with; None
         if they are `inputs1`. They differ where a channel switches at the end (`driven`).
+    parts
+        Number of parts of every substep; 0 if it is not chosen yet.
     """
 
     t0: float
@@ -69,6 +72,7 @@ class Interval:
     noise: Array | None = None
     gaps: Mapping[str, tuple[float, bool]] = field(default_factory=dict)
     row: Mapping[str, float] | None = None
+    parts: int = 0
 
     @classmethod
     def between(cls, start: End, stop: End) -> Interval:
@@ -82,6 +86,7 @@ class Interval:
             z1=stop.z,
             noise=stop.noise,
             gaps=stop.gaps,
+            parts=stop.parts,
         )
 
     def driven(self, held: Held) -> Interval:
@@ -213,6 +218,8 @@ class Span:
     row
         Inputs of the sample at the end, of the shape of `inputs1`, as of an `Interval`; None if
         they are `inputs1`.
+    parts
+        Number of parts of every substep, shape (members,); None if it is not chosen yet.
     """
 
     t0: Array
@@ -226,6 +233,7 @@ class Span:
     noise: Array | None = None
     gaps: Array | None = None
     row: Array | None = None
+    parts: IntArray | None = None
 
     @classmethod
     def of(cls, interval: Interval, channels: tuple[str, ...]) -> Span:
@@ -250,6 +258,7 @@ class Span:
             noise=None if interval.noise is None else interval.noise[None],
             gaps=gaps,
             row=None if interval.row is None else _values(interval.row, channels),
+            parts=np.array([interval.parts]) if interval.parts else None,
         )
 
     def driven(self, held: Held) -> Span:
@@ -278,6 +287,11 @@ class Span:
 
     def __len__(self) -> int:
         return len(self.t0)
+
+    @property
+    def division(self) -> int:
+        """Number of parts of every substep, of members that have the same; 1 if not chosen yet."""
+        return 1 if self.parts is None else int(self.parts[0])
 
     @property
     def start(self) -> float:
@@ -354,4 +368,5 @@ class Span:
             noise=None if self.noise is None else self.noise[k],
             gaps=gaps,
             row=None if self.row is None else row,
+            parts=0 if self.parts is None else int(self.parts[k if len(self.parts) > 1 else 0]),
         )

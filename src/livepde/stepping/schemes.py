@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -119,6 +119,10 @@ class Advance:
             raise ConfigurationError(
                 f"halvings must be a whole number from 0 to {MOST_HALVINGS}; got {given!r}."
             )
+
+    def divided(self, parts: int) -> Advance:
+        """Return the control by which every substep is divided into so many parts more."""
+        return self if parts == 1 else replace(self, parts=parts * self.parts)
 
     def count(self, length: float) -> int:
         """Return the number of equal substeps of an interval of that length."""
