@@ -542,9 +542,16 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
     points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
     places = {**observed.places, **({} if withheld is None else withheld.places)}
+    units = {
+        name: unit
+        for one in (observed, withheld)
+        if one is not None
+        for name, unit in zip(one.names, one.units, strict=True)
+    }
+    several = len(set(units.values())) > 1
     return Layout(
         time_unit=model.time_unit,
-        sensor_unit=observed.observation.unit,
+        sensor_unit="" if several else observed.unit,
         coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
@@ -557,6 +564,7 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         length_unit=model.length_unit,
         places={name: at.tolist() for name, at in places.items()},
         comments=_field_comments(model),
+        sensor_units=units if several else {},
     )
 
 
