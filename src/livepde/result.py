@@ -548,10 +548,11 @@ def layout_of(model: Model, observed: Observed, withheld: Observed | None) -> La
         if one is not None
         for name, unit in zip(one.names, one.units, strict=True)
     }
-    several = len(set(units.values())) > 1
+    stated = {unit for unit in units.values() if unit}
+    several = len(stated) > 1
     return Layout(
         time_unit=model.time_unit,
-        sensor_unit="" if several else observed.unit,
+        sensor_unit="" if several else "".join(stated),
         coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
