@@ -10,9 +10,12 @@ from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
+import pandas as pd
 import pytest
+import xarray as xr
 
 from livepde.errors import DataError, TimeOrderError
+from livepde.runs.directory import RunWriter, open_run
 from livepde.streams.clock import Clock
 from livepde.streams.csvfile import header_of, how_written, read_csv
 from livepde.streams.intake import Intake
@@ -173,3 +176,39 @@ def test_words_amid_the_values_are_no_labels(tmp_path: Path) -> None:
     rows = source.poll(0.0)
     assert len(rows) == 4  # the intake counts it as malformed
     source.close()
+
+
+# --- dates of a run ------------------------------------------------------------------------------
+
+
+def run_in(folder: Path, unit: str, origin: str | None) -> xr.Dataset:
+    """Write and return the estimates of a run with snapshots at other times than samples."""
+    attrs = {"origin": origin} if origin else {}
+    data = xr.Dataset(
+        {"k": ("time", [1.0, 2.0, 3.0]), "T": (("snapshot", "vertex"), [[0.0, 1.0]])},
+        {"time": ("time", [0.0, 1.5, 3.0], {"units": unit}), "snapshot": ("snapshot", [3.0])},
+        attrs,
+    )
+    writer = RunWriter.create(folder, version="1", command=["livepde"], title="A run")
+    writer.finish(status="finished", dataset=data, shown=[], checks=[], notes=[])
+    return data
+
+
+@pytest.mark.parametrize(
+    ("unit", "step"), [("s", "1.5s"), ("min", "90s"), ("h", "90min"), ("d", "36h"), ("day", "36h")]
+)
+def test_other_programs_read_dates_of_a_run(tmp_path: Path, unit: str, step: str) -> None:
+    data = run_in(tmp_path / "run", unit, "2025-03-01 06:00:00")
+    with xr.open_dataset(tmp_path / "run" / "estimates.nc", engine="scipy") as other:
+        dates = pd.date_range("2025-03-01 06:00", periods=3, freq=step)
+        np.testing.assert_array_equal(other["time"], dates.to_numpy())
+        assert other["snapshot"].values[0] == dates.to_numpy()[-1]
+    mine = open_run(tmp_path / "run").dataset
+    xr.testing.assert_identical(mine, data)  # here they are numbers, as they were
+
+
+def test_times_without_a_date_stay_numbers(tmp_path: Path) -> None:
+    data = run_in(tmp_path / "run", "s", None)
+    with xr.open_dataset(tmp_path / "run" / "estimates.nc", engine="scipy") as other:
+        assert other["time"].values.tolist() == [0.0, 1.5, 3.0]
+    xr.testing.assert_identical(open_run(tmp_path / "run").dataset, data)
