@@ -296,6 +296,7 @@ def concluded(
         checks_of,
         clock_findings,
         input_findings,
+        sampling_findings,
         tables,
         verdict,
         verdict_table,
@@ -313,7 +314,11 @@ def concluded(
     driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
-        found = [*clock_findings(driven.journal), *input_findings(driven.journal, driving)]
+        found = [
+            *sampling_findings(dataset, prepared.raw),
+            *clock_findings(driven.journal),
+            *input_findings(driven.journal, driving),
+        ]
         return verdict(dataset).with_findings(found)
 
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)

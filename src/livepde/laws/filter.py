@@ -24,7 +24,7 @@ from scipy.linalg import lapack
 
 from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
-from livepde.laws.input_noise import pause_rows, with_input_noise
+from livepde.laws.input_noise import after_pause, with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.member_sensors import MemberSensors
@@ -208,15 +208,12 @@ class Filter:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
         if failure is not None:
             return x, taken, failure
-        driven = x.driven.after(span)
-        if np.count_nonzero(driven.pause):
-            rows, failure = pause_rows(self.carried, self.problem, x, span, driven.pause)
+        end = changed(end, driven=x.driven.after(span))
+        if np.count_nonzero(end.driven.pause):
+            end, failure = after_pause(self.carried, self.problem, x, end, span)
             if failure is not None:
                 return x, taken, failure
-            if rows is not None:
-                end = with_rows(end, rows, np.zeros((*rows.shape[:2], x.C.shape[2])))
-                end = self.compressed(end) if end.U.shape[1] > self.rank else end
-        end = changed(end, driven=driven)
+            end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if self.shadows is not None:
             end = self.shadows.predict(x, end, span)
         if self.fading < math.inf:  # exponential decay of the cross-covariance

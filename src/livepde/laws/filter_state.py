@@ -9,7 +9,7 @@ import numpy as np
 from livepde.laws.gate import Screened
 from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import changed
-from livepde.laws.pauses import Driven
+from livepde.laws.pauses import InputHistory
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
@@ -93,7 +93,7 @@ class FilterState:
     causes: Array = field(metadata={"grows": 1, "begins_anew": True})
     ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState
-    driven: Driven
+    driven: InputHistory
 
     def __len__(self) -> int:
         return len(self.member)

@@ -14,13 +14,13 @@ from livepde.laws.filter_state import FilterState, with_rows
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed
 from livepde.laws.reduction import Reduction
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array
 from livepde.stepping import Span, StepFailed
 
 __all__ = [
+    "after_pause",
     "initial_rows",
     "input_rank",
-    "pause_rows",
     "with_initial_rows",
     "with_input_noise",
 ]
@@ -37,8 +37,7 @@ PIECES = 6  # of a pause, in each of which an input is a line
 
 def input_rank(problem: Problem) -> int:
     """Return how many rows of the square root noise, pauses and an initial state need."""
-    pause = PAUSE_ROWS if lines(problem) else 0
-    return ROWS * len(problem.input_noise) + problem.initial_rank + pause
+    return ROWS * len(problem.input_noise) + problem.initial_rank + PAUSE_ROWS
 
 
 def with_input_noise(
@@ -103,23 +102,23 @@ def lines(problem: Problem) -> list[str]:
     ]
 
 
-def pause_rows(
-    propagate: Propagate, problem: Problem, x: FilterState, span: Span, pause: Mask
-) -> tuple[Array | None, StepFailed | None]:
-    """Return rows of U after a pause, (members, rows, n); None if no input may have varied.
+def after_pause(
+    propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
+) -> tuple[FilterState, StepFailed | None]:
+    """Return the state after a span with more rows where the span was a pause.
 
     The deviation of an input from its line is a bridge: a sum of MODES sines over the pause with
-    independent amplitudes. Each row is the response to one of them.
+    independent amplitudes. Each row is the response to one of them, and one row is the change of
+    the state in the pause.
 
     Parameters
     ----------
     propagate
         Takes a state over a span.
-    x
-        The state before the pause.
-    pause
-        Members for which the span is a pause, shape (members,).
+    x, end
+        The state before and after the span.
     """
+    pause = end.driven.pause
     length = span.t1 - span.t0
     sizes = x.driven.deviation(length) * pause[:, None]
     members, bare = len(x), _bare(x)
@@ -150,18 +149,18 @@ def pause_rows(
                 return at.u, failure
         return at.u, None
 
+    # How long the pause was is not sure either: the clock may have been set in it.
+    rows = [(end.u - x.u) * pause[:, None]]
     names = [name for name in lines(problem) if sizes[:, problem.channels.index(name)].any()]
-    if not names:
-        return None, None
-    base, failure = after(names[0], 0)
-    rows = []
     for name in names:
+        base, failure = after(name, 0)
         for mode in range(1, MODES + 1):
             if failure is not None:
-                return None, failure
+                return end, failure
             u, failure = after(name, mode)
             rows.append(u - base)
-    return np.stack(rows, axis=1), failure
+    U = np.stack(rows, axis=1)
+    return with_rows(end, U, np.zeros((*U.shape[:2], x.C.shape[2]))), failure
 
 
 def _mixed(span: Span, s: float) -> Array:

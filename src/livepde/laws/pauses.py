@@ -15,7 +15,7 @@ import numpy as np
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span
 
-__all__ = ["Driven", "pauses"]
+__all__ = ["InputHistory", "pauses"]
 
 PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # intervals before which none is usual
@@ -23,7 +23,7 @@ SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class InputHistory:
     """What the inputs have done so far, and at which pace.
 
     Attributes
@@ -46,7 +46,7 @@ class Driven:
     pause: Mask
 
     @classmethod
-    def start(cls, channels: int, members: int = 1) -> Driven:
+    def start(cls, channels: int, members: int = 1) -> InputHistory:
         """Return the value before any interval."""
         far = np.full((members, channels), np.inf)
         none = np.zeros(members)
@@ -54,7 +54,7 @@ class Driven:
             low=far, high=-far, steepest=np.zeros_like(far), pace=none, count=none, pause=none > 0.0
         )
 
-    def after(self, span: Span) -> Driven:
+    def after(self, span: Span) -> InputHistory:
         """Return the value after an interval; a pause says nothing on how steep inputs are."""
         length = span.t1 - span.t0
         if not length.all():
@@ -67,7 +67,7 @@ class Driven:
             slopes = np.where(pause[:, None], 0.0, slopes)
             # A pace that changes for good is usual after a few samples.
             length = np.where(pause, PAUSE * self.pace, length)
-        return Driven(
+        return InputHistory(
             low=np.fmin(self.low, last),
             high=np.fmax(self.high, last),
             steepest=np.fmax(self.steepest, slopes),
@@ -84,7 +84,7 @@ class Driven:
 
 
 def pauses(times: Sequence[float] | Array) -> list[int]:
-    """Return the numbers of the samples that end a pause, by the rule of `Driven`."""
+    """Return the numbers of the samples that end a pause, by the rule of `InputHistory`."""
     found, pace = [], 0.0
     for k, length in enumerate(np.diff(times).tolist()):
         if k >= SETTLED and length > PAUSE * pace:
