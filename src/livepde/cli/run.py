@@ -340,6 +340,9 @@ def concluded(
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
+    figures: dict[str, Any] = {}
+    if draw and can_draw(terminal(err=True)):
+        figures = figures_of(dataset, loaded.title, driven.journal)
     writer.finish(
         status=driven.status,
         dataset=dataset,
@@ -347,7 +350,7 @@ def concluded(
         shown=shown,
         checks=checks,
         notes=notes,
-        figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
+        figures=figures,
     )
     return Conclusion(dataset, shown, checks, notes)
 

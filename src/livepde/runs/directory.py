@@ -347,6 +347,15 @@ class Run:
                 remedy = "delete it: they are read from the journal then"
             raise RunError(f"{path} is damaged: {error}; {remedy}.") from error
 
+    @contextmanager
+    def reading(self) -> Iterator[Journal | None]:
+        """Open the journal of the run for reading; None if it has none."""
+        if not (self.path / JOURNAL).is_file():
+            yield None
+            return
+        with Journal.open(self.path / JOURNAL) as journal:
+            yield journal
+
     def case_file(self) -> Path:
         """Return the case file to run again: the original if it is unchanged, else the copy.
 
