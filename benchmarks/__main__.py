@@ -344,14 +344,26 @@ def first_hour(
     *,
     seeds: Annotated[int, Count(20, 2, "Truths of each walk.")],
     only: Annotated[list[str] | None, several("Only this walk.")] = None,
+    wrong: Annotated[
+        bool, typer.Option("--wrong", help="One channel of each table is wrong.")
+    ] = False,
 ) -> Outcome:
     """Count how often the walks of docs/first-hour.md find truths of another code.
+
+    With --wrong one channel is late, scaled, exchanged or in degrees Fahrenheit: whether the runs
+    are not trusted, and name it first.
 
     Example:  python -m benchmarks first-hour --only pumping --seeds 4
     """
     from benchmarks.first_hour import WALKS
     from benchmarks.first_hour import first_hour as benchmark
+    from benchmarks.wrong_channels import FAULTS, wrong_channels
 
+    if wrong:
+        known = tuple(dict.fromkeys(fault.walk for fault in FAULTS))
+        walks = chosen(only, known, "walk", known)
+        faults = [fault for fault in FAULTS if fault.walk in walks]
+        return wrong_channels(faults, seeds=seeds, progress=True)
     return benchmark(tuple(chosen(only, WALKS, "walk", WALKS)), seeds=seeds, progress=True)
 
 

@@ -14,6 +14,7 @@ import runpy
 import shutil
 import tempfile
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.runs.outcome import Check, Outcome, Table
 
-__all__ = ["FOLDER", "WALKS", "first_hour", "write"]
+__all__ = ["FOLDER", "TABLES", "WALKS", "first_hour", "save", "write"]
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"
@@ -424,9 +425,14 @@ def write(folder: Path, walk: str, seed: int = WRITTEN) -> dict[str, float]:
         (folder / "places.csv").write_text("\n".join(["name,x,y", *lines]) + "\n")
     else:
         header, table, truths = TABLES[walk](seed)
-    rows = [",".join(map(_cell, row)) for row in table.tolist()]
-    (folder / f"{walk}.csv").write_text("\n".join([",".join(header), *rows]) + "\n")
+    save(folder / f"{walk}.csv", header, table)
     return truths
+
+
+def save(path: Path, header: Sequence[str], table: Array) -> None:
+    """Write a table as CSV."""
+    rows = [",".join(map(_cell, row)) for row in table.tolist()]
+    path.write_text("\n".join([",".join(header), *rows]) + "\n")
 
 
 def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = False) -> Outcome:

@@ -96,7 +96,7 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
         ("T\n20\n21\n", "has one column, 'T'; expected times and measurements"),
         ("time_s,T_1\n", "holds no rows beside its header."),
         ("", "holds no rows beside its header."),
-        ("time,T_1\ns,K\n0,20\n", "row 2: holds no numbers; the header is one line"),
+        ("time,T_1\na,b\ns,K\nc,d\n0,20\n", "row 2: holds no numbers; the header is one line"),
         ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
         (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
         ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),

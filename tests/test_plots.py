@@ -99,6 +99,7 @@ def test_without_matplotlib_one_sentence_tells_the_remedy(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     for draw in (
         lambda: plots.overview(dataset()),
+        lambda: plots.curves(dataset(), np.zeros(0), np.zeros((0, 2))),
         lambda: plots.profiles(dataset(), "u"),
         lambda: plots.history({}),
     ):
@@ -313,3 +314,35 @@ def test_an_unknown_over_orders_of_magnitude_has_a_logarithmic_axis() -> None:
     data["k"][0] = 300.0
     data["k_low"], data["k_high"] = data["k"] / 2.0, 2.0 * data["k"]
     assert panel(plots.overview(data), "k").get_yscale() == "log"
+
+
+# --- measured and expected -----------------------------------------------------------------------
+
+
+def test_measured_and_expected_curves_of_each_sensor() -> None:
+    data = dataset(withheld=1)
+    t = data["time"].values
+    measured = np.column_stack([t, 2.0 * t, 3.0 * t])
+    measured[4, 1] = np.nan
+    (ax,) = drawn(plots.curves(data, t, measured, title="A run")).axes
+    assert texts(ax) == ["s0", "s1", "w0"]
+    points, lines = ax.lines[::2], ax.lines[1::2]
+    errors = [data["innovation"][:, 0], data["innovation"][:, 1], data["withheld_error"][:, 0]]
+    for k, (point, line) in enumerate(zip(points, lines, strict=True)):
+        np.testing.assert_array_equal(point.get_ydata(), measured[:, k])
+        np.testing.assert_allclose(line.get_ydata(), measured[:, k] - errors[k].values)
+
+
+def test_curves_of_a_journal_that_has_lost_its_first_samples() -> None:
+    data = dataset()
+    t = data["time"].values[10:]
+    (ax,) = drawn(plots.curves(data, t, np.zeros((len(t), 2)))).axes
+    np.testing.assert_allclose(ax.lines[1].get_ydata(), -data["innovation"][10:, 0].values)
+
+
+def test_sensors_of_another_unit_have_a_panel_of_their_own() -> None:
+    data = dataset().assign_coords(sensor_unit=("sensor", ["degC", "W/m^2"]))
+    t = data["time"].values
+    axes = drawn(plots.curves(data, t, np.zeros((len(t), 2)))).axes
+    assert [texts(ax) for ax in axes] == [["s0"], ["s1"]]
+    assert [ax.get_ylabel() for ax in axes] == ["[°C]", "[W/m²]"]

@@ -286,6 +286,16 @@ def test_figures_are_drawn(tmp_path, driven):
     assert "![overview](overview.png)" in (tmp_path / "run" / "report.md").read_text()
 
 
+def test_a_journal_gives_the_readings_of_channels():
+    journal = drive(identifier(), samples(b=0.0)).journal
+    t, values = journal.readings(["b", "a", "nowhere"])
+    given = [*samples(b=0.0)]
+    assert t.tolist() == [item.t for item in given]
+    for name, column in zip(("b", "a"), values.T, strict=False):
+        assert column.tolist() == [item.z[name] for item in given]
+    assert np.isnan(values[:, 2]).all()
+
+
 # --- numbers ---------------------------------------------------------------------------------
 
 

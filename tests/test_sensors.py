@@ -293,13 +293,14 @@ def sensors_of_any_kind(draw):
             },
             inputs=("x",),
         ),
+        lp.observation.Fluxes({"e": "left", "i": a}, "gain"),
         lp.observation.Moving({"m": "x", "n": "missing"}),
         lp.observation.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
         lp.Full(),
         lp.Subdomain(lambda x: x[0] > 0.8 * a),
         lp.observation.Matrix(np.random.default_rng(power).standard_normal((3, 13)) + c),
     ]
-    both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6)])
+    both = lp.Combined([base[k] for k in (1, 2, 3, 4, 5, 6, 7)])
     base += [
         both,
         lp.observation.Calibrated(

@@ -63,7 +63,7 @@ def test_what_counts_as_missing(csv, missing):
         ("t,a,b\n0,1,1\nlater,1,1\n", "row 3, column 't': got 'later'"),
         ("t,a,b\n0,1,1\n,1,1\n", "row 3, column 't'"),
         ("t,a,b\n2025-01-01,1,1\n5,1,1\n", "expected a date"),
-        ("t,a,b\ns,K,K\n0,1,1\n1,1,1\n", "row 2, column 't': got 's'; expected a number"),
+        ("t,a,b\n0,1,1\ns,K,K\n1,1,1\n", "row 3, column 't': got 's'; expected a number"),
         ("t,a,b\n0,'1,5',1\n", "row 2: 4 fields, but the header has 3; decimals need a point"),
         ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, say decimal = ','"),
         ('t,a,b\n"0,5",1,1\n"0,6",1,1\n', "got '0,5'; if that is a decimal comma"),

@@ -10,7 +10,11 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["SECONDS", "dated", "instants", "when"]
+__all__ = ["SECONDS", "dated", "instants", "since", "when", "with_epoch", "without_epoch"]
+
+CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
+TIMES = ("time", "snapshot")  # coordinates of a dataset that are times
+OWN = "units_of_run"  # attribute of a time with an epoch: its unit as the run has it
 
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
 
@@ -21,6 +25,40 @@ def dated(data: xr.Dataset) -> tuple[datetime, float] | None:
     if origin is None or unit not in SECONDS:
         return None
     return datetime.fromisoformat(str(origin)), SECONDS[unit]
+
+
+def since(unit: str, origin: Any) -> dict[str, str]:
+    """Return the CF attributes of times in a unit, counted from a date; none without a date."""
+    if origin is None or unit not in CLOCKS:
+        return {}
+    return {"units": f"{CLOCKS[unit]} since {origin}", "calendar": "standard"}
+
+
+def with_epoch(data: xr.Dataset) -> xr.Dataset:
+    """Return a dataset whose times count from a date, so that other programs read dates.
+
+    The numbers stay as they are. A run without dates is returned as it is.
+    """
+    unit = str(data["time"].attrs.get("units", ""))
+    attrs = since(unit, data.attrs.get("origin"))
+    if not attrs:
+        return data
+    found = data.copy(deep=False)
+    for name in TIMES:
+        found[name] = found[name].copy(deep=False)
+        found[name].attrs = {**found[name].attrs, **attrs, OWN: unit}
+    return found
+
+
+def without_epoch(data: xr.Dataset) -> xr.Dataset:
+    """Return a dataset of `with_epoch`, read with its times as numbers, as it was before."""
+    if OWN not in data["time"].attrs:
+        return data
+    found = data.copy(deep=False)
+    for name in TIMES:
+        if name in found.coords:
+            found[name].attrs = {"units": data["time"].attrs[OWN]} if name == "time" else {}
+    return found
 
 
 def when(data: xr.Dataset, t: float) -> str:

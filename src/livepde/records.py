@@ -359,7 +359,7 @@ class Layout:
     Attributes
     ----------
     time_unit, sensor_unit
-        Units of time and innovations.
+        Units of time and innovations; `sensor_unit` is empty if the sensors have several.
     coordinates
         Axis -> coordinates of the vertices.
     cells
@@ -382,6 +382,8 @@ class Layout:
     comments
         Variable of a field -> what its numbers are, where that is not a mean or a standard
         deviation.
+    sensor_units
+        Sensor, withheld or not -> its unit; empty if they have one in common.
     """
 
     time_unit: str
@@ -399,6 +401,7 @@ class Layout:
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     attrs: Mapping[str, Any] = field(default_factory=dict)
     comments: Mapping[str, str] = field(default_factory=dict)
+    sensor_units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the layout as a JSON object."""
@@ -468,6 +471,8 @@ class Layout:
             **{axis: ("vertex", np.array(x), unit) for axis, x in self.coordinates.items()},
             **self._places("sensor", self.sensors),
             **self._places("withheld", withheld),
+            **self._sensor_units("sensor", self.sensors),
+            **self._sensor_units("withheld", withheld),
         }
 
     def _places(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
@@ -479,6 +484,12 @@ class Layout:
         unit = {"units": self.length_unit}
         axes = zip(self.coordinates, at.T, strict=True)
         return {f"{dimension}_{axis}": (dimension, x, unit) for axis, x in axes}
+
+    def _sensor_units(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
+        """Return the coordinate of the units of sensors, if they have several."""
+        if not self.sensor_units or not names:
+            return {}
+        return {f"{dimension}_unit": (dimension, [self.sensor_units[name] for name in names])}
 
     @classmethod
     def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
@@ -492,7 +503,22 @@ class Layout:
         pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
         grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
         at = {name: [0.0] * len(grid) for name in ("z", "w")}
-        blank = cls("", "", grid, none, ["z"], ["w"], {}, {}, pair, [], [], places=at)
+        units = {"z": "K", "w": "m"}
+        blank = cls(
+            "",
+            "",
+            grid,
+            none,
+            ["z"],
+            ["w"],
+            {},
+            {},
+            pair,
+            [],
+            [],
+            places=at,
+            sensor_units=units,
+        )
         rows, snapshot = RecordArrays(), Snapshot({}, {}, np.eye(2))
         rows.append(
             Record(

@@ -576,9 +576,17 @@ def layout_of(
     points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
     places = {**observed.places, **({} if withheld is None else withheld.places)}
+    units = {
+        name: unit
+        for one in (observed, withheld)
+        if one is not None
+        for name, unit in zip(one.names, one.units, strict=True)
+    }
+    stated = {unit for unit in units.values() if unit}
+    several = len(stated) > 1
     return Layout(
         time_unit=model.time_unit,
-        sensor_unit=observed.observation.unit,
+        sensor_unit="" if several else "".join(stated),
         coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
@@ -592,6 +600,7 @@ def layout_of(
         places={name: at.tolist() for name, at in places.items()},
         comments=_field_comments(model),
         attrs={"ignored": "\n".join(ignored)} if ignored else {},
+        sensor_units=units if several else {},
     )
 
 

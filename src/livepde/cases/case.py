@@ -30,7 +30,7 @@ from livepde.cases.case_content import CaseContent
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.equations import resolve
 from livepde.cases.laws import law_of
-from livepde.cases.process import conditioned, drive_notes, model_of, process_notes
+from livepde.cases.process import conditioned, drive_notes, model_of, process_notes, wall_attributes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS
 from livepde.errors import DataError
@@ -170,7 +170,7 @@ class Prepared:
             found["origin"] = self.origin.isoformat(sep=" ")
         if self.case.source:
             found["reference_source"] = self.case.source
-        return found
+        return found | wall_attributes(self.case, self.case.model)
 
 
 def load(
@@ -233,7 +233,7 @@ class Case(CaseContent):
         # In this order: an error about the mesh comes before those about what lies on it.
         _ = self.mesh, self.options, self.model, self.observation, self.withheld, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
-        _ = input_noise_of(self)
+        _ = input_noise_of(self), wall_attributes(self, self.model)
         check_initial(self)
         self._check_names()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -13,7 +13,14 @@ import numpy as np
 
 from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
-from livepde.cases.schema import SENSORS, CaseSpec, ChannelSpec, GradientSpec, TikhonovSpec
+from livepde.cases.schema import (
+    FLUX,
+    SENSORS,
+    CaseSpec,
+    ChannelSpec,
+    GradientSpec,
+    TikhonovSpec,
+)
 from livepde.cases.units import conversion
 from livepde.errors import CaseError, MissingInputError, SpaceError
 from livepde.fem import (
@@ -30,6 +37,7 @@ from livepde.observation import (
     Calibrated,
     Combined,
     Discrepancy,
+    Fluxes,
     LineIntegrals,
     Moving,
     Observation,
@@ -116,9 +124,11 @@ def observation_of(case: CaseContent, *roles: str) -> Observation | None:
         kinds.setdefault((_kind(channel), channel.of), {})[name] = channel
     names = [*chain.from_iterable(kinds.values())]
     levels = noise_of(case, *roles) if assimilated else None
+    units = {case.unit(name) for name in names}
     outer: dict[str, Any] = {
         "noise": levels and [levels[name] for name in names],
-        "unit": case.equation.state.unit,
+        # Sensors with several units have them from their parts.
+        "unit": units.pop() if len(units) == 1 else "",
         "reconstruction": _reconstruction(case) if assimilated else Pseudoinverse(),
     }
     own = any(item.offset or item.gain or item.correlated for item in channels.values())
@@ -132,14 +142,16 @@ def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> Observa
     """Return one observation of all kinds, which has the keyword arguments `outer`."""
     common = outer if len(kinds) == 1 else {}
     parts = [
-        _part(case, kind, members, {"of": of, **common} if of else common)
+        _part(case, kind, members, {"unit": case.unit(next(iter(members))), **common}, of)
         for (kind, of), members in kinds.items()
     ]
     return parts[0] if len(parts) == 1 else Combined(parts, **outer)
 
 
 def _kind(channel: ChannelSpec) -> str:
-    """Return the key that makes a channel a sensor of its kind."""
+    """Return what makes a channel a sensor of its kind: a key, or the quantity "flux"."""
+    if channel.is_flux:
+        return FLUX
     given = (key for key in ("over", "along", "follows") if getattr(channel, key) is not None)
     return next(given, "at")
 
@@ -190,8 +202,14 @@ def _part(
     kind: str,
     channels: Mapping[str, ChannelSpec],
     common: Mapping[str, Any],
+    of: str | None,
 ) -> Observation:
-    """Return the observation of channels of one kind."""
+    """Return the observation of channels of one kind, of a component of the state."""
+    if of is not None:
+        common = {**common, "of": of}
+    if kind == FLUX:
+        places = {name: _flux_place(case, name, item) for name, item in channels.items()}
+        return Fluxes(places, case.equation.conductivity, **common)
     if kind == "over":
         return Averages(_regions(case, channels), **common)
     if kind == "along":
@@ -218,6 +236,20 @@ def _part(
             )
         common = {**common, "component": numbers}
     return Points(points, direct, uncertain or None, **common)
+
+
+def _flux_place(case: CaseContent, name: str, channel: ChannelSpec) -> float | str:
+    """Return the end of the mesh where a flux is measured, or a position inside."""
+    if not case.equation.conductivity:
+        text = f"the equation '{case.equation.name}' has no flux to measure; leave it out."
+        raise case.error(f"channels.{name}.quantity", text)
+    if len(case.mesh.p) != 1:
+        text = "'flux' requires an interval; use livepde.observation.Functionals in Python."
+        raise case.error(f"channels.{name}.quantity", text)
+    if isinstance(channel.at, str) and channel.at in (case.mesh.boundaries or {}):
+        return channel.at
+    place: float = _inside_mesh(case, channel.at, f"channels.{name}.at")
+    return place
 
 
 def _reconstruction(case: CaseContent) -> Reconstruction:
@@ -268,8 +300,27 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
 
 def sensor_notes(case: CaseContent) -> list[str]:
     """Return notes on positions of sensors that are allowed and yet doubtful."""
-    channels = case.roles(*SENSORS)
-    if len(case.mesh.p) != 1 or any(item.at is None for item in channels.values()):
+    return [*_noisy_fluxes(case), *_crowded(case)]
+
+
+def _noisy_fluxes(case: CaseContent) -> Iterator[str]:
+    """Yield a note on each flux that is measured at a boundary with a noisy value."""
+    noisy = {item.at: name for name, item in case.roles("boundary").items() if item.noise}
+    for name, item in case.roles("sensor").items():
+        if item.is_flux and item.at in noisy:
+            other = noisy[item.at]
+            yield (
+                f"The noise of {other} between readings moves the flux that {name} measures at "
+                f"'{item.at}'. Make {other} a sensor at that end, and the flux an unknown that "
+                f"moves: boundary.{item.at} = {{ flux = 'J' }} with unknowns.J.evolution."
+            )
+
+
+def _crowded(case: CaseContent) -> list[str]:
+    """Return a note if all sensors lie in one cell."""
+    shown = case.roles(*SENSORS).items()
+    channels = {name: item for name, item in shown if not item.is_flux}
+    if len(case.mesh.p) != 1 or not channels or any(item.at is None for item in channels.values()):
         return []
     at = {float(_position(case, name, item)) for name, item in channels.items()}
     if len(at) == 1 or len(set(np.searchsorted(np.sort(case.mesh.p[0]), list(at)).tolist())) > 1:
@@ -418,7 +469,7 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
     for name, channel in case.roles("sensor", "boundary").items():
         if channel.role == "boundary" and channel.at in ends:
             found.append(_Reading(ends[str(channel.at)], values[name], name))
-        elif channel.role == "sensor" and channel.at is not None:
+        elif channel.role == "sensor" and channel.at is not None and not channel.is_flux:
             place = _position(case, name, channel)
             found.append(_Reading(place, values[name], name))
     present = [one for one in found if np.isfinite(one.value)]

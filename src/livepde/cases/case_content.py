@@ -145,6 +145,8 @@ class CaseContent:
             return self.equation.inputs[channel].unit
         if self.spec.channels[channel].role == "position":
             return self.equation.length_unit
+        if self.spec.channels[channel].is_flux and self.equation.fluxes is not None:
+            return self.equation.fluxes.flux
         return self.equation.state.unit
 
 

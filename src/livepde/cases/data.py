@@ -254,7 +254,7 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
     for k, name in enumerate(names):
         channel = case.spec.channels.get(name)
         # A channel that is held may leap at any time.
-        if channel is None or channel.between != "line":
+        if channel is None or channel.between != "line" or channel.is_flux:
             continue
         if channel.role in ("boundary", *SENSORS):
             groups.setdefault(channel.of, []).append(k)

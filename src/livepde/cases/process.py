@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -31,11 +32,14 @@ from livepde.fem import (
     Sobolev,
     linear,
 )
+from livepde.fem.field_blocks import base_name
 from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount, Multiple
+from livepde.observation.fluxes import in_cells
+from livepde.runs.thermal_resistance import LAYERS, SURFACES
 
-__all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes"]
+__all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes", "wall_attributes"]
 
 
 HELD = 1e4  # transfer coefficient at a boundary that is held, over D and the size of a cell
@@ -271,6 +275,30 @@ def _without_cells(case: CaseContent, given: Any, key: str) -> CaseError:
     return case.error(key, text)
 
 
+def wall_attributes(case: CaseContent, model: Model) -> dict[str, Any]:
+    """Return the attributes of a dataset by which the resistance of a wall is reported.
+
+    A wall is an interval with conductivities that are numbers; of other cases there are none.
+    """
+    name, given = case.equation.conductivity, case.spec.output.surface_resistances
+    unit = case.equation.unknowns[name].unit if name else ""
+    layers: dict[str, float] = {}
+    if unit == "W/(m K)" and len(case.mesh.p) == 1:
+        space = model.parameter_space
+        lengths = np.ptp(case.mesh.p[0][case.mesh.t], axis=0) @ in_cells(space, case.mesh, name)
+        numbers = [label for label in space.labels if base_name(label) == name]
+        layers = {label: float(lengths[space.labels[label]]) for label in numbers}
+    if given is None:
+        return {LAYERS: json.dumps(layers)} if layers else {}
+    key = "output.surface_resistances"
+    if not layers:
+        raise case.error(key, "requires a wall: an interval with conductivities that are numbers.")
+    surfaces = [case.convert(value, "m^2 K/W", key) for value in given]
+    if min(surfaces) < 0.0:
+        raise case.error(key, f"got {list(given)}; expected 0 or more.")
+    return {LAYERS: json.dumps(layers), SURFACES: sum(surfaces)}
+
+
 def drive_notes(case: CaseContent, model: Model) -> list[str]:
     """Return a note if only the initial state drives the process.
 
@@ -442,10 +470,12 @@ def _check_drive(case: CaseContent, storage: str) -> None:
     ]
     if any(amount not in (None, 0.0) and amount not in spec.unknowns for amount in amounts):
         return
+    if any(item.is_flux for item in case.roles("sensor").values()):
+        return
     text = (
         f"temperatures alone do not determine '{storage}'; it requires a known flux, exchange or "
-        "source. Add one, such as boundary.left = { flux = 'CHANNEL' } of a heat-flux plate, or "
-        f"state options.{storage}."
+        "source, or a measured flux. Add one, such as boundary.left = { flux = 'CHANNEL' } or a "
+        f"sensor with quantity = 'flux' of a heat-flux plate, or state options.{storage}."
     )
     raise case.error(f"unknowns.{storage}", text)
 

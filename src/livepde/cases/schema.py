@@ -33,6 +33,7 @@ from livepde.streams.mqtt import Broker
 SENSORS = ("sensor", "withheld", "ignored")  # roles of channels that measure the state
 
 __all__ = [
+    "FLUX",
     "SENSORS",
     "BoundarySpec",
     "CaseSpec",
@@ -395,6 +396,9 @@ class CorrelatedSpec(Spec):
     std: Quantity
 
 
+FLUX = "flux"  # quantity of a sensor that measures a flux
+
+
 class ChannelSpec(Spec):
     """One channel of the stream and its role."""
 
@@ -430,6 +434,11 @@ class ChannelSpec(Spec):
         return (self.at, self.each, self.positions) != (None, None, None)
 
     @property
+    def is_flux(self) -> bool:
+        """Whether the channel measures a flux, and not the state."""
+        return self.quantity == FLUX
+
+    @property
     def drives(self) -> bool:
         """Whether the channel drives the model: a boundary value or another input."""
         return self.role in ("boundary", "input")
@@ -454,11 +463,26 @@ class ChannelSpec(Spec):
     @model_validator(mode="after")
     def _one_place(self) -> ChannelSpec:
         fixed = (self.at, self.over, self.along, self.each, self.positions)
-        placed = sum(place is not None for place in (*fixed, self.follows, self.quantity))
+        quantity = None if self.is_flux else self.quantity
+        placed = sum(place is not None for place in (*fixed, self.follows, quantity))
+        if self.is_flux and self.role not in ("sensor", "withheld"):
+            raise ValueError(
+                'quantity = "flux" requires a sensor; a flux that drives the model is an input '
+                "that boundary.NAME.flux names"
+            )
         if self.role in ("input", "position") and placed:
             raise ValueError(f"a channel of role {self.role} has no place: leave it out")
         if self.role == "boundary" and not isinstance(self.at, str):
             raise ValueError('a boundary channel needs at = the name of a boundary, as "left"')
+        if self.is_flux:
+            if self.at is None or placed != 1:
+                raise ValueError(
+                    'quantity = "flux" needs at = the name of an end, as "left", or a position'
+                )
+            if own := {"offset", "correlated", "at_std", "of", "component"} & self.model_fields_set:
+                raise ValueError(
+                    f'{own.pop()} is not possible with quantity = "flux": leave it out'
+                )
         if self.role in SENSORS and placed != 1:
             raise ValueError(
                 "expected one of: at = position, over = [from, to], along = [start, end], "
@@ -584,6 +608,7 @@ class OutputSpec(Spec):
     retain: Quantity | None = None
     thin: PositiveInt = Retention.every
     smoothed: StrictBool = False
+    surface_resistances: tuple[Quantity, Quantity] | None = None
     mqtt: PublishSpec | None = None
 
     @model_validator(mode="after")

@@ -57,6 +57,7 @@ def check(
         *loaded.notes,
         *_refused(prepared),
         *_sentinels(loaded, samples),
+        *_sampling(prepared, samples),
         *_switching(loaded, samples),
         *_show_preview(console, prepared),
     ]
@@ -100,6 +101,18 @@ def _sentinels(case: Case, samples: DataTable) -> list[str]:
             for found in sentinels(np.round((values - column.offset) / column.factor, 9))
         ]
     return said
+
+
+def _sampling(prepared: Prepared, samples: DataTable) -> list[str]:
+    """Return sentences on times that change their unit or leap, and on pauses."""
+    import xarray as xr
+
+    from livepde.runs import sampling_findings
+
+    unit = {"units": prepared.case.equation.time_unit}
+    attrs = {} if prepared.origin is None else {"origin": prepared.origin.isoformat(sep=" ")}
+    times = xr.Dataset(coords={"time": ("time", samples.t, unit)}, attrs=attrs)
+    return [finding.sentence for finding in sampling_findings(times, samples)]
 
 
 def _switching(case: Case, samples: DataTable) -> list[str]:

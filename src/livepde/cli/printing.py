@@ -16,7 +16,7 @@ from livepde import __version__
 from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from livepde.runs import Check, Outcome, Table
+    from livepde.runs import Check, Journal, Outcome, Table
 
 __all__ = [
     "BAD_INPUT",
@@ -33,6 +33,7 @@ __all__ = [
     "terminal",
 ]
 
+MOST_CURVES = 100_000  # samples of a run whose readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 FIGURES_MISSING = "No figures: they need Matplotlib, pip install 'livepde[plots]'."
 
@@ -61,13 +62,25 @@ def can_draw(console: Console) -> bool:
     return found
 
 
-def figures_of(dataset: Any, title: str) -> dict[str, Any]:
-    """Return the figures of a run: name -> function that draws."""
+def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict[str, Any]:
+    """Return the figures of a run: name -> function that draws.
+
+    Parameters
+    ----------
+    journal
+        Has the readings, for the figure `curves` of runs that are not too long.
+    """
     from livepde import plots
 
     if not dataset.sizes["time"]:
         return {}
-    return {"overview": lambda: plots.overview(dataset, title=title)}
+    found: dict[str, Any] = {"overview": lambda: plots.overview(dataset, title=title)}
+    kinds = [of for of in ("sensor", "withheld") if of in dataset]
+    names = [str(name) for of in kinds for name in dataset[of].values]
+    if journal is not None and names and len(journal) <= MOST_CURVES:
+        kept = journal.readings(names)
+        found["curves"] = lambda: plots.curves(dataset, *kept, title=title)
+    return found
 
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:

@@ -49,7 +49,10 @@ def report(
     shown = attempted("The tables", opened.summary, nothing, notes)
     shown = [*shown, *attempted("The table of irregular rows", opened.arrivals, nothing, notes)]
     console = terminal(err=as_json)
-    figures = figures_of(found, opened.title) if can_draw(console) else {}
+    figures: dict[str, Any] = {}
+    if can_draw(console):
+        with opened.reading() as journal:
+            figures = figures_of(found, opened.title, journal)
     try:
         drawn = drawn_into(folder, figures, notes)
         text = markdown(opened.title, shown, checks, notes, drawn)

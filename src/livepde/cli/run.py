@@ -297,6 +297,7 @@ def concluded(
         checks_of,
         clock_findings,
         input_findings,
+        sampling_findings,
         tables,
         verdict,
         verdict_table,
@@ -314,7 +315,11 @@ def concluded(
     driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
-        found = [*clock_findings(driven.journal), *input_findings(driven.journal, driving)]
+        found = [
+            *sampling_findings(dataset, prepared.raw),
+            *clock_findings(driven.journal),
+            *input_findings(driven.journal, driving),
+        ]
         return with_settings(prepared, verdict(dataset).with_findings(found))
 
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
@@ -336,6 +341,9 @@ def concluded(
         notes.append(f"Interrupted after {len(driven.result)} samples.")
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
+    figures: dict[str, Any] = {}
+    if draw and can_draw(terminal(err=True)):
+        figures = figures_of(dataset, loaded.title, driven.journal)
     writer.finish(
         status=driven.status,
         dataset=dataset,
@@ -343,7 +351,7 @@ def concluded(
         shown=shown,
         checks=checks,
         notes=notes,
-        figures=figures_of(dataset, loaded.title) if draw and can_draw(terminal(err=True)) else {},
+        figures=figures,
     )
     return Conclusion(dataset, shown, checks, notes)
 

@@ -282,8 +282,8 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
 
 
 def _ports(observed: Observed, text: str) -> list[Port]:
-    unit = observed.observation.unit
-    return [Port(name, unit, text, Column((name,))) for name in observed.names]
+    named = zip(observed.names, observed.units, strict=True)
+    return [Port(name, unit, text, Column((name,))) for name, unit in named]
 
 
 def _has_covariance(law: object) -> bool:

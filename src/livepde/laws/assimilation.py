@@ -224,7 +224,7 @@ def absorb(
         whole = bool(used.all())
         e = np.where(used, e, np.nan)
     elif options.gate.beyond < math.inf:
-        screened, pause = x.screened.paused(span.t1 - span.t0)
+        screened, pause = x.screened, x.driven.pause
         far = _far(x, e, d, variance, shift, pause, used, options.gate.beyond)
         z = span.z1
         if z.shape != used.shape:  # members may share one sample

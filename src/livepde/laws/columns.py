@@ -439,7 +439,8 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
     problem = columns.work.filter.problem
     what = "input" if first in columns.inputs else "sensor"
     time = f" {problem.model.time_unit}" if problem.model.time_unit else ""
-    unit = problem.observed.observation.unit if what == "sensor" else ""
+    units = dict(zip(problem.observed.names, problem.observed.units, strict=True))
+    unit = units.get(first, "") if what == "sensor" else ""
     amount = f"{abs(size):.2g} {unit}".rstrip()
     words: dict[str, Callable[[], tuple[str, str]]] = {
         "offset": lambda: (

@@ -24,7 +24,7 @@ from scipy.linalg import lapack
 
 from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
-from livepde.laws.input_noise import with_input_noise
+from livepde.laws.input_noise import after_pause, with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.member_sensors import MemberSensors
@@ -254,6 +254,12 @@ class Filter:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
         if failure is not None:
             return x, taken, failure
+        end = changed(end, driven=x.driven.after(span))
+        if np.count_nonzero(end.driven.pause):
+            end, failure = after_pause(self.carried, self.problem, x, end, span)
+            if failure is not None:
+                return x, taken, failure
+            end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if self.shadows is not None:
             end = self.shadows.predict(x, end, span)
         if self.fading < math.inf:  # exponential decay of the cross-covariance

@@ -9,6 +9,7 @@ import numpy as np
 from livepde.laws.gate import Screened
 from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import changed
+from livepde.laws.pauses import InputHistory
 from livepde.laws.shadow_state import ShadowState
 from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
@@ -71,6 +72,8 @@ class FilterState:
         `livepde.verdict`. The filter itself never reads them.
     shadows
         Estimated discretisation error.
+    driven
+        What the inputs have done so far.
     """
 
     member: IntArray
@@ -94,6 +97,7 @@ class FilterState:
     causes: Array = field(metadata={"grows": 1, "begins_anew": True})
     ledger: Ledger = field(metadata={"begins_anew": True})
     shadows: ShadowState
+    driven: InputHistory
 
     def __len__(self) -> int:
         return len(self.member)

@@ -16,7 +16,6 @@ __all__ = ["Gate", "Gated", "Screened"]
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 LASTING = 100  # readings that misfit, after which constants have to explain them as well
 CALM = 50  # samples without a correction of the state, after which a disturbance is over
-PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
 ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
 
@@ -48,8 +47,6 @@ class Screened:
         Readings that misfit while they corrected the state, since a disturbance began.
     calm
         Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
-    pace
-        Longest usual interval between samples, shape (members,); 0 before.
     """
 
     refused: IntArray
@@ -67,7 +64,6 @@ class Screened:
     longest: IntArray
     strain: IntArray
     calm: IntArray
-    pace: Array
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Screened:
@@ -90,18 +86,7 @@ class Screened:
             longest=none,
             strain=none,
             calm=np.full(members, CALM),
-            pace=np.zeros(members),
         )
-
-    def paused(self, length: Array) -> tuple[Screened, Mask]:
-        """Return the value after intervals of a length (members,), and which were pauses."""
-        longer: Mask = length > self.pace
-        if not np.count_nonzero(longer):
-            return self, longer
-        pause = longer & (self.pace > 0.0) & (length > PAUSE * self.pace)
-        # A pace that changes for good is usual after a few samples.
-        usual = np.where(pause, PAUSE * self.pace, length)
-        return changed(self, pace=np.maximum(self.pace, usual)), pause
 
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""

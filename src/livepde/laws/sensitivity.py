@@ -33,6 +33,7 @@ from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem,
 from livepde.laws.member_arrays import changed, join, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.one_member import step_alone
+from livepde.laws.pauses import InputHistory
 from livepde.laws.reduction import Reduction
 from livepde.laws.refit_apart import go_on
 from livepde.laws.refit_options import Refit
@@ -278,6 +279,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             causes=np.zeros((1, k, filter_.judge.rank if filter_.judge else 0)),
             ledger=filter_.judge.start() if filter_.judge else NO_LEDGER,
             shadows=ShadowState.none(1, n, k),
+            driven=InputHistory.start(len(problem.channels)),
         )
         if filter_.shadows is not None:
             given = problem.initial

@@ -356,8 +356,11 @@ def stored(
     parts["log"] = log
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
-    if work.window and anchored is not None and (anchored & taken).any():
-        parts |= _windows_from(state, now, log.shape[1] - 1, anchored & taken)
+    # After a pause the state is another one, too.
+    pause = now.driven.pause
+    begun = taken & (pause if anchored is None else pause | anchored)
+    if work.window and np.count_nonzero(begun):
+        parts |= _windows_from(state, now, log.shape[1] - 1, begun)
     # Two earlier filters suffice: every `back` samples the newer one becomes the older one, and the
     # law can go back by at least `back` samples and less than twice as many.
     last = log.shape[1] - 1
@@ -385,7 +388,7 @@ def _windows_from(
 ) -> dict[str, Any]:
     """Return the fields of windows that begin with a filter at a row, of some members.
 
-    No trajectory of constant unknowns passes through a disturbance.
+    No trajectory of constant unknowns passes through a disturbance or a pause.
     """
     zero = np.zeros(len(begun), dtype=np.int64)
     return {

@@ -651,6 +651,11 @@ class ShadowSet:
                 parts["u0"] = np.where(rows, x.u, s.u0)
         for shadow in self.shadows:
             parts |= shadow.read(s, span)
+        # What inputs may have done in a pause stands in the covariance of the state.
+        if (pause := end.driven.pause).any() and "missed" in parts:
+            rows = pause[:, None]
+            parts["bend"] = np.where(rows, 0.0, parts["bend"])
+            parts["missed"] = np.where(rows, s.missed, parts["missed"])
         s = changed(s, **parts)
         # After a jump of the drive the error of the step is another one at once.
         due = (s.count >= s.due) | jumps

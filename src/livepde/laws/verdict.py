@@ -286,7 +286,7 @@ def _position(filter_: Filter, x: FilterState) -> Position:
         distance=_distance(reduction, x, a),
         sensors=sensors,
         noise=np.sqrt(x.level[0]) * filter_.noise,
-        unit=problem.observed.observation.unit,
+        unit=problem.observed.unit,
         time_unit=problem.model.time_unit,
         unknowns=names,
         moving=reduction.moves,

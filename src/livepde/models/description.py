@@ -109,6 +109,8 @@ class Equation:
         Function mesh -> element of the state, and of unknown fields.
     fluxes
         Units of fluxes and sources (`livepde.models.with_conditions`); None: it takes none.
+    conductivity
+        Unknown D of the flux -D u_x, measured by sensors with `quantity = "flux"`; empty: none.
     storage
         Option that may be an unknown instead, by which the equation is divided then: only the
         ratio of other unknowns to it is determined without a known flux or source.
@@ -135,6 +137,7 @@ class Equation:
     length_unit: str = "m"
     time_unit: str = "s"
     fluxes: Fluxes | None = None
+    conductivity: str = ""
     storage: str = ""
     spacing: Literal["uniform", "geometric"] = "uniform"
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -224,6 +224,7 @@ HEAT = Equation(
     build=by_name(heat),
     element=linear,
     fluxes=Fluxes("K m/s", "m/s", "K/s"),
+    conductivity="alpha",
 )
 
 CONDUCTION = Equation(
@@ -243,5 +244,6 @@ CONDUCTION = Equation(
     build=by_name(conduction),
     element=linear,
     fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
+    conductivity="k",
     storage="C",
 )

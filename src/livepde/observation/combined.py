@@ -28,7 +28,7 @@ class Combined(Observation):
     ----------
     parts
         Observations; the names of all their sensors differ. Each has its own `noise`, unless
-        `noise` is given here for all sensors.
+        `noise` is given here for all sensors, and its own `unit` likewise.
 
     Examples
     --------
@@ -112,6 +112,12 @@ class CombinedObserved(Observed):
     @property
     def places(self) -> Mapping[str, Array]:
         return {name: at for part in self.parts for name, at in part.places.items()}
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        if self.observation.unit:
+            return super().units
+        return tuple(unit for part in self.parts for unit in part.units)
 
     @cached_property
     def noise(self) -> Array | None:
@@ -221,6 +227,10 @@ class CalibratedObserved(Observed):
 
     def _names(self) -> tuple[str, ...]:
         return self.base.names
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return super().units if self.observation.unit else self.base.units
 
     @property
     def places(self) -> Mapping[str, Array]:

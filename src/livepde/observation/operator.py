@@ -183,6 +183,17 @@ class Observed:
         return {} if at is None else dict(zip(self.names, at, strict=True))
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each sensor."""
+        return (self.observation.unit,) * self.size
+
+    @property
+    def unit(self) -> str:
+        """Common unit of the sensors; empty if they differ."""
+        first, *others = self.units
+        return first if all(other == first for other in others) else ""
+
+    @property
     def nodal(self) -> bool:
         """True if G^+ is taken in coefficients, False if in the inner product of X."""
         return self.observation.nodal

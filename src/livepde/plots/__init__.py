@@ -16,13 +16,14 @@ from livepde.plots.dataset import (
     sensor_places,
     time_scale,
 )
-from livepde.plots.run_figure import overview
+from livepde.plots.run_figure import curves, overview
 from livepde.plots.style import GREY, PALETTE, figure
 
 __all__ = [
     "GREY",
     "NORMAL_95",
     "PALETTE",
+    "curves",
     "ensemble",
     "figure",
     "history",

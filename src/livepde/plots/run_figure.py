@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["overview"]
+__all__ = ["curves", "overview"]
 
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
 RESIDUALS = (  # variable, its dimension, title of its panel
@@ -71,6 +71,56 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
         alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
         panel(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
     return drawn
+
+
+def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> Figure:
+    """Draw the readings of each sensor, and what the model expected of them.
+
+    Parameters
+    ----------
+    data
+        Dataset as returned by `Result.to_xarray()`.
+    t, measured
+        Times, and readings of the assimilated and then of the withheld sensors, NaN where missing,
+        shapes (samples,) and (samples, sensors).
+    title
+        Title above all panels.
+    """
+    figure_class()
+    errors = [data[name].transpose("time", of).values for name, of, _ in RESIDUALS if name in data]
+    times = data["time"].values
+    rows = np.searchsorted(times, t).clip(max=len(times) - 1)
+    known = times[rows] == t
+    expected = measured[known] - np.concatenate(errors, axis=1)[rows[known]]
+    names = [str(name) for _, of, _ in RESIDUALS if of in data for name in data[of].values]
+    units = _units_of(data, names)
+    each = list(dict.fromkeys(units.values()))
+    drawn = empty(len(each), 1, title)
+    grid = drawn.add_gridspec(len(each), 1)
+    for k, unit in enumerate(each):
+        ax = drawn.add_subplot(grid[k, 0])
+        shown = [i for i, name in enumerate(names) if units[name] == unit]
+        for n, i in enumerate(shown[:MOST_LINES]):
+            colour = PALETTE[n % len(PALETTE)]
+            at = time_values(data, t)
+            ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
+            ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, label=names[i])
+        time_axis(ax, data)
+        ax.set_ylabel(labelled("", unit).strip())
+        ax.set_title("measured (points) and expected one step ahead (lines)")
+        finish(ax)
+    return drawn
+
+
+def _units_of(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
+    """Return the unit of each sensor."""
+    common = str(data["innovation"].attrs.get("units", ""))
+    units = dict.fromkeys(names, common)
+    for dimension in ("sensor", "withheld"):
+        if f"{dimension}_unit" in data.coords:
+            own = data[f"{dimension}_unit"].values
+            units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
+    return units
 
 
 def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Axes], Axes]]:

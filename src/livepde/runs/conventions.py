@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from livepde.dates import since
 from livepde.plots.dataset import field_names, interval_95, scalars
 from livepde.runs.directory import plain
 
@@ -41,7 +42,6 @@ LONG_NAMES = {
 DIFFERENCES = ("innovation", "withheld_error")
 # CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
 AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
-CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
 SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "°C": "degC",
     "°F": "degF",
@@ -192,10 +192,10 @@ def _name_lists(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
 def _clock_attrs(clock: str, origin: str | None) -> dict[str, str]:
     """Return the CF attributes of times in a unit, counted from a date where the run has one."""
     attrs = {"standard_name": "time"} if clock else {}
-    if origin is None or clock not in CLOCKS:
+    counted = since(clock, origin)
+    if not counted:
         return attrs | _unit_attrs("time", clock)
-    since = {"units": f"{CLOCKS[clock]} since {origin}", "calendar": "standard"}
-    return attrs | since | {"units_metadata": "leap_seconds: none"}
+    return attrs | counted | {"units_metadata": "leap_seconds: none"}
 
 
 def _unit_attrs(name: str, own: str) -> dict[str, str]:

@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from livepde.atomic_write import PARTIAL, replacing, write_bytes
+from livepde.dates import with_epoch, without_epoch
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
@@ -258,7 +259,7 @@ class RunWriter:
     def _write_estimates(self, dataset: xr.Dataset) -> None:
         """Write the dataset, and its digest before it takes its place and after."""
         with replacing(self.path / ESTIMATES) as partial:
-            _to_netcdf(dataset, partial)
+            _to_netcdf(with_epoch(dataset), partial)
             new = hashlib.sha256(partial.read_bytes()).hexdigest()
             self.record[CONTENT] = [*self.record.get(CONTENT, []), new]
             self._save_record()
@@ -331,7 +332,8 @@ class Run:
                 raise ValueError("its bytes are not those that were written")
             # What is written here decodes in silence: a warning tells of bytes that changed.
             with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
-                return xr.load_dataset(io.BytesIO(content), engine="scipy")
+                raw = io.BytesIO(content)
+                return without_epoch(xr.load_dataset(raw, engine="scipy", decode_times=False))
         except (
             OSError,
             ValueError,
@@ -344,6 +346,15 @@ class Run:
             if journal.is_file():
                 remedy = "delete it: they are read from the journal then"
             raise RunError(f"{path} is damaged: {error}; {remedy}.") from error
+
+    @contextmanager
+    def reading(self) -> Iterator[Journal | None]:
+        """Open the journal of the run for reading; None if it has none."""
+        if not (self.path / JOURNAL).is_file():
+            yield None
+            return
+        with Journal.open(self.path / JOURNAL) as journal:
+            yield journal
 
     def case_file(self) -> Path:
         """Return the case file to run again: the original if it is unchanged, else the copy.

@@ -513,6 +513,15 @@ class Journal:
         found = self._samples("WHERE id >= ? ORDER BY id LIMIT ?", start, FEW)
         return [(one.t, one.values) for one in found if one.t <= high]
 
+    def readings(self, names: Sequence[str]) -> tuple[Array, Array]:
+        """Return times and values of channels in all samples, (samples,), (samples, channels)."""
+        rows = [
+            (one.t, [one.values.get(name, math.nan) for name in names])
+            for one in self._samples("ORDER BY id")
+        ]
+        values = np.array([row for _, row in rows]).reshape(len(rows), len(names))
+        return np.array([t for t, _ in rows]), values
+
     def _number_at(self, t: float) -> int:
         """Return the number of the first sample not earlier than a time, by bisection."""
         # Times are sorted but have no index, so bisection by the primary key is the short way.

@@ -12,18 +12,21 @@ import numpy as np
 
 from livepde.dates import when
 from livepde.laws.equation_tests import rested
+from livepde.laws.pauses import pauses
 from livepde.laws.step_ledger import step_findings
 from livepde.linalg import Array
 from livepde.plots.dataset import field_names, note, prior_left, scalars
 from livepde.records import STATUS_CODES
 from livepde.runs.outcome import Table
 from livepde.runs.summary import digits, jumps, shown
+from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor
 from livepde.verdict import (
     FLAT,
     MOST,
     PROMISES,
     REFINE,
     REFUSED,
+    Cause,
     Finding,
     Severity,
     Shifts,
@@ -37,12 +40,14 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.runs.journal import Journal
+    from livepde.streams import DataTable
 
 __all__ = [
     "clock_findings",
     "doubts",
     "findings_of",
     "input_findings",
+    "sampling_findings",
     "severities",
     "unexplained",
     "verdict",
@@ -131,6 +136,59 @@ def clock_findings(journal: Journal) -> list[Finding]:
     )
     remedy = "If the clock was wrong, state its correction with `intake.shift`."
     return [Finding("clock", "caution", text, "", count, remedy=remedy)]
+
+
+def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[Finding]:
+    """Return what the times of a run show: units that changed, clocks that leapt, and pauses.
+
+    Parameters
+    ----------
+    table
+        The complete record of the run, whose readings tell a clock that leapt from a pause.
+    """
+    t, found = data["time"].values, list[Finding]()
+    leaps = {}
+    if table is not None:
+        rows = pauses(table.t)
+        leaps = {leap.t: leap for leap in clock_leaps(table.t, table.values, rows)}
+    anchors = note(data, "residual") is None  # the gradient law has no covariance
+    for k in pauses(t):
+        usual = float(np.median(np.diff(t[:k])))
+        length, at = float(t[k] - t[k - 1]), when(data, float(t[k]))
+        times = f"{length:.6g} {data['time'].attrs.get('units', '')}".rstrip()
+        if factor := unit_factor(float(t[k - 1]), float(t[k]), usual):
+            found.append(_unit_changed(k, at, factor))
+            break  # of later steps nothing is known
+        after = "The state is estimated again from there on, and the unknowns are kept."
+        if float(t[k]) in leaps:
+            found.append(_leapt(k, at, times, after if anchors else ""))
+            continue
+        text = f"No sample for {times} until {at}, {length / usual:.0f} usual intervals."
+        text = f"{text} {after}" if anchors else text
+        found.append(Finding("pause", "note", text, "", length))
+    return found
+
+
+def _unit_changed(k: int, at: str, factor: float) -> Finding:
+    """Return that times count in another unit from a sample on."""
+    text = (
+        f"From sample {k + 1} on ({at}) times are {factor:g} times as large as those before: they "
+        f"seem to be in another unit, such as {FACTORS[factor]} after seconds."
+    )
+    remedy = f"Divide the times from that row on by {factor:g}, or split the table there."
+    cause = Cause("clock", "time", f"the unit of time changes at {at}", 1.0, remedy)
+    return Finding("clock", "do not trust", text, "time", factor, causes=(cause,))
+
+
+def _leapt(k: int, at: str, times: str, after: str) -> Finding:
+    """Return that a clock leapt forward before a sample."""
+    text = (
+        f"Time leaps by {times} at {at} (sample {k + 1}), and the readings continue as after one "
+        f"usual interval: the clock was set. {after}"
+    )
+    remedy = "If the later times are right, add the leap to the earlier ones; else take it off."
+    cause = Cause("clock", "time", f"the clock leapt by {times} at {at}", math.nan, remedy)
+    return Finding("clock", "caution", text.rstrip(), "time", k, causes=(cause,))
 
 
 def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:

@@ -12,10 +12,19 @@ import numpy as np
 
 from livepde.dates import when
 from livepde.diagnostics.identifiability import TRADED, InformationGain
-from livepde.plots.dataset import field_names, interval_95, modes_told, note, prior_left, scalars
+from livepde.plots.dataset import (
+    NORMAL_95,
+    field_names,
+    interval_95,
+    modes_told,
+    note,
+    prior_left,
+    scalars,
+)
 from livepde.records import refused_readings, used_errors
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
+from livepde.runs.thermal_resistance import resistance
 from livepde.verdict import ModelErrors
 
 if TYPE_CHECKING:
@@ -262,13 +271,20 @@ def checks_of(expected: Mapping[str, tuple[Sense, Bound]], data: xr.Dataset) -> 
 def tables(data: xr.Dataset) -> list[Table]:
     """Return the tables of a run.
 
-    Estimates with references, estimated fields, errors of each channel, information gained from the
-    data, and jumps. Errors over all samples include the initial transient of learning; those of the
-    second half can be compared with the noise.
+    Estimates with references, the resistance of a wall, estimated fields, errors of each channel,
+    information gained from the data, and jumps. Errors over all samples include the initial
+    transient of learning; those of the second half can be compared with the noise.
     """
     labels = scalars(data) if data.sizes["time"] else []
     channels = _channels(data)
-    found = [_estimates(data, labels), _fields(data), channels, _told(data, labels), _jumped(data)]
+    found = [
+        _estimates(data, labels),
+        _wall(data),
+        _fields(data),
+        channels,
+        _told(data, labels),
+        _jumped(data),
+    ]
     return [table for table in found if table.rows or table is channels]
 
 
@@ -297,6 +313,25 @@ def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     source = str(data.attrs.get("reference_source", ""))
     title = f"{title}; reference: {source}" if source else title
     return Table(title, (*columns, "reference", "error"), rows)
+
+
+def _wall(data: xr.Dataset) -> Table:
+    """Return the table of R and U of a wall, with their 95 % intervals; empty for other runs."""
+    found, rows = resistance(data), list[tuple[Any, ...]]()
+    if found is not None:
+        surfaces = "without surface resistances"
+        if found.surfaces is not None:
+            surfaces = f"with {found.surfaces:g} m^2 K/W of surface resistances"
+        for name, value, relative, unit in (
+            ("R, without surface resistances", found.R, found.relative, "m^2 K/W"),
+            (f"U, {surfaces}", found.U, found.relative_U, "W/(m^2 K)"),
+        ):
+            std = value * relative
+            ends = (value * math.exp(sign * NORMAL_95 * relative) for sign in (-1.0, 1.0))
+            interval = " to ".join(digits(end, std)[0] for end in ends)
+            rows.append((name, *digits(value, std), interval, unit))
+    columns = ("quantity", "value", "± std. dev.", "95 %", "unit")
+    return Table("Wall: R = sum of thickness/k, U = 1/(R + surfaces)", columns, rows)
 
 
 def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
@@ -330,7 +365,13 @@ def _channels(data: xr.Dataset) -> Table:
     errors = _errors(data)
     fits = {} if errors is None else errors.sensors
     fitted = [name for name in channels if name in fits]
-    unit = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
+    units = {
+        str(name): str(unit)
+        for dimension in ("sensor", "withheld")
+        if f"{dimension}_unit" in data.coords
+        for name, unit in zip(data[dimension].values, data[f"{dimension}_unit"].values, strict=True)
+    }
+    common = str(data["innovation"].attrs.get("units", "")) if "innovation" in data else ""
     rows = [
         (
             name,
@@ -341,7 +382,7 @@ def _channels(data: xr.Dataset) -> Table:
             len(own),
             *([refused] if refuses else []),
             *([shown(fits.get(name, math.nan), ".2g")] if fitted else []),
-            unit,
+            units.get(name, common),
         )
         for name, (role, own, later, refused) in channels.items()
     ]

@@ -28,6 +28,7 @@ __all__ = [
     "origin_at",
     "read_times",
     "since_1970",
+    "with_second_passes",
 ]
 
 Instant: TypeAlias = float | str | date | datetime
@@ -160,6 +161,37 @@ def read_times(
             )
         times[k] = value
     return times * (clock.second if dates else clock.factor), dates
+
+
+def with_second_passes(
+    times: Array, cells: Sequence[Any], clock: Clock, repeats: Callable[[int, int], bool]
+) -> Array:
+    """Return times of dates whose hours that clocks show twice are told apart.
+
+    A date without a zone of its own that is not later than those before it belongs to the second
+    pass of such an hour, unless its row repeats an earlier one.
+
+    Parameters
+    ----------
+    times
+        In the model's unit since 1970, as of the first pass.
+    cells
+        The dates as they are written.
+    repeats
+        Whether a row has the values of another row.
+    """
+    if not (np.diff(times) <= 0.0).any():
+        return times
+    found, last = times.copy(), -math.inf
+    first: dict[float, int] = {}  # row of each time of the first pass
+    for k, t in enumerate(times.tolist()):
+        if t <= last and is_naive(cells[k], clock) and (again := clock.repeated_hour(t)):
+            if not (t in first and repeats(first[t], k)):
+                found[k] = t + again
+        else:
+            first[t] = k
+        last = max(last, float(found[k]))
+    return found
 
 
 def is_naive(cell: Any, clock: Clock) -> bool:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import codecs
 import csv
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
+from operator import itemgetter
 from pathlib import Path
 from statistics import multimode
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,12 +36,26 @@ from livepde.streams.table import (
     to_table,
 )
 
-__all__ = ["UTF_8", "Written", "header_of", "how_written", "read_csv", "too_wide"]
+__all__ = [
+    "UNDER",
+    "UTF_8",
+    "Written",
+    "are_labels",
+    "header_of",
+    "how_written",
+    "is_title",
+    "read_csv",
+    "too_wide",
+]
+
+T = TypeVar("T")
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it
 SEPARATORS = ("\t", ";", ",")  # in the order in which they are tried
 END = "end"  # of a file that is read
 LOOK = 100_000  # characters that are looked at to say how a file is written
+TOA5 = "TOA5"  # first cell of the title line of loggers by Campbell
+UNDER = 2  # most lines of labels under a header: units and kinds of values
 BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .ods, .xls
 
 
@@ -134,7 +149,44 @@ def read_csv(
     def where(k: int) -> str:
         return f"{path}, row {rows[k]}, column '{clock.name}'"
 
-    return to_table(times, dates, numbers, columns, clock, every, missing, (f"{path}", where))
+    written = stamps if dates else None
+    return to_table(times, written, numbers, columns, clock, every, missing, (f"{path}", where))
+
+
+def is_title(cells: Sequence[str]) -> bool:
+    """Return whether a first line is the title that some loggers write above the header."""
+    return bool(cells) and cells[0].strip() == TOA5
+
+
+def are_labels(cells: Sequence[str]) -> bool:
+    """Return whether a line under the header has units or other words, and no values or dates.
+
+    >>> are_labels(["TS", "RN", "Deg C"]), are_labels(["2025-01-01 00:00", "", "NAN"])
+    (True, False)
+    """
+    texts = [text for cell in cells if (text := cell.strip())]
+    return bool(texts) and not any(
+        text[0].isdigit() or text.lower() in MISSING or number_of(text, ",") is not None
+        for text in texts
+    )
+
+
+def below_title(rows: Iterator[T], cells: Callable[[T], Sequence[str]]) -> Iterator[T]:
+    """Iterate over the rows of a file from its header on, without lines of labels under it."""
+    header = next(rows, None)
+    if header is not None and is_title(cells(header)):
+        header = next(rows, None)
+    if header is None:
+        return
+    yield header
+    for _ in range(UNDER):
+        row = next(rows, None)
+        if row is None:
+            return
+        if not are_labels(cells(row)):
+            yield row
+            break
+    yield from rows
 
 
 def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]:
@@ -143,7 +195,7 @@ def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]
     try:
         with path.open(newline="", encoding=encoding) as file:
             rows = csv.reader(islice(file, skip, None), delimiter=separator, skipinitialspace=True)
-            return next((row for row in rows if row), [])
+            return next(below_title(filter(None, rows), list), [])
     except (OSError, UnicodeError, csv.Error) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
 
@@ -198,7 +250,7 @@ def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -
     if skip is None:
         skip = _titles(lines, separator)
     found = csv.reader(lines[skip:], delimiter=separator, skipinitialspace=True)
-    header, *rows = [row for row in found if row] or [[]]
+    header, *rows = [*below_title(filter(None, found), list)] or [[]]
     cells = [cell for row in rows for cell in row]
     decimal = "," if any(map(has_decimal_comma, cells)) else "."
     formats = _time_formats(header, rows, decimal)
@@ -317,8 +369,9 @@ def _cells(
     with path.open(newline="", encoding=encoding) as file:
         whole = chain(islice(file, skip, None), [f"{END}\n"])
         lines = csv.reader(whole, delimiter=separator, skipinitialspace=True)
-        numbered = _whole(lines, skip + 1)
-        header = next((row for _, row in numbered if row), [])
+        written = (one for one in _whole(lines, skip + 1) if one[1])
+        numbered = below_title(written, itemgetter(1))
+        _, header = next(numbered, (0, []))
         _check_header(path, header, separator, encoding, clock, skip)
         _check_names(path, header, needed)
         places = [header.index(name) for name in needed]

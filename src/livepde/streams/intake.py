@@ -340,9 +340,17 @@ class Intake:
             return None
         t, again = times
         # An hour that clocks show twice: its second pass, unless these values came in the first.
-        if again and t <= self._last and not self._repeats(t, values):
+        if again and self._passed(t, again, values) and not self._repeats(t, values):
             t += again
         return _Held(t=t, values=values, token=token, remarks=tuple(about.remarks))
+
+    def _passed(self, t: float, hour: float, values: Mapping[str, float]) -> bool:
+        """Return whether rows of a time or later ones have come, of the same channels."""
+        if t <= self._last:
+            return True
+        mine = set(present(values))
+        waiting = (one for one in self._ahead if t <= one.t <= t + hour)
+        return any(not mine.isdisjoint(present(one.values)) for one in waiting)
 
     def _judged(self, held: _Held, received: float, found: IntakeOutcome) -> bool:
         """Return whether a row is used or waits for others."""

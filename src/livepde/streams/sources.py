@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
-from livepde.streams.csvfile import UTF_8, too_wide
+from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, too_wide
 from livepde.streams.table import JSON_LINES, no_file
 
 __all__ = ["Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
@@ -120,6 +120,8 @@ def _names(cells: list[str]) -> list[str]:
 class Follow(RowSource):
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
+    The title of a logger (TOA5) and lines of units under the header are skipped.
+
     A line is read once its end has been written. A file that is replaced by another (rotated logs)
     is read to its end before the new one; one that has become shorter is read again from its start,
     where known rows are repeated. Unread rows of a file that was renamed are lost after a crash.
@@ -154,6 +156,7 @@ class Follow(RowSource):
         self._number = 0  # of the file: 1 for the first, 2 for that which replaced it
         self._head = b""  # how the file begins, to know it again
         self._header: list[str] | None = None
+        self._labels = 0  # lines under the header that may be labels
         self._offset = 0
         self._ended = False
         # Lines are told apart as bytes, before they are decoded.
@@ -217,6 +220,7 @@ class Follow(RowSource):
             return False
         self.close()
         self._file, self._header, self._head, self._offset = file, None, b"", 0
+        self._labels = 0
         self._number += 1
         start, known = self._resumed or (0, 0)
         self._resumed = None
@@ -224,9 +228,22 @@ class Follow(RowSource):
         head = file.read(HEAD)
         if start <= os.fstat(file.fileno()).st_size and zlib.crc32(head[:start]) == known:
             if not self._json and start:
-                self._header = _names(self._cells(head.splitlines()[0]))
+                self._read_header(file, start)
             self._head, self._offset = head[:start], start
         return True
+
+    def _read_header(self, file: io.BufferedReader, start: int) -> None:
+        """Read the header of a file whose lines up to a position are known."""
+        file.seek(0)
+        cells = self._cells(_line(file))
+        if is_title(cells):
+            if file.tell() >= start:
+                return
+            cells = self._cells(_line(file))
+        self._header, self._labels = _names(cells), UNDER
+        while self._labels and file.tell() < start:
+            file.readline(LONGEST)
+            self._labels -= 1
 
     def _replaced(self) -> bool:
         """Return whether another file has the name now, or this one has become shorter."""
@@ -276,10 +293,17 @@ class Follow(RowSource):
                 )
             return Row({}, token=token, broken=f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
-            self._header = _names(cells)
+            if is_title(cells):
+                return None
+            self._header, self._labels = _names(cells), UNDER
             twice = sorted(set(cells) - set(self._header))
             text = "two columns are called '{}', and none of them is taken: rename one"
             return Row({}, token=token, broken=text.format(twice[0])) if twice else None
+        if self._labels:
+            labels = are_labels(cells)
+            self._labels = self._labels - 1 if labels else 0
+            if labels:
+                return None
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token=token, broken=text)

@@ -6,7 +6,7 @@ import difflib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import datetime
 from itertools import chain, islice
@@ -24,9 +24,11 @@ from livepde.streams.clock import (
     NO_POINT,
     Clock,
     has_decimal_comma,
+    is_naive,
     number_of,
     origin_at,
     read_times,
+    with_second_passes,
 )
 from livepde.streams.thinned import Thinned
 
@@ -164,14 +166,16 @@ def read_json_lines(
         check_columns(place, [clock.name], list(row))
     decimals = decimal_marks(columns)
     check_columns(str(path), decimals, [*dict.fromkeys(chain(*rows))])
-    times, dates = read_times([row[clock.name] for row in rows], clock, lambda k: f"{places[k]},")
+    cells = [row[clock.name] for row in rows]
+    times, dates = read_times(cells, clock, lambda k: f"{places[k]},")
+    written = cells if dates else None
 
     def numbers(name: str, use: Any) -> Array:
-        cells = ((rows[k].get(name), f"{places[k]}, '{name}'", decimals[name]) for k in use)
-        return np.array([cell_number(*cell) for cell in cells])
+        texts = ((rows[k].get(name), f"{places[k]}, '{name}'", decimals[name]) for k in use)
+        return np.array([cell_number(*text) for text in texts])
 
     where = (str(path), places.__getitem__)
-    return to_table(times, dates, numbers, columns, clock, every, missing, where)
+    return to_table(times, written, numbers, columns, clock, every, missing, where)
 
 
 def tabulated(
@@ -229,12 +233,13 @@ def tabulated(
     def here(k: int) -> str:
         return f"{where}, sample {k}"
 
-    return to_table(found, dates, numbers, columns, clock, every, missing, (where, here))
+    written = moments if dates else None
+    return to_table(found, written, numbers, columns, clock, every, missing, (where, here))
 
 
 def to_table(
     times: Array,
-    dates: bool,
+    written: Sequence[Any] | None,
     numbers: Callable[[str, Any], Array],
     columns: Mapping[str, Column],
     clock: Clock,
@@ -244,8 +249,23 @@ def to_table(
 ) -> DataTable:
     """Return the channels between start and stop.
 
-    `numbers` gives the chosen rows of a column; `where` names the data and a row, for messages.
+    Parameters
+    ----------
+    written
+        The dates as they are written; None if times are numbers.
+    numbers
+        Gives the chosen rows of a column.
+    where
+        Names the data and a row, for messages.
     """
+    dates = written is not None
+    if written is not None:
+
+        def repeats(one: int, other: int) -> bool:
+            pairs = (numbers(name, np.array([one, other])) for name in decimal_marks(columns))
+            return all(np.array_equal(pair[:1], pair[1:], equal_nan=True) for pair in pairs)
+
+        times = with_second_passes(times, written, clock, repeats)
     rows = Thinned([column.between for column in columns.values()])
     # Rows that are left out may hold a switch, or a part of a mean.
     any_held = bool(rows.held.any())
@@ -396,6 +416,7 @@ class JsonLines:
 
     def __iter__(self) -> Iterator[Sample]:
         clock, last, zero = self._clock, -math.inf, 0.0
+        first: dict[float, dict[str, float]] = {}  # rows of an hour that clocks show twice
         needed = [channel for channel, column in self._columns.items() if column.needed]
         thinned = Thinned([column.between for column in self._columns.values()])
         any_held = bool(thinned.held.any())
@@ -403,13 +424,20 @@ class JsonLines:
         for k, (where, row, t, dates) in enumerate(
             islice(self._timed_rows(thinned), 0, None, step)
         ):
+            values = self._values(row, where)
+            if dates and is_naive(row.get(clock.name), clock) and (again := clock.repeated_hour(t)):
+                if t <= last and not _same_values(first.get(t), values):
+                    t += again
+                else:
+                    first[t] = values
+            elif first:
+                first = {}
             if t <= last:
                 raise _disorder(where, t == last, dates and clock.set_back(t))
             if dates and math.isinf(last):  # the first sample is t = 0
                 zero = t
                 self.origin = origin_at(t / clock.second)
             last = t
-            values = self._values(row, where)
             whole = not any(math.isnan(values[channel]) for channel in needed)
             if not any_held:
                 if whole:
@@ -505,6 +533,14 @@ def cell_number(value: Any, where: str, decimal: str = ".") -> float:
             f"{where}: got {value!r}; a channel must be finite (leave it empty if it is missing)."
         )
     return number
+
+
+def _same_values(known: Mapping[str, float] | None, values: Mapping[str, float]) -> bool:
+    """Return whether a row has the values of a known one."""
+    if known is None:
+        return False
+    pairs = zip(known.values(), values.values(), strict=True)
+    return all(a == b or (math.isnan(a) and math.isnan(b)) for a, b in pairs)
 
 
 def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:

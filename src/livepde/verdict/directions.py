@@ -138,14 +138,15 @@ class Dictionary:
 
     def _add_sensors(self, model: Model, observed: Observed, noise: Array, room: int) -> None:
         """Append the directions of single sensors, as many kinds as there is room for."""
-        sensors, unit = observed.size, observed.observation.unit
+        sensors, units = observed.size, observed.units
+        none = ("",) * sensors
         shifts, step = sensor_shifts(model, observed)
         amplitudes = {  # of each sensor, with their unit; where room is short the last go first
-            "offset": (OFFSET * noise, unit),
-            "lag": (np.full(sensors, np.nan), ""),
-            "position": (np.full(sensors, step), model.length_unit),
-            "gain": (np.full(sensors, GAIN), ""),
-            "drift": (OFFSET * noise, unit),
+            "offset": (OFFSET * noise, units),
+            "lag": (np.full(sensors, np.nan), none),
+            "position": (np.full(sensors, step), (model.length_unit,) * sensors),
+            "gain": (np.full(sensors, GAIN), none),
+            "drift": (OFFSET * noise, units),
         }
         if not shifts:
             del amplitudes["position"]
@@ -155,9 +156,9 @@ class Dictionary:
             self.left_out.append(f"{kind} of single sensors: there are {sensors}")
         self.kinds = tuple(amplitudes)
         for kind, (size, of) in amplitudes.items():
-            own = list(zip(observed.names, size.tolist(), strict=True))
-            each = [(axis, name, one) for axis in range(axes[kind]) for name, one in own]
-            found = [ScoreDirection(kind, name, one, of, k) for k, name, one in each]
+            own = list(zip(observed.names, size.tolist(), of, strict=True))
+            each = [(axis, *one) for axis in range(axes[kind]) for one in own]
+            found = [ScoreDirection(kind, name, one, unit, k) for k, name, one, unit in each]
             self._add(kind, _within_reach(model, observed, found) if kind == "position" else found)
         self.own: IntArray = np.arange(len(self.directions)) % sensors  # sensor of each so far
         self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None

@@ -1,0 +1,164 @@
+"""The walks of docs/first-hour.md with one channel that is wrong: late, scaled, exchanged, in °F.
+
+A run of such a table must not be trusted, and has to name the channel first.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import livepde as lp
+from benchmarks import ROOT
+from benchmarks.first_hour import FOLDER, TABLES, save
+from benchmarks.jobs import each
+from livepde.cases import load
+from livepde.runs.outcome import Check, Outcome, Table
+
+__all__ = ["FAULTS", "Fault", "first_named", "with_fault", "wrong_channels"]
+
+Array = NDArray[Any]
+NAMED = 0.8  # of the runs
+SCALE = 1.15
+WITHOUT = """
+Left out are faults that other numbers explain as well: a scale of the rate of a pumping test, of
+the heat into a borehole or of a flux plate multiplies the unknowns. In a column with one probe
+either channel may be named, since only their ratio is known.
+"""
+
+
+class Fault(NamedTuple):
+    """A channel, or two, of a walk, and what is wrong with them.
+
+    Attributes
+    ----------
+    walk, channels
+        The walk, and its channels; of several, either may be named.
+    kind
+        "late" by some samples, "scaled", "fahrenheit" or "exchanged".
+    samples
+        How late, in intervals of the sensors.
+    """
+
+    walk: str
+    channels: tuple[str, ...]
+    kind: str
+    samples: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.walk}: {' and '.join(self.channels)} {self.kind}"
+
+
+FAULTS = (
+    Fault("pumping", ("OW1",), "late", 10.0),
+    Fault("pumping", ("OW1",), "scaled"),
+    Fault("pumping", ("OW2",), "scaled"),
+    Fault("pumping", ("Q",), "late", 15.0),
+    Fault("pumping", ("OW1", "OW2"), "exchanged"),
+    Fault("column", ("c", "c_in"), "scaled"),
+    Fault("heater", ("T_30",), "late", 5.0),
+    Fault("heater", ("T_30",), "scaled"),
+    Fault("heater", ("T_10",), "fahrenheit"),
+    Fault("heater", ("T_60",), "fahrenheit"),
+    Fault("heater", ("heater",), "late", 10.0),
+    Fault("heater", ("heater",), "scaled"),
+    Fault("heater", ("T_10", "T_60"), "exchanged"),
+    Fault("wall", ("T_inside",), "late", 6.0),
+    Fault("wall", ("T_outside",), "late", 6.0),
+    Fault("wall", ("T_outside",), "fahrenheit"),
+    Fault("wall", ("T_inside", "T_outside"), "exchanged"),
+    Fault("wall", ("q",), "late", 6.0),
+    Fault("furnace", ("T_2",), "late", 30.0),
+    Fault("furnace", ("T_2",), "scaled"),
+    Fault("furnace", ("T_cold",), "fahrenheit"),
+    Fault("furnace", ("T_2", "T_4"), "exchanged"),
+)
+
+
+def with_fault(fault: Fault, header: Sequence[str], table: Array, columns: dict[str, str]) -> Array:
+    """Return a table with a fault.
+
+    Parameters
+    ----------
+    columns
+        Channel -> its column.
+    """
+    found, t = table.copy(), table[:, 0]
+    places = [list(header).index(columns[name]) for name in fault.channels]
+    first = places[0]
+    if fault.kind == "exchanged":
+        found[:, places] = table[:, places[::-1]]
+    elif fault.kind == "scaled":
+        found[:, first] *= SCALE
+    elif fault.kind == "fahrenheit":
+        found[:, first] = 1.8 * table[:, first] + 32.0
+    else:
+        known = np.isfinite(table[:, first])
+        # An interval of the sensors: rows of inputs that are written at changes lie between.
+        seen = np.isfinite(table[:, -1])
+        delay = fault.samples * float(np.median(np.diff(t[seen])))
+        late = t[known] + delay
+        if known.all():
+            found[:, first] = np.interp(t, late, table[known, first])
+        else:  # values that are written at changes hold until the next one
+            at = np.searchsorted(late, t, side="right") - 1
+            found[:, first] = table[known, first][np.maximum(at, 0)]
+    return found
+
+
+def first_named(verdict: lp.Verdict) -> str:
+    """Return the channel that the first finding with causes names first; empty if none does."""
+    for finding in verdict.findings:
+        if finding.causes:
+            return finding.causes[0].subject
+        if finding.severity == "do not trust" and finding.subject:
+            return finding.subject
+    return ""
+
+
+def wrong_channels(faults: Sequence[Fault], *, seeds: int, progress: bool = False) -> Outcome:
+    """Run the walks with one wrong channel each.
+
+    Parameters
+    ----------
+    seeds
+        Truths of each.
+    """
+    todo = [(fault, seed) for fault in faults for seed in range(seeds)]
+    rows, trusted, named = [], 0, 0
+    for (fault, seed), (level, subject, text) in each(_judged, todo, "tables", progress=progress):
+        right = any(name in subject for name in fault.channels)
+        trusted += level == "trusted"
+        named += right
+        rows.append((str(fault), seed, level, subject or "–", "yes" if right else "no", text))
+    checks = [
+        Check("wrong tables that are trusted", float(trusted), 0.0, "<="),
+        Check("share of runs that name the channel first", named / len(todo), NAMED, ">="),
+    ]
+    columns = ("wrong", "truth", "verdict", "named first", "right", "cause")
+    note = " ".join(WITHOUT.split())
+    return Outcome(tables=[Table("One wrong channel", columns, rows)], checks=checks, notes=[note])
+
+
+def _judged(fault: Fault, seed: int) -> tuple[str, str, str]:
+    """Return the level of the verdict, the first channel that it names, and its cause."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / FOLDER.relative_to(ROOT)
+        shutil.copytree(FOLDER, folder)
+        case = load(folder / f"{fault.walk}.toml")
+        columns = {name: str(item.column) for name, item in case.spec.channels.items()}
+        header, table, _ = TABLES[fault.walk](seed)
+        save(folder / f"{fault.walk}.csv", header, with_fault(fault, header, table, columns))
+        prepared = load(folder / f"{fault.walk}.toml").prepare()
+        last = prepared.identifier.run(prepared.stream).last
+        if last is None:
+            raise RuntimeError(f"{fault}: no sample was taken")
+        verdict = last.verdict
+        texts = [cause.text for finding in verdict.findings for cause in finding.causes]
+        return verdict.level, first_named(verdict), (texts or ["–"])[0]

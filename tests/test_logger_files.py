@@ -1,0 +1,214 @@
+"""Tables as loggers write them: hours that clocks show twice, titles and units around a header."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from datetime import datetime, timedelta
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from livepde.errors import DataError, TimeOrderError
+from livepde.runs.directory import RunWriter, open_run
+from livepde.streams.clock import Clock
+from livepde.streams.csvfile import header_of, how_written, read_csv
+from livepde.streams.intake import Intake
+from livepde.streams.sources import Follow
+from livepde.streams.table import Column, DataTable, JsonLines, read_json_lines, tabulated
+
+BERLIN = ZoneInfo("Europe/Berlin")
+CLOCK = Clock("t", zone=BERLIN)
+COLUMNS = {"a": Column(("a",))}
+
+
+# --- hours that are shown twice ------------------------------------------------------------------
+
+
+def local(minutes: int, count: int) -> list[str]:
+    """Return local times of the night in which clocks are set back."""
+    start = datetime(2026, 10, 24, 23, tzinfo=ZoneInfo("UTC"))
+    moments = (start + timedelta(minutes=minutes * k) for k in range(count))
+    return [str(moment.astimezone(BERLIN).replace(tzinfo=None)) for moment in moments]
+
+
+def from_csv(folder: Path, rows: list[dict]) -> list[float]:
+    path = folder / "log.csv"
+    path.write_text("t,a\n" + "".join(f"{row['t']},{row['a']}\n" for row in rows))
+    return read_csv(path, COLUMNS, CLOCK).t.tolist()
+
+
+def from_json(folder: Path, rows: list[dict]) -> list[float]:
+    path = folder / "log.jsonl"
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return read_json_lines(path, COLUMNS, CLOCK).t.tolist()
+
+
+def from_lines(_: Path, rows: list[dict]) -> list[float]:
+    return [sample.t for sample in JsonLines(map(json.dumps, rows), COLUMNS, CLOCK)]
+
+
+def from_memory(_: Path, rows: list[dict]) -> list[float]:
+    values = {"a": [row["a"] for row in rows]}
+    return tabulated([row["t"] for row in rows], values, COLUMNS, CLOCK).t.tolist()
+
+
+def live(_: Path, rows: list[dict]) -> list[float]:
+    intake = Intake(COLUMNS, CLOCK)
+    return [ready.t for row in rows for ready in intake.take(row).ready]
+
+
+BATCH = [from_csv, from_json, from_lines, from_memory]
+Reader = Callable[[Path, list[dict]], list[float]]
+
+
+@pytest.mark.parametrize("read", [*BATCH, live])
+@pytest.mark.parametrize("minutes", [1, 10, 60])
+def test_the_hour_that_clocks_show_twice(tmp_path: Path, read: Reader, minutes: int) -> None:
+    """Of local times each reader makes those that went by, an hourly log among them."""
+    count = 240 // minutes
+    texts = local(minutes, count)
+    assert len(set(texts)) == 180 // minutes
+    rows = [{"t": text, "a": float(k)} for k, text in enumerate(texts)]
+    assert read(tmp_path, rows) == [60.0 * minutes * k for k in range(count)]
+
+
+@pytest.mark.parametrize("read", BATCH)
+@pytest.mark.parametrize("again", [70, 75])
+def test_a_repeated_row_is_no_second_pass(tmp_path: Path, read: Reader, again: int) -> None:
+    rows = [{"t": text, "a": float(k)} for k, text in enumerate(local(1, 100))]
+    with pytest.raises(TimeOrderError, match="if clocks were set back, write dates with an offset"):
+        read(tmp_path, [*rows[:80], rows[again], *rows[80:]])
+
+
+@pytest.mark.parametrize("read", BATCH)
+def test_dates_with_an_offset_are_never_moved(tmp_path: Path, read: Reader) -> None:
+    texts = ["2026-10-25 02:30+01:00", "2026-10-25 02:10+01:00"]
+    rows = [{"t": text, "a": float(k)} for k, text in enumerate(texts)]
+    with pytest.raises(TimeOrderError):
+        read(tmp_path, rows)
+
+
+# --- titles and units of loggers -----------------------------------------------------------------
+
+TITLE = '"TOA5","CR1000","CR1000","1234","CR1000.Std.31","CPU:wall.CR1","1234","Table1"\n'
+NAMES = '"TIMESTAMP","RECORD","T_1","T_2"\n'
+UNITS = '"TS","RN","Deg C","Deg C"\n'
+KINDS = '"","","Avg","Avg"\n'
+VALUES = [
+    '"2025-01-01 00:00:00",0,1.25,"NAN"\n',
+    '"2025-01-01 00:10:00",1,1.5,2\n',
+    '"2025-01-01 00:20:00",2,"NAN",3\n',
+]
+HEADS = {
+    "TOA5": TITLE + NAMES + UNITS + KINDS,
+    "units": NAMES + UNITS,
+    "plain": NAMES,
+}
+TOA5_COLUMNS = {"a": Column(("T_1",)), "b": Column(("T_2",))}
+STAMP = Clock("TIMESTAMP")
+
+
+def table(path: Path) -> DataTable:
+    return read_csv(path, TOA5_COLUMNS, STAMP)
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_complete_file_of_a_logger(tmp_path: Path, head: str) -> None:
+    path = tmp_path / "log.dat"
+    path.write_text(HEADS[head] + "".join(VALUES))
+    found = table(path)
+    assert found.t.tolist() == [0.0, 600.0, 1200.0]
+    np.testing.assert_array_equal(found.values, [[1.25, math.nan], [1.5, 2.0], [math.nan, 3.0]])
+    assert header_of(path, ",", "utf-8", 0) == ["TIMESTAMP", "RECORD", "T_1", "T_2"]
+    written = how_written(path)
+    assert written.header == ["TIMESTAMP", "RECORD", "T_1", "T_2"]
+    assert [row[1] for row in written.rows] == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_file_of_a_logger_that_grows(tmp_path: Path, head: str) -> None:
+    """The rows of a file that grows by single characters are those of the complete one."""
+    path = tmp_path / "log.dat"
+    source, found = Follow(path, follow=True), []
+    text = HEADS[head] + "".join(VALUES)
+    for k in range(0, len(text), 7):
+        with path.open("a") as file:
+            file.write(text[k : k + 7])
+        found += source.poll(0.0)
+    source.close()
+    assert not [row.broken for row in found if row.broken]
+    assert [row.values["RECORD"] for row in found] == ["0", "1", "2"]
+    intake = Intake(TOA5_COLUMNS, STAMP)
+    ready = [one for row in found for one in intake.take(row.values).ready]
+    assert [one.t for one in ready] == table(path).t.tolist()
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_a_file_of_a_logger_is_continued_anywhere(tmp_path: Path, head: str) -> None:
+    path = tmp_path / "log.dat"
+    lines = [*HEADS[head].splitlines(keepends=True), *VALUES]
+    for known in range(1, len(lines) + 1):
+        path.write_text("".join(lines[:known]))
+        source = Follow(path, follow=True)
+        before = source.poll(0.0)
+        position = source.position([])
+        source.close()
+        path.write_text("".join(lines))
+        again = Follow(path, follow=True, position=position)
+        rows = [*before, *again.poll(0.0)]
+        again.close()
+        assert [row.broken for row in rows] == ["", "", ""], known
+        assert [row.values["RECORD"] for row in rows] == ["0", "1", "2"]
+
+
+def test_words_amid_the_values_are_no_labels(tmp_path: Path) -> None:
+    path = tmp_path / "log.dat"
+    path.write_text(NAMES + VALUES[0] + UNITS + "".join(VALUES[1:]))
+    with pytest.raises(DataError, match="row 3, column 'TIMESTAMP': got 'TS'"):
+        table(path)
+    source = Follow(path)
+    rows = source.poll(0.0)
+    assert len(rows) == 4  # the intake counts it as malformed
+    source.close()
+
+
+# --- dates of a run ------------------------------------------------------------------------------
+
+
+def run_in(folder: Path, unit: str, origin: str | None) -> xr.Dataset:
+    """Write and return the estimates of a run with snapshots at other times than samples."""
+    attrs = {"origin": origin} if origin else {}
+    data = xr.Dataset(
+        {"k": ("time", [1.0, 2.0, 3.0]), "T": (("snapshot", "vertex"), [[0.0, 1.0]])},
+        {"time": ("time", [0.0, 1.5, 3.0], {"units": unit}), "snapshot": ("snapshot", [3.0])},
+        attrs,
+    )
+    writer = RunWriter.create(folder, version="1", command=["livepde"], title="A run")
+    writer.finish(status="finished", dataset=data, shown=[], checks=[], notes=[])
+    return data
+
+
+@pytest.mark.parametrize(
+    ("unit", "step"), [("s", "1.5s"), ("min", "90s"), ("h", "90min"), ("d", "36h"), ("day", "36h")]
+)
+def test_other_programs_read_dates_of_a_run(tmp_path: Path, unit: str, step: str) -> None:
+    data = run_in(tmp_path / "run", unit, "2025-03-01 06:00:00")
+    with xr.open_dataset(tmp_path / "run" / "estimates.nc", engine="scipy") as other:
+        dates = pd.date_range("2025-03-01 06:00", periods=3, freq=step)
+        np.testing.assert_array_equal(other["time"], dates.to_numpy())
+        assert other["snapshot"].values[0] == dates.to_numpy()[-1]
+    mine = open_run(tmp_path / "run").dataset
+    xr.testing.assert_identical(mine, data)  # here they are numbers, as they were
+
+
+def test_times_without_a_date_stay_numbers(tmp_path: Path) -> None:
+    data = run_in(tmp_path / "run", "s", None)
+    with xr.open_dataset(tmp_path / "run" / "estimates.nc", engine="scipy") as other:
+        assert other["time"].values.tolist() == [0.0, 1.5, 3.0]
+    xr.testing.assert_identical(open_run(tmp_path / "run").dataset, data)

@@ -1,0 +1,268 @@
+"""Pauses of a logger, clocks that leap and units of time that change: named, and outlived."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+import livepde as lp
+from benchmarks.honest.linear import diffusion, fine_times
+from livepde.cases import load
+from livepde.cli import app
+from livepde.fleet import Fleet
+from livepde.laws.pauses import InputHistory, pauses
+from livepde.runs import sampling_findings
+from livepde.stepping import Span
+from livepde.streams.sampling import unit_factor
+
+ALPHA = 1.5e-5
+DT = 10.0
+ROWS = 600
+AT = 300  # row at which something happens
+PLACES = (0.03, 0.06, 0.1)
+CASE = """
+equation = "heat"
+initial = "interpolate"
+mesh = { from = 0, to = "50 cm", cells = 60 }
+data = { file = "rod.csv", time = "t", time_unit = "s" }
+unknowns.alpha = { prior = "2e-5 m^2/s", std = "1e-5 m^2/s", transform = "log" }
+[channels]
+hot = { role = "boundary", column = "hot", at = "left" }
+cold = { role = "boundary", column = "cold", at = "right" }
+T_1 = { role = "sensor", column = "T_1", at = "3 cm", noise = "0.05 K" }
+T_2 = { role = "sensor", column = "T_2", at = "6 cm", noise = "0.05 K" }
+T_3 = { role = "sensor", column = "T_3", at = "10 cm", noise = "0.05 K" }
+"""
+
+
+@cache
+def rod(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and values of a rod with a long memory, by finite volumes of its own."""
+    rng = np.random.default_rng(seed)
+    t = DT * np.arange(ROWS)
+    fine = fine_times(t)
+    begin = 1.0 - np.exp(-fine / 600.0)
+    waves = 10.0 * np.sin(2 * np.pi * fine / 1500.0) + 5.0 * np.sin(2 * np.pi * fine / 640.0 + 1.0)
+    drive = np.column_stack([waves * begin, 3.0 * np.sin(2 * np.pi * fine / 2100.0) * begin])
+    cells, length = 200, 0.5
+    width = length / cells
+    between = np.full(cells, ALPHA / width)
+    loss, B = np.zeros(cells), np.zeros((cells, 2))
+    loss[0] = loss[-1] = B[0, 0] = B[-1, 1] = 2.0 * between[-1]
+    middles = width * (np.arange(cells) + 0.5)
+    C = np.array([[np.interp(x, middles, row) for row in np.eye(cells)] for x in PLACES])
+    system = diffusion(between[:-1], np.full(cells, width), loss, B, C, np.zeros((3, 2)))
+    seen = system.respond(drive, DT)
+    seen += 0.05 * rng.standard_normal(seen.shape)
+    ends = [np.interp(t, fine, column) for column in drive.T]
+    return t, 20.0 + np.column_stack([*ends, seen])
+
+
+def told_times(kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return times as a table states them, and which rows it has."""
+    k, (t, _) = np.arange(ROWS), rod()
+    times = {
+        "small leap": t + 60.0 * (k >= AT),
+        "leap": t + 3600.0 * (k >= AT),
+        "milliseconds": np.where(k >= AT, 1e3 * t, t),
+    }.get(kind, t)
+    return times, (k < AT) | (k >= AT + 60) if kind == "gap" else k >= 0
+
+
+def case(folder: Path, kind: str, seed: int = 0) -> Path:
+    times, kept = told_times(kind)
+    table = np.column_stack([times, rod(seed)[1]])[kept]
+    header = "t,hot,cold,T_1,T_2,T_3"
+    np.savetxt(folder / "rod.csv", table, "%.9g", ",", header=header, comments="")
+    (folder / "case.toml").write_text(CASE)
+    return folder / "case.toml"
+
+
+def found_in(path: Path) -> list[lp.verdict.Finding]:
+    table = load(path).read().raw
+    assert table is not None
+    times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
+    return sampling_findings(times, table)
+
+
+# --- what the sampling shows ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_even_sampling_shows_nothing(tmp_path: Path, seed: int) -> None:
+    assert found_in(case(tmp_path, "plain", seed)) == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_gap_is_a_pause(tmp_path: Path, seed: int) -> None:
+    (finding,) = found_in(case(tmp_path, "gap", seed))
+    assert (finding.what, finding.severity) == ("pause", "note")
+    assert finding.text.startswith("No sample for 610 s until t = 3600 s, 61 usual intervals.")
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("kind", "length"), [("leap", "3610 s"), ("small leap", "70 s")])
+def test_a_clock_that_leaps_is_named(tmp_path: Path, kind: str, length: str, seed: int) -> None:
+    """The readings go on as after one interval, which no gap does."""
+    (finding,) = found_in(case(tmp_path, kind, seed))
+    assert (finding.what, finding.severity) == ("clock", "caution")
+    assert finding.text.startswith(f"Time leaps by {length} at t = ")
+    assert "(sample 301)" in finding.text
+    assert finding.causes[0].kind == "clock"
+
+
+def test_a_unit_of_time_that_changes_is_named(tmp_path: Path) -> None:
+    (finding,) = found_in(case(tmp_path, "milliseconds"))
+    assert (finding.what, finding.severity) == ("clock", "do not trust")
+    assert "From sample 301 on" in finding.text
+    assert "1000 times as large" in finding.text
+    assert "Divide the times from that row on by 1000" in finding.sentence
+
+
+def test_a_logger_that_gets_slower_changes_no_unit() -> None:
+    """One second, then one minute: the times go on."""
+    assert unit_factor(before=100.0, after=160.0, usual=1.0) == 0.0
+    assert unit_factor(before=100.0, after=101e3, usual=1.0) == 1000.0
+    assert unit_factor(before=100.0, after=101e3, usual=0.1) == 0.0
+
+
+@pytest.mark.slow
+def test_check_says_it(tmp_path: Path) -> None:
+    path = case(tmp_path, "small leap")
+    result = CliRunner().invoke(app, ["check", str(path)])
+    assert result.exit_code == 0
+    assert "Time leaps by 70 s" in " ".join(result.output.split())
+
+
+# --- parameters survive a pause ------------------------------------------------------------------
+
+
+def estimate_of(path: Path) -> lp.Estimate:
+    prepared = load(path).prepare()
+    found = prepared.identifier.run(prepared.stream).last
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["gap", "small leap"])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_unknowns_survive(tmp_path: Path, kind: str, seed: int) -> None:
+    """The rod remembers an hour, and its ends have gone on unseen for ten minutes."""
+    found = estimate_of(case(tmp_path, kind, seed))
+    low, high = found["alpha"].interval()
+    assert low <= ALPHA <= high
+    assert found["alpha"].std < 1.5e-7  # 1 %: as without the pause
+    assert found.verdict.level == "trusted"
+
+
+def samples() -> list[tuple[float, dict[str, float]]]:
+    """Return the first rows of the rod, with a gap of forty."""
+    names = ("hot", "cold", "T_1", "T_2", "T_3")
+    rows = list(zip(rod()[0].tolist(), rod()[1].tolist(), strict=True))
+    return [(t, dict(zip(names, row, strict=True))) for t, row in rows[:60] + rows[100:140]]
+
+
+def parts(std: float = 1e-5, **options: Any) -> tuple[Any, ...]:
+    model = lp.models.heat(
+        lp.interval(0.0, 0.5, 30),
+        lp.Scalar(lp.LogNormal(2e-5, std=std)),
+        {"left": lp.Channel("hot"), "right": lp.Channel("cold")},
+    )
+    places = dict(zip(("T_1", "T_2", "T_3"), PLACES, strict=True))
+    return model, lp.Points(places, noise=0.05), lp.SensitivityLaw(**options)
+
+
+def identifier(std: float = 1e-5, **options: Any) -> lp.Identifier:
+    return lp.Identifier(*parts(std, **options), u0=20.0)
+
+
+@pytest.mark.slow
+def test_the_state_is_less_certain_after_a_pause_and_the_unknown_is_not() -> None:
+    who, before = identifier(1e-7, refit=None), None
+    for t, z in samples():
+        found = who.step(t, z | dict.fromkeys(("T_1", "T_2", "T_3"), np.nan))
+        spread = np.linalg.norm(found.belief.u_factor)
+        if before is not None and t - before[0] > 100.0:
+            # Nothing is known of the end of the rod in the pause: several kelvin nearby.
+            assert spread > 2.0 * before[1]
+            assert found["alpha"].std == pytest.approx(before[2])
+            return
+        before = t, spread, found["alpha"].std
+    raise AssertionError("there is no pause")
+
+
+def test_inputs_that_never_moved_stay_known() -> None:
+    history = InputHistory.start(1)
+    for k in range(30):
+        history = history.after(span(float(k), float(k + 1), 7.0))
+    after = history.after(span(30.0, 90.0, 7.0))
+    assert after.pause.tolist() == [True]
+    assert after.deviation(np.array([60.0])).tolist() == [[0.0]]
+
+
+def span(t0: float, t1: float, value: float) -> Span:
+    inputs, none = np.array([[value]]), np.zeros((1, 0))
+    parts = {"inputs0": inputs, "inputs1": inputs, "z0": none, "z1": none}
+    return Span(t0=np.array([t0]), t1=t1, channels=("a",), **parts)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_law_and_the_report_have_the_same_pauses(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    steps = rng.uniform(0.5, 1.5, 200)
+    steps[[40, 90, 91]] *= 12.0
+    times = np.concatenate([[0.0], np.cumsum(steps)])
+    history, found = InputHistory.start(1), []
+    for k in range(200):
+        history = history.after(span(float(times[k]), float(times[k + 1]), 0.0))
+        found += [k + 1] if history.pause[0] else []
+    assert found == pauses(times)
+    assert found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shadows", [None, lp.laws.Shadows()])
+def test_a_run_goes_on_to_the_bit_before_and_after_a_pause(shadows: Any) -> None:
+    rows = samples()
+    whole = identifier(shadows=shadows)
+    for cut in (59, 60, 61):
+        first, second = identifier(shadows=shadows), identifier(shadows=shadows)
+        for t, z in rows[:cut]:
+            first.step(t, z)
+        second.restore(first.dump())
+        for t, z in rows[cut:]:
+            second.step(t, z)
+        if cut == 59:
+            for t, z in rows:
+                whole.step(t, z)
+        assert second.dump() == whole.dump()
+
+
+@pytest.mark.slow
+def test_a_member_of_a_fleet_has_the_pause_of_a_single_run() -> None:
+    single, fleet = identifier(), Fleet(*parts(), members=["a", "b"], u0=20.0)
+    for t, z in samples():
+        one = single.step(t, z)
+        off = {"T_2": 0.01}
+        both = {name: [value, value + off.get(name, 0.0)] for name, value in z.items()}
+        found = fleet.step(t, both)
+    np.testing.assert_allclose(found.q[0], one.q, rtol=1e-9)
+    assert found.q[0] != found.q[1]
+
+
+@pytest.mark.slow
+def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
+    rows = samples()
+    last = identifier(refit=None, shadows=None).run(rows).last
+    assert last is not None
+    smoothed = identifier(refit=None, shadows=None).smoothed(rows)
+    std = last["alpha"].std
+    assert float(smoothed["alpha"][-1]) == pytest.approx(last["alpha"].median, abs=0.1 * std)
+    assert float(smoothed["alpha_std"][-1]) == pytest.approx(std, rel=0.03)
