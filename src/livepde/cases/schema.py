@@ -465,7 +465,7 @@ class ChannelSpec(Spec):
         fixed = (self.at, self.over, self.along, self.each, self.positions)
         quantity = None if self.is_flux else self.quantity
         placed = sum(place is not None for place in (*fixed, self.follows, quantity))
-        if self.is_flux and self.role not in ("sensor", "withheld"):
+        if self.is_flux and self.role not in SENSORS:
             raise ValueError(
                 'quantity = "flux" requires a sensor; a flux that drives the model is an input '
                 "that boundary.NAME.flux names"
