@@ -21,6 +21,7 @@ import test_latent_ends as latent
 import test_modes_left_out as modes
 import test_refit as refits
 import test_run_warnings as warned
+import test_step_choice as fronts
 import test_verdict as rods
 from factories import driven_rod, line
 
@@ -227,6 +228,13 @@ def fitted(**options: int) -> list[str]:
 
 
 @cache
+def stepped(**options: Any) -> list[str]:
+    """Return the findings on a pipe with a front, of which some steps have to be short."""
+    law = lp.SensitivityLaw(shadows=lp.laws.Shadows(**options))
+    given = fronts.identifier(law)
+    return kinds([given.step(*row) for row in fronts.rows()[:30]][-1].verdict)
+
+
 def filled(*, rests: bool = False, gain: float = 1.0) -> list[str]:
     """Return the findings on the gradient law, with readings of all of a rod at 1 % of noise."""
     drive = (lambda t: 1.0 * (t < 5.0)) if rests else (lambda t: 1.0)
@@ -293,6 +301,8 @@ RUNS = {
     "equation_tests: misfit": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
     "findings: misfit": Pair(partial(one_column, 0.9), partial(one_column, 0.2)),
     "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
+    "verdict: step": Pair(partial(stepped, parts=2), stepped),
+    "verdict: untested": Pair(partial(stepped, mesh=False, parts=1), stepped),
     "step_ledger: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
 }
 

@@ -152,14 +152,15 @@ def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
 def test_the_deviation_is_that_of_the_unknown_times_the_derivative():
     """What is known of u0 is exact: all that the sensors may deviate by comes from k."""
     inputs, h = {"T_end": 1.0, "heat": 1.0}, 1e-4
+    law = lp.SensitivityLaw(shadows=None)  # whose steps are those of the times
     shown = [
         lp.Identifier(i.model, SENSORS, i.law, withheld=HIDDEN, q0={"k": k})
         .forecast([0.1, 0.3], inputs)
         .z
-        for i in [rod(LAWS["sensitivity"])]
+        for i in [rod(law)]
         for k in (0.2 - h, 0.2 + h)
     ]
-    found = rod(lp.SensitivityLaw(shadows=None)).forecast([0.1, 0.3], inputs)
+    found = rod(law).forecast([0.1, 0.3], inputs)
     assert found.z_std == pytest.approx(0.05 * abs(shown[1] - shown[0]) / (2 * h), rel=1e-4)
     assert np.isnan(rod(LAWS["gradient"]).forecast(0.1, inputs).z_std).all()
 

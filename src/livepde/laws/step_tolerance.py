@@ -81,8 +81,12 @@ class StepTolerance:
         members, k = len(error), x.C.shape[2]
         U = np.broadcast_to(states, (members, *states.shape))
         seen = self.rows(x, U, np.zeros((members, len(states), k)), at)
+        seen = np.abs(seen)
+        if np.isnan(at.inputs).any():
+            # A sensor whose place is missing shows nothing now: elsewhere it shows values.
+            seen = np.where(np.isnan(seen) | ~seen.any(axis=1, keepdims=True), 1.0, seen)
         level = np.sqrt(x.level)[:, None]
-        gain = np.nanmax(np.abs(seen) / self.noise, axis=2, initial=0.0) / level
+        gain = (seen / self.noise).max(axis=2, initial=0.0) / level
         sizes = np.sqrt((error * error) @ self._weights.T)  # (members, parts)
         found = (gain * sizes[:, parts]).max(axis=1, initial=0.0) / ALLOWED
         return np.where(np.isfinite(found), found, 0.0)
