@@ -98,6 +98,17 @@ def test_variants_in_processes_are_those_of_this_process(biased):
     assert each[0]["variants"] == each[1]["variants"]
 
 
+@pytest.mark.slow
+def test_a_case_that_is_recommended_itself_is_not_written_again(tmp_path):
+    path = short_rod(tmp_path, 31)
+    written = tmp_path / "better.toml"
+    options = ["--variant", "offset: channels.T_10.offset='1 K'", "--jobs", "1"]
+    code, output = call("compare", path, *options, "--write", written)
+    assert code == 0
+    assert "is not written" in " ".join(output.split())
+    assert not written.exists()
+
+
 def test_what_cannot_be_compared_or_written_is_refused_before_a_run(biased, tmp_path):
     assert "expected 'name: key=value" in bad("compare", biased, "--variant", "offset:")
     assert "is the case itself" in bad("compare", biased, "--write", biased, "--force")

@@ -101,7 +101,9 @@ def compare(
     found += _all(run, chosen, jobs, as_json)
     best = recommended(base, found)
     notes = conclusions(base, found)
-    if write is not None:
+    if write is not None and best is base:
+        notes.append(f"{write} is not written: the case itself is recommended.")
+    elif write is not None:
         notes.append(_written(write, case, settings, best.variant.settings))
     present(
         _tables(base, found, best),
