@@ -156,7 +156,7 @@ def test_a_smoother_takes_the_same_steps(evolution: Any) -> None:
     """Undivided steps end at 0.32, nine standard deviations away."""
     model = pipe()
     if evolution is not None:
-        unknowns = {
+        unknowns: dict[str, Any] = {
             "K": lp.LogNormal(0.5, std=0.5),
             "D": lp.Scalar(lp.LogNormal(0.2, std=0.2), evolution=evolution),
         }
