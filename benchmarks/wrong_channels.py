@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import livepde as lp
 from benchmarks import ROOT
 from benchmarks.first_hour import FOLDER, TABLES, save
 from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.runs.outcome import Check, Outcome, Table
+from livepde.verdict import Verdict
 
 __all__ = ["FAULTS", "Fault", "first_named", "with_fault", "wrong_channels"]
 
@@ -112,7 +112,7 @@ def with_fault(fault: Fault, header: Sequence[str], table: Array, columns: dict[
     return found
 
 
-def first_named(verdict: lp.Verdict) -> str:
+def first_named(verdict: Verdict) -> str:
     """Return the channel that the first finding with causes names first; empty if none does."""
     for finding in verdict.findings:
         if finding.causes:

@@ -18,6 +18,7 @@ from livepde.linalg import Array
 from livepde.stepping import Span, StepFailed
 
 __all__ = [
+    "PAUSE_ROWS",
     "after_pause",
     "initial_rows",
     "input_rank",
@@ -30,14 +31,14 @@ Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, Any, Ste
 # Rows of the square root for each noisy channel: with 10 the standard deviation of a state near the
 # boundary is that of all rows to 1 %: tests/test_input_noise.py.
 ROWS = 10
-PAUSE_ROWS = 6  # rows of the square root for the state after a pause
+PAUSE_ROWS = 4  # rows of the square root for the state after a pause
 MODES = 3  # shapes in time of the deviation of an input from its line in a pause
 PIECES = 6  # of a pause, in each of which an input is a line
 
 
 def input_rank(problem: Problem) -> int:
-    """Return how many rows of the square root noise, pauses and an initial state need."""
-    return ROWS * len(problem.input_noise) + problem.initial_rank + PAUSE_ROWS
+    """Return how many rows of the square root the noise of inputs and an initial state need."""
+    return ROWS * len(problem.input_noise) + problem.initial_rank
 
 
 def with_input_noise(

@@ -27,7 +27,7 @@ from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_referenc
 from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
-from livepde.laws.input_noise import input_rank, with_initial_rows
+from livepde.laws.input_noise import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.jumps import Jumps
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put_each, take, where
@@ -204,7 +204,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             jumping = int(reduction.named(self.jumps.unknowns, "Jumps: unknowns").sum())
             moving = max(moving, jumping)
         rank = self.rank if self.rank is not None else reduction.size + 5 * moving
-        rank += input_rank(problem) if self.rank is None else 0
+        rank += input_rank(problem) + PAUSE_ROWS if self.rank is None else 0
         if rank < reduction.size:
             raise LawError(
                 f"SensitivityLaw: rank must be at least the {reduction.size} reduced coordinates; "
