@@ -27,7 +27,7 @@ from factories import driven_rod, line
 
 import livepde as lp
 from benchmarks.silent import unjudged
-from livepde.runs import clock_findings, input_findings, verdict
+from livepde.runs import clock_findings, input_findings, sampling_findings, verdict
 from livepde.stepping import Advance, simulate
 from livepde.verdict import Cause, Verdict
 
@@ -149,6 +149,16 @@ def counted(channel: str = "T", **counts: int) -> list[str]:
     rows.counts = {(kind, channel): number for kind, number in counts.items()}
     found = [*clock_findings(rows), *input_findings(rows, ["T"])]
     return [finding.what for finding in found]
+
+
+def paused(gap: int = 0) -> list[str]:
+    """Return the findings on the sampling of a run without so many of its rows."""
+    each = zip(rods.TIMES.tolist(), rods.shown() + rods.errors(), strict=True)
+    samples = [lp.Sample(t, row, {"T_left": rods.driven(t)}) for t, row in each]
+    del samples[40 : 40 + gap]
+    sensors = lp.Points(rods.PLACES, noise=rods.NOISE)
+    result = lp.Identifier(rods.rod(), sensors, lp.SensitivityLaw(), u0=0.0).run(samples)
+    return [finding.what for finding in sampling_findings(result.to_xarray())]
 
 
 @cache
@@ -296,6 +306,7 @@ RUNS = {
     ),
     "run_verdict: guards": Pair(partial(exploded, spoiled=True), partial(exploded, spoiled=False)),
     "run_verdict: gain": Pair(partial(filled, gain=1e4), filled),
+    "run_verdict: pause": Pair(partial(paused, 30), paused),
     "run_verdict: jump": Pair(partial(jumped, 0.7), partial(jumped, 1.0)),
     "equation_tests: rest": Pair(partial(filled, rests=True, gain=100.0), filled),
     "equation_tests: misfit": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
