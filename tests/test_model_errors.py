@@ -14,7 +14,15 @@ import scipy
 import livepde as lp
 from livepde.laws.error_columns import SMALL, ErrorColumns
 from livepde.laws.stored_samples import StoredSamples
-from livepde.verdict import Allowed, Cause, Finding, ModelErrors, Verdict
+from livepde.verdict import (
+    Allowed,
+    Cause,
+    Finding,
+    ModelErrors,
+    Shifts,
+    Verdict,
+    discretised,
+)
 from livepde.verdict.averaged import NU, TEMPER, Causes, Family, LinearModel, averaged
 
 # --- the average --------------------------------------------------------------------------------
@@ -313,3 +321,13 @@ def test_other_findings_keep_their_severity():
         "misfit", "do not trust", "The model does not explain the data.", causes=(unit,)
     )
     assert Verdict.of([gross]).with_errors(errors(0.01, 1.0)).level == "do not trust"
+
+
+def test_a_guessed_curvature_of_inputs_is_a_caution_unless_an_interval_holds_it():
+    shifts = Shifts(2.6, {"step": 0.1, "input": -2.5}, {("k", "input"): 0.1})
+    (found,) = discretised(shifts)
+    assert found.severity == "caution"
+    assert Verdict.of([found]).level == "caution"
+    assert Verdict.of([found]).with_errors(errors(0.05, 1.5)).level == "trusted"
+    (held,) = discretised(Shifts(2.6, {"step": 2.5, "input": 0.1}))
+    assert held.severity == "note"

@@ -50,7 +50,8 @@ PROMISES: dict[Level, str] = {
 }
 """Level -> what it says of the estimates."""
 DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
-RANKED = (*DOUBTS, "following", "stuck")  # those whose severity follows from fit and effect
+# Those whose severity follows from fit and effect: the interval holds shifts by the discretisation.
+RANKED = (*DOUBTS, "following", "stuck", "discretisation")
 NAMES: dict[str, Severity] = {"trusted": "note", "caution": "caution", LEVELS[-1]: "do not trust"}
 WORST: dict[Severity, Level] = {"note": "trusted", "caution": "caution", "do not trust": LEVELS[-1]}
 FEWEST = 20  # samples before which there is nothing to judge by
@@ -241,7 +242,9 @@ def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
     doubted = any(finding.what in DOUBTS for finding in given)
     level = errors.level(doubted=doubted)
     ranked = [
-        replace(one, severity=NAMES[level]) if one.what in RANKED and not _gross(one) else one
+        replace(one, severity=NAMES[level])
+        if one.what in RANKED and one.severity != "note" and not _gross(one)
+        else one
         for one in given
     ]
     text = errors.sentence(doubted=doubted)

@@ -15,6 +15,7 @@ __all__ = ["NOT_KNOWN", "REFINE", "Shifts", "discretised", "held_inputs", "known
 
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
 DECIDES = 5.0  # the same, from which the interval is little else
+GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign
 SHARED = 1.0  # the same by one kind of error, from which it is named
 SETTING = 1.0  # the same if inputs are readings: no interval holds that
 HOLD = "hold"
@@ -102,7 +103,8 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     remedy = " ".join(REFINE[kind][1] for kind in parts)
     # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
     # and says more on the mesh and the step than on the data.
-    severity: Severity = "caution" if total > DECIDES else "note"  # the interval holds it
+    unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
+    severity: Severity = "caution" if unsure else "note"  # the interval holds it
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
 
 
