@@ -37,7 +37,7 @@ def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     assert found.level == "trusted"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_an_offset_the_boundary_is_held_as_a_value_holds_it(tmp_path):
     path = short_rod(tmp_path, 41)
     held = run_variant(path, [], Variant("value"))

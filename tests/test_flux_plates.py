@@ -155,7 +155,7 @@ def case(folder: Path, *changes: tuple[str, str]) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_a_plate_as_a_sensor_determines_k_and_C(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
@@ -238,7 +238,7 @@ def test_noise_of_the_temperature_at_a_plate_is_noted(tmp_path: Path) -> None:
     assert not [note for note in load(case(tmp_path)).notes if "T_inside" in note]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scale_of_the_plate_may_be_unknown(tmp_path: Path) -> None:
     first_hour.write(tmp_path, "wall")
     path = case(tmp_path, ('at = "left", noise', 'at = "left", gain = 0.03, noise'))

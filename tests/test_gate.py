@@ -50,7 +50,7 @@ def test_one_bad_value_changes_next_to_nothing(at):
 
 @pytest.mark.slow
 def test_without_the_gate_one_bad_value_spoils_all():
-    law = lp.SensitivityLaw(gate=np.inf, guards=None, refit=None)
+    law = lp.SensitivityLaw(gate=np.inf, guards=None, refit=None, shadows=None)
     value, _ = rod(law).run(spoiled(readings(), {150}, 9999.0)).last.parameters["alpha"]
     assert value == pytest.approx(0.05 - 10 * 0.03)  # as far as latent values go
 

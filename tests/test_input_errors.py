@@ -70,7 +70,7 @@ MISTAKES = {
     "dates": (data("\n20,", "\n01.04.2025 12:00,"), RUN),
     "an encoding": (data("T_20", "Fühler", "cp1252"), RUN),
     "a workbook": (lambda: DATA.write_bytes(b"PK\x03\x04\x14"), RUN),
-    "a line of units": (data("T_right\n", "T_right\ns,K,K,K,K,K\n"), RUN),
+    "a word": (data("\n40,", "\nlater,"), RUN),
     "a repeated row": (data("\n40,", "\n20,"), RUN),
     "rows out of order": (data("\n40,", "\n10,"), RUN),
     "no rows": (lambda: DATA.write_text(DATA.read_text().partition("\n")[0]), RUN),

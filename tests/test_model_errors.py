@@ -242,7 +242,10 @@ def test_a_sound_run_is_trusted_with_hardly_a_wider_interval(seed):
     assert one.wider < 1.3
 
 
-@pytest.mark.parametrize("wrong", [("source", 0.06), ("loss", 0.5), ("flow", 0.15)])
+WRONG = [pytest.param(one, marks=pytest.mark.long) for one in (("loss", 0.5), ("flow", 0.15))]
+
+
+@pytest.mark.parametrize("wrong", [("source", 0.06), *WRONG])
 def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
     verdict = ended(truth(3, wrong)).verdict
     assert verdict.errors is not None

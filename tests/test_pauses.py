@@ -152,7 +152,7 @@ def estimate_of(path: Path) -> lp.Estimate:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["gap", "small leap"])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
 def test_the_unknowns_survive(tmp_path: Path, kind: str, seed: int) -> None:
     """The rod remembers an hour, and its ends have gone on unseen for ten minutes."""
     found = estimate_of(case(tmp_path, kind, seed))

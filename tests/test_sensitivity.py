@@ -128,7 +128,7 @@ def test_bounds_are_never_left():
         assert min(found) >= 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_drift_and_memory_follow_a_jump():
     model = conductivity()
     times = 0.05 * np.arange(161)

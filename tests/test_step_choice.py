@@ -103,7 +103,7 @@ def test_a_stated_dt_max_is_an_upper_bound() -> None:
     assert estimate.steps % 3 == 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_bound_on_the_cost_is_said_where_it_bites() -> None:
     law = lp.SensitivityLaw(shadows=Shadows(parts=2))
     estimate = ran(given := identifier(law))
@@ -114,8 +114,11 @@ def test_the_bound_on_the_cost_is_said_where_it_bites() -> None:
     assert not [one for one in ran(identifier()).verdict.findings if one.what == "step"]
 
 
+OTHERS = [pytest.param(stop, marks=pytest.mark.long) for stop in (9, 25)]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [6, 9, 25])
+@pytest.mark.parametrize("stop", [6, *OTHERS])
 def test_a_run_that_is_resumed_takes_the_same_steps(stop: int) -> None:
     whole, first = identifier(), identifier()
     ends = [whole.step(*row) for row in rows()]
@@ -150,7 +153,7 @@ def test_members_of_a_fleet_choose_their_own_steps() -> None:
     assert singles[0][10].steps > singles[1][10].steps
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("evolution", [None, lp.RandomWalk(1e-4)])
 def test_a_smoother_takes_the_same_steps(evolution: Any) -> None:
     """Undivided steps end at 0.32, nine standard deviations away."""

@@ -81,7 +81,8 @@ def test_speed_and_damping_from_two_points():
         scheme=Alexander2(),
         noise=AbsoluteNoise(0.01),
     )
-    law = lp.SensitivityLaw()
+    # The truth has the steps of the samples, too.
+    law = lp.SensitivityLaw(shadows=lp.laws.Shadows(parts=1))
     ident = lp.Identifier(model, sensors, law, u0={"w": pluck}, scheme=Alexander2())
     (c2, c2_std), (d, d_std) = ident.run(twin).last.parameters.values()
     assert c2 == pytest.approx(1.0, abs=0.01)

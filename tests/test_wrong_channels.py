@@ -62,7 +62,7 @@ def test_the_channel_of_the_first_cause_counts() -> None:
     assert first_named(Verdict.of((note,), ())) == ""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_scale_is_not_trusted() -> None:
     (fault,) = (fault for fault in FAULTS if fault.walk == "column")
     outcome = wrong_channels([fault], seeds=1)

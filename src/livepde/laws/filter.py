@@ -26,7 +26,7 @@ from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.input_noise import after_pause, with_input_noise
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, product, put, take
+from livepde.laws.member_arrays import changed, join, product, put, take
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.process_noise import NoiseRows, grades, pieces
 from livepde.laws.reduction import Reduction
@@ -235,15 +235,15 @@ class Filter:
         if (parts == parts[0]).all():
             end, taken, failure = self._predicted(x, replace(span, parts=parts))
             return changed(end, parts=parts), taken, failure
-        end, steps = x, np.zeros(len(x), dtype=np.int64)
-        for count in sorted(set(parts.tolist())):
-            group = np.flatnonzero(parts == count)
+        ends, steps = list[FilterState](), np.zeros(len(x), dtype=np.int64)
+        groups = [np.flatnonzero(parts == count) for count in sorted(set(parts.tolist()))]
+        for group in groups:
             some = take(x, group), span.part(group), parts[group]
             after, steps[group], failure = self._by_parts(*some)
             if failure is not None:
                 return x, steps, failure
-            end = put(end, group, after)
-        return end, steps, None
+            ends.append(after)
+        return take(join(*ends), np.argsort(np.concatenate(groups))), steps, None
 
     def _predicted(
         self, x: FilterState, span: Span

@@ -152,6 +152,7 @@ def after_pause(
 
     # How long the pause was is not sure either: the clock may have been set in it.
     rows = [(end.u - x.u) * pause[:, None]]
+    failure: StepFailed | None = None
     names = [name for name in lines(problem) if sizes[:, problem.channels.index(name)].any()]
     for name in names:
         base, failure = after(name, 0)

@@ -27,6 +27,7 @@ from livepde.verdict.model_errors import Allowed, ModelErrors
 
 __all__ = ["linear_model", "model_errors"]
 
+MANY = 150  # samples that tell apart what the full list has
 MOST_COLUMNS = 250  # of the process in the full list
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute with the full list
 MOST_SENSORS = 12  # with slow noise of their own
@@ -234,7 +235,8 @@ def linear_model(
         What is asked for, as rows on the coordinates xi, (numbers, r).
     """
     work = len(samples.spans) * samples.filter.problem.model.X.dim
-    numbers = FULL if work * MOST_COLUMNS < MOST_WORK else SMALL
+    fine = len(samples.spans) >= MANY and work * MOST_COLUMNS < MOST_WORK
+    numbers = FULL if fine else SMALL
     errors = ErrorColumns(samples, numbers)
     answers, states, predicted = errors.followed(one)
     noise = samples.noise
@@ -276,6 +278,9 @@ def linear_model(
     J = (one.slopes / level)[used]
     z = (one.residuals / level)[used] + J @ one.xi
     Z = np.concatenate(parts, axis=1)
+    # Beside a missing position of a sensor that moves, rates are not known.
+    known = np.isfinite(Z).all(axis=1)
+    J, z, Z = J[known], z[known], Z[known]
     columns = np.array([column for column, _ in causes])
     most = np.array([largest for _, largest in causes])
     single = Causes(columns, most, CAUSE_SIZES)

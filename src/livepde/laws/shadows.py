@@ -35,7 +35,7 @@ from livepde.laws.reduction import Reduction
 from livepde.laws.shadow_state import ShadowState
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.laws.step_tolerance import StepTolerance
-from livepde.linalg import Array, IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.stepping import (
     TINY,
     Advance,
@@ -847,6 +847,7 @@ class ShadowSet:
             found.append(Diagnostics(shadow_failed=failed, mesh_unfollowed=refused, shifts=shifts))
         return stacked(found)
 
+    @nonfinite_allowed()  # a shift that overflows is none
     def widening(self, x: FilterState) -> tuple[Array, Array]:
         """Return the row of the square root [U C] that is reported for all shifts together.
 

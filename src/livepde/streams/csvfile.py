@@ -166,7 +166,10 @@ def are_labels(cells: Sequence[str]) -> bool:
     """
     texts = [text for cell in cells if (text := cell.strip())]
     return bool(texts) and not any(
-        text[0].isdigit() or text.lower() in MISSING or number_of(text, ",") is not None
+        not text.isprintable()
+        or text[0].isdigit()
+        or text.lower() in MISSING
+        or number_of(text, ",") is not None
         for text in texts
     )
 

@@ -287,6 +287,7 @@ class Follow(RowSource):
         try:
             cells = self._cells(line)
         except (UnicodeError, csv.Error) as error:
+            self._labels = 0  # rows have begun
             if self._head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
                 return Row(
                     {}, token=token, broken="the file is in UTF-16, not to be followed: write UTF-8"
