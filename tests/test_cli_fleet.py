@@ -232,6 +232,8 @@ def same(one: xr.Dataset, other: xr.Dataset) -> None:
 def _attrs(data: xr.Dataset) -> dict:
     """Return what a dataset says, of its verdict the kinds and subjects of findings."""
     found = dict(data.attrs)
+    if "log_evidence" in found:  # a number to rounding, too
+        found["log_evidence"] = round(float(found["log_evidence"]), 6)
     if "verdict" in found:
         findings = json.loads(found["verdict"])["findings"]
         found["verdict"] = [(f["what"], f["subject"], f["severity"]) for f in findings]

@@ -207,8 +207,13 @@ def needs_data(page: Path) -> bool:
     return any("cases/" in one and not _stands_elsewhere(one) for one in commands)
 
 
+# Pages that take more than half a minute each run before a release.
+LONG = ("first-hour.md", "heat.md", "kdv.md", "advection_dispersion.md")
+RUN = [pytest.param(page, marks=pytest.mark.long if page.name in LONG else ()) for page in PAGES]
+
+
 @pytest.mark.pages
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
 def test_a_page_runs(page, tmp_path, monkeypatch, request):
     if needs_data(page):
         monkeypatch.setenv("LIVEPDE_DATA", str(request.getfixturevalue("data_dir")))

@@ -168,7 +168,7 @@ def test_what_is_sent_again_to_standard_input_is_used_once(here):
     assert np.array_equal(resumed["alpha"], expected["alpha"])
 
 
-@pytest.mark.parametrize("source", ["file", "lines"])
+@pytest.mark.parametrize("source", ["file", pytest.param("lines", marks=pytest.mark.long)])
 def test_a_block_that_comes_again_changes_nothing(here, source):
     """More rows than one commit has; rows 80 to 139 come again after row 159, and are counted."""
     whole = [row(k) for k in range(220)]
