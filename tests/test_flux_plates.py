@@ -154,8 +154,8 @@ def case(folder: Path, *changes: tuple[str, str]) -> Path:
     return folder / "wall.toml"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_plate_as_a_sensor_determines_k_and_C(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:

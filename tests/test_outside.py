@@ -8,7 +8,7 @@ import pytest
 from experiments import outside
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("process", outside.PROCESSES)
 def test_all_laws_run_on_the_data_of_the_study(process, monkeypatch):
     monkeypatch.setattr(outside, "TIMES", outside.TIMES[:6])
