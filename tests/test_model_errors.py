@@ -253,7 +253,7 @@ def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
     assert one.low < 0.12 < one.high
     assert verdict.level == "caution"
     first = verdict.sentences[0]
-    assert "times their noise" in first
+    assert "times the noise" in first
     assert "interval" in first
 
 
@@ -275,6 +275,71 @@ def test_an_unknown_that_moves_has_no_such_interval_and_the_run_says_so():
     verdict = identifier.run(samples).last.verdict
     assert verdict.errors is None
     assert any("unknowns move" in text for text in verdict.untested)
+
+
+def numbers(estimate: lp.Estimate) -> Any:
+    """Return misfit, and relative ends and width of the interval of the only unknown."""
+    errors = estimate.verdict.errors
+    assert errors is not None
+    one = errors["q"] if "q" in estimate.space.labels else errors.unknowns[0]
+    relative = [end / one.value for end in (one.low, one.high, one.plain_low, one.plain_high)]
+    return [errors.misfit, errors.of_signal, *relative, one.wider]
+
+
+def ended_with(z: Any, order: Any = None, scale: float = 1.0, **options: Any) -> lp.Estimate:
+    """Return the end of a run with sensors in another order, and a state in another unit."""
+    names = order or list(SENSORS)
+    sensors = lp.Points({name: SENSORS[name] for name in names}, noise=0.01 * scale)
+    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0, **options)
+    columns = {name: scale * z[:, k] for k, name in enumerate(SENSORS)}
+    samples = [
+        (
+            t,
+            {name: float(columns[name][k]) for name in names},
+            {name: scale * value for name, value in ends(t).items()},
+        )
+        for k, t in enumerate(TIMES)
+    ]
+    last = identifier.run(samples).last
+    assert last is not None
+    return last
+
+
+@pytest.mark.parametrize("wrong", [(), (("source", 0.06),)])
+@pytest.mark.parametrize("gaps", [False, True])
+def test_order_and_units_of_the_readings_change_no_interval(wrong, gaps):
+    z = truth(4, *wrong).copy()
+    if gaps:  # single readings, and a sensor for a while
+        z[7::11, 0] = z[30:60, 2] = np.nan
+    expected = numbers(ended_with(z))
+    assert numbers(ended_with(z, order=["T_7", "T_2", "T_5"])) == pytest.approx(expected, rel=1e-4)
+    assert numbers(ended_with(z, scale=40.0)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_what_is_uncertain_of_the_start_is_no_misfit():
+    """The residuals are those of the best fit, in which the start has its most probable value."""
+    clean = truth(5)
+    bump = 0.3 * np.sin(np.pi * np.array(list(SENSORS.values())))
+    decay = np.exp(-0.12 * np.pi**2 * np.array(TIMES))
+    z = clean + decay[:, None] * bump  # the first mode of another initial state
+    uncertain = ended_with(z, u0_errors=[lambda x: 0.3 * np.sin(np.pi * x[0])])
+    errors = uncertain.verdict.errors
+    assert errors is not None
+    assert errors.misfit == pytest.approx(1.0, abs=0.15)
+    assert uncertain.verdict.level == "trusted"
+    stated = ended_with(z).verdict.errors
+    assert stated is not None
+    assert stated.misfit > 1.5
+
+
+def test_samples_before_the_window_are_not_taken_as_exact_without_a_word():
+    sensors = lp.Points(SENSORS, noise=0.01)
+    law = lp.SensitivityLaw(refit=lp.Refit(window=60))
+    identifier = lp.Identifier(rod(), sensors, law, u0=0.0)
+    samples = [(t, row, ends(t)) for t, row in zip(TIMES, truth(1), strict=True)]
+    verdict = identifier.run(samples).last.verdict
+    assert verdict.errors is None
+    assert any("window of the refit" in text for text in verdict.untested)
 
 
 # --- levels --------------------------------------------------------------------------------------
@@ -314,6 +379,28 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
     more = again.with_findings([Finding("input", "note", "Channel a has gaps.")])
     assert more.level == level
     assert sum(finding.what == "effect" for finding in more.findings) == (level != "trusted")
+
+
+def test_a_doubted_run_without_unknowns_of_the_model_is_not_trusted():
+    offset = Allowed("T.offset", "K", 0.0, -0.1, 0.1, -0.1, 0.1, 1.0, of_sensor=True)
+    misfit = Finding("misfit", "do not trust", "The model does not explain the data.")
+    only = ModelErrors(2.0, 0.01, {"T": 2.0}, (offset,))
+    assert Verdict.of([misfit]).with_errors(only).level == "caution"
+
+
+def test_numbers_without_a_bound_are_json():
+    one = Allowed("k", "", 0.0, -1.0, math.inf, 0.0, 0.0, math.inf)
+    verdict = Verdict.of([]).with_errors(ModelErrors(1.0, math.inf, {"T": 1.0}, (one,)))
+    text = json.dumps(verdict.to_dict(), allow_nan=False)
+    assert Verdict.from_dict(json.loads(text)) == verdict
+
+
+def test_a_later_estimate_has_an_interval_as_much_wider_as_before():
+    before = errors(0.3, 4.0)
+    after = before.about({"k": (2.0, 1.99, 2.02)})["k"]
+    assert after.low == pytest.approx(2.0 - 0.01 * 0.3 / 0.001)
+    assert after.high == pytest.approx(2.0 + 0.02 * 0.3 / 0.001)
+    assert before.about({"k": (1.0, 0.999, 1.001)})["k"] == before["k"]
 
 
 def test_other_findings_keep_their_severity():

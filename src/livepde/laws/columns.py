@@ -116,12 +116,9 @@ class Columns:
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
         """Return the columns of one member, or why they cannot be looked at."""
-        if work.refit is None:
-            return "the law stores no samples"
-        if not work.fits:
-            return "unknowns move, inputs have noise, or the past fades"
-        if not state.log.shape[1]:
-            return "no sample is stored"
+        why, options = work.unstored(state), work.refit
+        if why or options is None:
+            return why
         problem = work.filter.problem
         names, channels = problem.observed.names, problem.channels
         inputs = tuple(name for name in channels if name in problem.model.channels)
@@ -144,9 +141,7 @@ class Columns:
         open_gate = replace(work.options, gate=Gate())
         zero = np.zeros(1, dtype=np.int64)
         begun = changed(state, log=log, window=zero)
-        return cls(
-            replace(work, options=open_gate), begun, places, inputs, work.refit
-        )._without_wild
+        return cls(replace(work, options=open_gate), begun, places, inputs, options)._without_wild
 
     @property
     def _without_wild(self) -> Columns:

@@ -19,11 +19,12 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from livepde.fem import Inputs, Moment, On, dot, grad
+from livepde.fem import Moment, dot, grad
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.stepping import ForwardStage
+from livepde.verdict.missing_terms import boundary_lifts, flux_loads, force, scaled_channel
 
 __all__ = ["FULL", "SMALL", "Course", "ErrorColumns", "hats"]
 
@@ -31,13 +32,13 @@ MOST_WORK = 1e8  # coefficients of answers that a pass may compute
 MOST_UNKNOWNS = 4  # that may jump or drift
 STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
+STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
 NARROW = 0.03  # of the length: a contact
 
-Load: TypeAlias = Callable[["Now"], Array]
-Weight: TypeAlias = Callable[[float], Array]
+Load: TypeAlias = Callable[["StatePoint"], Array]
 
 
-class Now(NamedTuple):
+class StatePoint(NamedTuple):
     """State, latent unknowns, time and inputs, and the change of the inputs in a unit of time."""
 
     u: Array
@@ -173,29 +174,18 @@ class ErrorColumns:
 
     def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
         """Iterate over boundary values and channels that are off, and late."""
-        model = self.model
-        zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
-        rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
-        for name in model.channels:
-            moved = Moment(0.0, Inputs({**known, name: 1.0}))
-            lift = model.impose(zero, moved) - rest
-            if lift.any():
-                fixed &= lift == 0.0
-                yield Answer("boundary", name, lift=lift), ALWAYS
+        model, lifts = self.model, boundary_lifts(self.model)
+        for name, lift in lifts.items():
+            yield Answer("boundary", name, lift=lift), ALWAYS
+            if name in model.channels:
                 yield Answer("late boundary", name, lift=_late(lift, name)), ALWAYS
-            else:
+        for name in model.channels:
+            if name not in lifts:
                 yield Answer("channel", name, load=_scaled(model, name)), ALWAYS
-        if fixed.any():
-            yield Answer("boundary", "the fixed boundary", lift=fixed.astype(float)), ALWAYS
 
     def _fluxes(self) -> Iterator[tuple[Answer, Course]]:
-        model = self.model
-        ones = model.state_space.interpolate(1.0)
-        for name in [str(one) for one in model.mesh.boundaries or {}]:
-            form: Any = On(name, lambda u, v, x: u * v)
-            load = model.bilinear(form) @ ones
-            if not load[model.X.free == 0.0].any() and load.any():
-                yield Answer("flux", name, load=load), ALWAYS
+        for name, load in flux_loads(self.model).items():
+            yield Answer("flux", name, load=load), ALWAYS
 
     def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
         """Iterate over unknowns that drift or jump during the run."""
@@ -265,7 +255,7 @@ class ErrorColumns:
             due = (number + 1) % stride == 0 or number + 1 == len(spans) or number == 0
             if due:
                 moment = span.end.member(0)
-                now = Now(x.u[0], q, moment, _rates(span))
+                now = StatePoint(x.u[0], q, moment, _rates(span))
                 if t > last:
                     share = (0.5 * (t + last) - begin) / (end - begin)
                     p = self._advanced(stage, p, now, t - last, share, free)
@@ -289,7 +279,7 @@ class ErrorColumns:
         return list(ends)[:-1]
 
     def _advanced(
-        self, stage: ForwardStage, p: Array, now: Now, h: float, share: float, free: Array
+        self, stage: ForwardStage, p: Array, now: StatePoint, h: float, share: float, free: Array
     ) -> Array:
         """Return the answers a time h later, shape (columns, n)."""
         factor, rows = stage.linearised(now.u, now.q, h, now.moment)
@@ -322,32 +312,18 @@ def _late(lift: Array, name: str) -> Load:
     return lambda now: -now.rates.get(name, 0.0) * lift
 
 
-def _residual(model: Model, u: Array, q: Array, moment: Moment) -> Array:
-    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
-    found: Array = model.F(moment) - model.B(u, moment) - driven
-    return found
-
-
 def _scaled(model: Model, name: str) -> Load:
-    """Return the change of the load with a channel that is larger by its own size."""
-
-    def load(now: Now) -> Array:
-        inputs = now.moment.inputs
-        more = Moment(now.moment.t, Inputs({**inputs, name: 1.001 * inputs[name]}))
-        return 1e3 * (
-            _residual(model, now.u, now.q, more) - _residual(model, now.u, now.q, now.moment)
-        )
-
-    return load
+    """Return the load of a channel that is larger by its own size."""
+    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, STEP) / STEP
 
 
 def _changed(model: Model, direction: Array) -> Load:
     """Return the derivative of the load by a latent unknown."""
 
-    def load(now: Now) -> Array:
-        more, less = now.q + 0.01 * direction, now.q - 0.01 * direction
-        up, down = (_residual(model, now.u, q, now.moment) for q in (more, less))
-        return 50.0 * (up - down)
+    def load(now: StatePoint) -> Array:
+        more, less = now.q + STEP * direction, now.q - STEP * direction
+        up, down = (force(model, now.u, q, now.moment) for q in (more, less))
+        return (up - down) / (2.0 * STEP)
 
     return load
 

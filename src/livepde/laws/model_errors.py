@@ -137,7 +137,7 @@ def model_errors(
         Reported standard deviations of the latent unknowns, and their shifts by the discretisation,
         (m,).
     """
-    one = samples.about(samples.reached)
+    one = _best(samples)
     if one is None:
         return "a step of the model fails at the best fit"
     used = plausible(samples, options, one) & np.isfinite(one.residuals)
@@ -147,13 +147,15 @@ def model_errors(
     T = reduction.Phi @ start.C[0].T
     model, causes, families = linear_model(samples, one, used, T)
     mixture = averaged(model, causes, families).widened(shift)
+    if not np.isfinite(mixture.interval).all():
+        return "the answers of the process to errors overflow"
     level = _level(one.residuals, used)
     variance = model.asked[1] + shift**2
     return ModelErrors(
         misfit=_rms(one.residuals[used]) / level,
         of_signal=_of_signal(samples.readings, one.residuals, used),
         sensors={
-            name: _rms(column[there]) / level
+            name: _rms(column[there]) / math.sqrt(_variance(column[there]))
             for name, column, there in zip(
                 samples.filter.problem.observed.names, one.residuals.T, used.T, strict=True
             )
@@ -161,6 +163,19 @@ def model_errors(
         },
         unknowns=tuple(_allowed(samples, mixture, variance, std)),
     )
+
+
+def _best(samples: StoredSamples) -> Passed | None:
+    """Return the samples about the best fit; None if a step fails."""
+    one = samples.about(samples.reached)
+    if one is None or not samples.state.start.U.any():
+        return one
+    # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
+    there = np.isfinite(one.residuals)
+    J, r = one.slopes[there], one.residuals[there]
+    step = np.linalg.solve(np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi)
+    better = samples.about(samples.within_bounds(one.xi + step))
+    return one if better is None or better.cost(there) > one.cost(there) else better
 
 
 def _rms(values: Array) -> float:
@@ -288,11 +303,15 @@ def linear_model(
 
 
 def _level(residuals: Array, used: Mask) -> float:
-    """Return the noise that successive residuals show, over the noise that is stated."""
-    found = []
-    for k, column in enumerate(residuals.T):
-        r = column[used[:, k]]
-        if len(r) > 1:
-            pairs = len(r) - 1
-            found.append((0.5 * float((np.diff(r) ** 2).sum()) + SHRINK) / (pairs + SHRINK))
-    return math.sqrt(max(float(np.median(found)), LEAST_LEVEL)) if found else 1.0
+    """Return the noise that successive residuals show, over the noise that is stated.
+
+    That of the median sensor: so the weights of the sensors stay those of the estimate.
+    """
+    found = [_variance(column[there]) for column, there in _columns(residuals, used)]
+    return math.sqrt(float(np.median(found)))
+
+
+def _variance(residuals: Array) -> float:
+    """Return the variance that successive residuals of a sensor show, over the stated one."""
+    squares = 0.5 * float((np.diff(residuals) ** 2).sum())
+    return max((squares + SHRINK) / (len(residuals) - 1 + SHRINK), LEAST_LEVEL)

@@ -104,6 +104,14 @@ class SensitivityWork:
         """True if the stored samples determine constant unknowns alone, so that they are fitted."""
         return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
 
+    def unstored(self, state: SensitivityState) -> str:
+        """Return why the stored samples of a member cannot be fitted; empty if they can."""
+        if self.refit is None:
+            return "the law stores no samples"
+        if not self.fits:
+            return "unknowns move, inputs have noise, or the past fades"
+        return "" if state.log.shape[1] else "no sample is stored"
+
     @cached_property
     def window(self) -> int:
         """Largest number of samples that are taken again together; 0: none are."""

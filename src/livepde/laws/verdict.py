@@ -241,19 +241,18 @@ def with_errors(
 
 def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
     """Return misfit and effects of one member, or why there are none."""
-    if work.refit is None:
-        return "the law stores no samples"
-    if not work.fits:
-        return "unknowns move, inputs have noise, or the past fades"
-    if not state.log.shape[1]:
-        return "no sample is stored"
+    why, options = work.unstored(state), work.refit
+    if why or options is None:
+        return why
+    if state.window[0]:  # what earlier samples have told would be taken as exact
+        return "the samples before a pause, or before the window of the refit, are not fitted again"
     filter_ = work.filter
     Phi, (_, C) = filter_.reduction.Phi, reported_factors(filter_, state.now)
     shift = np.zeros(len(Phi))
     if filter_.shadows is not None:
         shift = Phi @ filter_.shadows.widening(state.now)[1][0, 0]
     std = np.linalg.norm(Phi @ C[0].T, axis=1)
-    return model_errors(StoredSamples.of(work, state), work.refit, std, shift)
+    return model_errors(StoredSamples.of(work, state), options, std, shift)
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:

@@ -700,7 +700,8 @@ class Live:
         if not self.waits:  # the end is near, and has them
             return estimate.verdict
         if _due(len(self.result) // JUDGED):
-            self._errors = self.identifier.settled(estimate, columns=False).verdict.errors
+            settled = self.identifier.settled(estimate, columns=False)
+            self._errors = settled.verdict.errors or self._errors
         if self._errors is None:
             return estimate.verdict
         values = {}

@@ -43,12 +43,12 @@ NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not
 """Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
 
 PROMISES: dict[Level, str] = {
-    "trusted": "nothing that matters speaks against it",
+    "trusted": "no model error of consequence was found",
     "caution": "the model is not exact",
     NOT_JUDGED: "whether the model holds was not tested",
     LEVELS[-1]: "do not use the estimates as they are",
 }
-"""Level -> what it says of the estimates."""
+"""Level -> what it means for the estimates."""
 DOUBTS = ("misfit", "constancy", "disagreement")  # findings that speak against the model
 # Those whose severity follows from fit and effect: the interval holds shifts by the discretisation.
 RANKED = (*DOUBTS, "following", "stuck", "discretisation")

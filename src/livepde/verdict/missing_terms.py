@@ -19,7 +19,18 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import ForwardStage
 
-__all__ = ["Now", "Process", "Term", "stride"]
+__all__ = [
+    "Now",
+    "Process",
+    "Term",
+    "boundary_lifts",
+    "flux_loads",
+    "force",
+    "scaled_channel",
+    "stride",
+]
+
+FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
 
 REACH = 64.0  # samples in which a source of amplitude one moves the state by three times the noise
 DEVIATIONS = 3.0
@@ -105,22 +116,8 @@ class Process:
         return np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
 
     def _boundary_values(self) -> Iterator[Term]:
-        model, zero = self.model, np.zeros(self.model.X.dim)
-        # Boundary values are affine in the inputs: the difference of two states is the lift of a
-        # channel.
-        known = dict.fromkeys(model.channels, 0.0)
-        at_rest = model.impose(zero, Moment(0.0, Inputs(known)))
-        # Boundary values that no channel moves are constants of the model, which may be wrong as
-        # well.
-        rest = model.X.free == 0.0
-        for name in model.channels:
-            moved = Inputs({**known, name: 1.0})
-            lift = model.impose(zero, Moment(0.0, moved)) - at_rest
-            if lift.any():
-                rest &= lift == 0.0
-                yield Term("boundary", name, lift=self.level * lift)
-        if rest.any():
-            yield Term("boundary", "the fixed boundary", lift=self.level * rest)
+        for name, lift in boundary_lifts(self.model).items():
+            yield Term("boundary", name, lift=self.level * lift)
 
     def _domain(self) -> Iterator[Term]:
         mass = self.model.mass
@@ -135,15 +132,8 @@ class Process:
 
     def _fluxes(self) -> Iterator[Term]:
         """Iterate over a flux through each boundary where the model states no value."""
-        model = self.model
-        names = [str(name) for name in (model.mesh.boundaries or {})]
-        ones = model.state_space.interpolate(1.0)
         # Each costs a solve with every answer of the process.
-        for name in names[:MOST_ENDS]:
-            form: Any = On(name, lambda u, v, x: u * v)
-            load = model.bilinear(form) @ ones
-            if np.abs(load[model.X.free == 0.0]).any() or not load.sum() > 0.0:
-                continue
+        for name, load in flux_loads(self.model, MOST_ENDS).items():
             # As much as the source of amplitude one brings into the whole domain.
             shape = load * (self._whole.sum() / load.sum())
             yield Term("flux", name, load=_constant(shape, self.level))
@@ -187,20 +177,54 @@ def _constant(shape: Array, level: float) -> Load:
 
 def _gain(model: Model, name: str) -> Load:
     """Return the load of a channel that is larger by `GAIN` than the model takes it for."""
+    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, GAIN)
 
-    def residual(u: Array, q: Array, moment: Moment) -> Array:
-        physical = model.latent.value(q)
-        driven = model.physical_A.vector("v", moment, q=physical, u=u)
-        found: Array = model.F(moment) - model.B(u, moment) - driven
-        return found
 
-    def load(now: Now) -> Array:
-        inputs = now.moment.inputs
-        more = Inputs({**inputs, name: (1.0 + GAIN) * inputs[name]})
-        moved = Moment(now.moment.t, more)
-        return residual(now.u, now.q, moved) - residual(now.u, now.q, now.moment)
+def boundary_lifts(model: Model) -> dict[str, Array]:
+    """Return channel -> change of the boundary values by a unit of it, (n,), if it drives any.
 
-    return load
+    Boundary values that no channel moves are one more, of size one.
+    """
+    # Boundary values are affine in the inputs: the difference of two states is a lift.
+    zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
+    rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
+    found = {}
+    for name in model.channels:
+        moved = Moment(0.0, Inputs({**known, name: 1.0}))
+        lift = model.impose(zero, moved) - rest
+        if lift.any():
+            fixed &= lift == 0.0
+            found[name] = lift
+    return found | ({FIXED: fixed.astype(float)} if fixed.any() else {})
+
+
+def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
+    """Return boundary -> load of a flux of one through it, (n,), where no value is stated.
+
+    Of the first `most` boundaries of the mesh.
+    """
+    ones, found = model.state_space.interpolate(1.0), {}
+    for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
+        form: Any = On(name, lambda u, v, x: u * v)
+        load = model.bilinear(form) @ ones
+        if load.sum() > 0.0 and not load[model.X.free == 0.0].any():
+            found[name] = load
+    return found
+
+
+def force(model: Model, u: Array, q: Array, moment: Moment) -> Array:
+    """Return F - B(u) - A(u) q, (n,), of a latent parameter q."""
+    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
+    found: Array = model.F(moment) - model.B(u, moment) - driven
+    return found
+
+
+def scaled_channel(
+    model: Model, name: str, u: Array, q: Array, moment: Moment, share: float
+) -> Array:
+    """Return the change of the force with a channel that is larger by a share of it, (n,)."""
+    more = Inputs({**moment.inputs, name: (1.0 + share) * moment.inputs[name]})
+    return force(model, u, q, Moment(moment.t, more)) - force(model, u, q, moment)
 
 
 def stride(seen: int) -> int:

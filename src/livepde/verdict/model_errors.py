@@ -83,7 +83,7 @@ class Allowed:
         off = f"up to {self.effect:.2g} times its size off"
         if self.effect < 1.0:
             off = f"up to {100.0 * self.effect:.2g} % off"
-        return f"{self.label} between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
+        return f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,8 @@ class ModelErrors:
         """
         if self.failed:
             return "do not trust"
+        if not self.asked:  # no unknown of which an effect could be harmless
+            return "caution" if doubted else "trusted"
         wide = [one.effect for one in self.asked if one.wider > WIDER]
         if not doubted:
             return "caution" if max(wide, default=0.0) > HIDDEN else "trusted"
@@ -163,17 +165,15 @@ class ModelErrors:
 
     def sentence(self, *, doubted: bool) -> str:
         """Return fit and effect in words."""
-        fit = (
-            f"What is left of the readings is {self.misfit:.2g} times their noise, and "
-            f"{self.of_signal:.1%} of the signal."
-        )
+        signal = 100.0 * self.of_signal
+        fit = f"Residuals are {self.misfit:.2g} times the noise and {signal:.2g} % of the signal."
         if self.failed:
             return f"The fit failed. {fit}"
         # Of many unknowns those are said that may be off the most.
         some = [one.text for one in self.asked[:MOST]]
         more = f"; {len(self.asked) - MOST} more are in the table" if len(self.asked) > MOST else ""
-        why = "Errors of the model" if doubted else "Errors of the model that the data do not show"
-        return f"{fit} {why} leave {', '.join(some)}{more}." if some else fit
+        why = "model errors" if doubted else "model errors that these data would not show"
+        return f"{fit} Allowing for {why}, {', '.join(some)}{more}." if some else fit
 
     @property
     def remedy(self) -> str:
@@ -186,13 +186,30 @@ class ModelErrors:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the value as JSON can hold it."""
-        own = {**asdict(self), "unknowns": [asdict(one) for one in self.unknowns]}
-        return {**own, "sensors": dict(self.sensors)}
+        own = {**asdict(self), "sensors": dict(self.sensors)}
+        found: dict[str, Any] = _without_nonfinite(own)
+        return found
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any] | None) -> ModelErrors | None:
         """Return the value that `to_dict` has written; None if there is none."""
         if stored is None:
             return None
-        unknowns: Iterable[Any] = stored["unknowns"]
-        return cls(**{**stored, "unknowns": tuple(Allowed(**one) for one in unknowns)})
+        numbers = {key: _number(stored[key]) for key in ("misfit", "of_signal")}
+        sensors = {name: _number(value) for name, value in stored["sensors"].items()}
+        rows = [{key: _number(value) for key, value in one.items()} for one in stored["unknowns"]]
+        return cls(**numbers, sensors=sensors, unknowns=tuple(Allowed(**row) for row in rows))
+
+
+def _without_nonfinite(value: Any) -> Any:
+    """Return nested data with None for infinite numbers, which JSON has not."""
+    if isinstance(value, dict):
+        return {key: _without_nonfinite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nonfinite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _number(value: Any) -> Any:
+    """Return an infinite number for None: only an effect or a ratio has no bound."""
+    return math.inf if value is None else value
