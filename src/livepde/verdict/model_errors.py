@@ -181,7 +181,7 @@ class ModelErrors:
         if self.failed:
             return "Do not use the estimates: find what is wrong with the model or the data."
         if self.effect > USELESS:
-            return "These intervals hold, but are too wide to use: find the error first."
+            return "These intervals are too wide to use: find the error first."
         return "Use these intervals instead of the plain ones."
 
     def to_dict(self) -> dict[str, Any]:
