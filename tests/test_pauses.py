@@ -19,7 +19,7 @@ from livepde.fleet import Fleet
 from livepde.laws.pauses import InputHistory, pauses
 from livepde.runs import sampling_findings
 from livepde.stepping import Span
-from livepde.streams.sampling import unit_factor
+from livepde.streams.sampling import clock_leaps, unit_factor
 
 ALPHA = 1.5e-5
 DT = 10.0
@@ -127,9 +127,25 @@ def test_a_unit_of_time_that_changes_is_named(tmp_path: Path) -> None:
 
 def test_a_logger_that_gets_slower_changes_no_unit() -> None:
     """One second, then one minute: the times go on."""
-    assert unit_factor(before=100.0, after=160.0, usual=1.0) == 0.0
-    assert unit_factor(before=100.0, after=101e3, usual=1.0) == 1000.0
-    assert unit_factor(before=100.0, after=101e3, usual=0.1) == 0.0
+    assert unit_factor(before=100.0, after=160.0, usual=1.0, later=60.0) == 0.0
+    assert unit_factor(before=100.0, after=101e3, usual=1.0, later=1e3) == 1000.0
+    assert unit_factor(before=100.0, after=101e3, usual=0.1, later=100.0) == 0.0
+
+
+@pytest.mark.parametrize("rows", [20, 1])
+def test_a_pause_overnight_changes_no_unit(rows: int) -> None:
+    """21 hours after 21 minutes are 60 times as long, but later steps are as before."""
+    t = np.concatenate([60.0 * np.arange(21), 21 * 3600.0 + 60.0 * np.arange(rows)])
+    (finding,) = sampling_findings(xr.Dataset(coords={"time": ("time", t, {"units": "s"})}))
+    assert (finding.what, finding.severity) == ("pause", "note")
+
+
+def test_a_sensor_that_began_before_a_pause_shows_nothing_of_the_clock() -> None:
+    t = 10.0 * np.concatenate([np.arange(40), 100.0 + np.arange(10)])
+    drawn = np.random.default_rng(0).standard_normal((50, 2)).cumsum(axis=0)
+    late = drawn.copy()
+    late[:39, 1] = np.nan
+    assert clock_leaps(t, late, [40]) == clock_leaps(t, drawn[:, :1], [40])
 
 
 @pytest.mark.slow
