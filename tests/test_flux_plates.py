@@ -127,6 +127,23 @@ def test_a_plate_needs_one_dimension() -> None:
         bound(model, FluxPlates({"q": "left"}))
 
 
+def test_a_member_of_a_fleet_reads_its_plate_as_a_single_run() -> None:
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = conduction(mesh, lp.LogNormal(2.0, std=1.0), {"right": lp.Channel("T")}, C=4.0)
+    seen = Combined([lp.Points({"a": 0.5}, noise=0.1), FluxPlates({"q": "right"}, noise=0.1)])
+    singles = [lp.Identifier(model, seen, lp.SensitivityLaw(), u0=0.0) for _ in "ab"]
+    fleet = lp.fleet.Fleet(model, seen, lp.SensitivityLaw(), members=["a", "b"], u0=0.0)
+    for k in range(12):
+        T = math.sin(0.5 * k)
+        rows = [{"a": 0.2 * T, "q": 3.0 * T + b, "T": T} for b in (0.0, 0.3)]
+        if k == 5:
+            rows[1]["q"] = math.nan
+        found = fleet.step(0.1 * k, {name: [row[name] for row in rows] for name in rows[0]})
+        alone = [single.step(0.1 * k, row) for single, row in zip(singles, rows, strict=True)]
+        np.testing.assert_allclose(found.q, [one.q for one in alone], rtol=1e-9)
+    assert abs(found.q[0] - found.q[1]) > 1e-3
+
+
 # --- in a case -----------------------------------------------------------------------------------
 
 R = "r = { prior = 1, std = 1"

@@ -282,3 +282,56 @@ def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     std = last["alpha"].std
     assert float(smoothed["alpha"][-1]) == pytest.approx(last["alpha"].median, abs=0.1 * std)
     assert float(smoothed["alpha_std"][-1]) == pytest.approx(std, rel=0.03)
+
+
+# --- pauses together with other features ---------------------------------------------------------
+
+SENSORS = ("T_1", "T_2", "T_3")
+
+
+def few(gap: bool) -> list[tuple[float, dict[str, float]]]:
+    """Return the first rows of the rod, eight of which may be left out."""
+    rows = [(t, z) for t, z in samples() if t < 42 * DT]
+    return [row for k, row in enumerate(rows) if not (gap and 30 <= k < 38)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("uncertain", [{}, {"input_noise": {"hot": 0.1}}])
+def test_a_pause_of_one_member_is_none_of_another(uncertain: Any) -> None:
+    """The samples of one member fail for eight rows: its next interval is a pause."""
+    options = {"u0": 20.0, **uncertain}
+    singles = [lp.Identifier(*parts(), **options) for _ in range(2)]
+    fleet, paused = Fleet(*parts(), members=["a", "b"], **options), list[list[bool]]()
+    for k, (t, z) in enumerate(few(gap=False)):
+        rows = [z, {**z, "T_2": z["T_2"] + 0.01, "hot": 1e300 if 30 <= k < 38 else z["hot"]}]
+        found = fleet.step(t, {name: [row[name] for row in rows] for name in z})
+        alone = [single.step(t, row) for single, row in zip(singles, rows, strict=True)]
+        np.testing.assert_allclose(found.q, [one.q for one in alone], rtol=1e-9)
+        paused.append([bool(single._state.now.driven.pause[0]) for single in singles])
+    assert paused[38] == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", [30, 31])
+def test_a_run_with_all_kinds_of_noise_goes_on_to_the_bit_at_a_pause(cut: int) -> None:
+    """Noise per reading, readings that are missing, an uncertain start and a noisy input."""
+    rng = np.random.default_rng(1)
+    rows = list[tuple[float, dict[str, Any]]]()
+    for t, z in few(gap=True):
+        noise = {name: (z[name], 0.05 + 0.1 * rng.random()) for name in SENSORS}
+        lost = {name: np.nan for name in SENSORS if t > 0.0 and rng.random() < 0.3}
+        rows.append((t, {**z, **noise, **lost}))
+
+    def begun() -> lp.Identifier:
+        errors = [lambda x: 0.3 * np.ones(x.shape[1:]), lambda x: x[0]]
+        return lp.Identifier(*parts(), u0=20.0, u0_errors=errors, input_noise={"hot": 0.1})
+
+    whole, first, second = begun(), begun(), begun()
+    for t, z in rows:
+        whole.step(t, z)
+    for t, z in rows[:cut]:
+        first.step(t, z)
+    second.restore(first.dump())
+    for t, z in rows[cut:]:
+        second.step(t, z)
+    assert second.dump() == whole.dump()
