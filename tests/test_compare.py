@@ -194,13 +194,16 @@ def test_no_withheld_sensor_may_be_predicted_worse():
 def test_a_case_without_evidence_recommends_nothing_and_names_failures():
     base = ended("as stated", math.nan, 1.0)
     notes = " ".join(conclusions(base, [VariantRun(Variant("typo"), error="no")]))
-    assert notes.startswith("No variant is recommended")
+    assert notes.startswith("Variants are not ranked")
     assert "failed: 'typo'" in notes
 
 
 def test_an_interval_that_is_not_known_refutes_nothing():
     unknown = Interval(1.0, math.nan, math.nan, math.nan)
     assert unknown.overlaps(unknown)
+    content = ended("gradient", math.nan, 1.0, estimates={"k": unknown}).to_dict()
+    assert content["estimates"]["k"]["low"] is None
+    json.dumps(content, allow_nan=False)
 
 
 def test_readings_before_the_start_of_the_fit_do_not_count_as_evidence(biased):

@@ -155,7 +155,13 @@ class VariantRun:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the run as JSON can hold it."""
-        numbers = {name: vars(one) for name, one in self.estimates.items()}
+        numbers = {
+            name: {
+                **{key: _number(getattr(one, key)) for key in ("value", "std", "low", "high")},
+                "unit": one.unit,
+            }
+            for name, one in self.estimates.items()
+        }
         return {
             "name": self.variant.name,
             "settings": list(self.variant.settings),
@@ -315,7 +321,8 @@ def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     best = recommended(base, others)
     if math.isnan(base.log_evidence):
         text = (
-            "No variant is recommended: this case has no log evidence (its law has no covariance)."
+            "Variants are not ranked: this case has no log evidence (its law has no covariance). "
+            "The case as it is remains."
         )
         return [text, *_failures(others), *_disagreements(best, [base, *others])]
     return [
