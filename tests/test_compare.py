@@ -129,8 +129,9 @@ def test_a_variant_has_a_name_and_settings():
     assert found == Variant("two", ("unknowns.k.std='1 m^2/s'", 'data.separator=";"'))
     assert variant_of("law.jumps=true") == Variant("law.jumps=true", ("law.jumps=true",))
     assert variant_of("no offset: channels.T.offset=").settings == ("channels.T.offset=",)
-    with pytest.raises(CaseError, match="key=value"):
-        variant_of("offsets")
+    for text in ("offsets", "x: offsets", "x: law.jumps=true; offsets"):
+        with pytest.raises(CaseError, match=f"^--variant {text}: expected 'name: key=value"):
+            variant_of(text)
 
 
 def ended(name: str, evidence: float, withheld: float, unknowns: int = 2, **more) -> VariantRun:
@@ -156,7 +157,7 @@ def test_the_best_evidence_counts_unless_withheld_sensors_are_predicted_worse():
     notes = " ".join(conclusions(base, [good, worse, other, failed]))
     assert "Recommended: 'good'" in notes
     assert "'worse' fits the assimilated sensors better and predicts" in notes
-    assert "evidence of 'other' counts other readings" in notes
+    assert "evidence of 'other' is missing or counts other readings" in notes
 
 
 def test_without_withheld_sensors_the_evidence_decides():
@@ -172,7 +173,55 @@ def test_an_unknown_that_depends_on_the_variant_is_named():
     assert "k depends on the variant: its interval in 'other' does not overlap" in notes
     assert "c depends" not in notes
     assert "speak against 'other'" in notes
-    assert "All variants agree" in " ".join(conclusions(base, [replace(other, estimates={})]))
+    assert "All variants agree" in " ".join(
+        conclusions(base, [replace(other, estimates={"c": near})])
+    )
+    # Without a common unknown there is nothing that agrees.
+    assert "agree" not in " ".join(conclusions(base, [replace(other, estimates={})]))
+    # The case itself is one of the variants that may disagree.
+    best = replace(other, log_evidence=50.0)
+    assert "its interval in 'as stated' does not" in " ".join(conclusions(base, [best]))
+
+
+def test_no_withheld_sensor_may_be_predicted_worse():
+    base = replace(ended("as stated", 10.0, 1.0), withheld={"v": 5.0, "w": 1.0})
+    hidden = replace(ended("hidden", 50.0, 1.0), withheld={"v": 1.0, "w": 1.5})
+    fewer = replace(ended("fewer", 50.0, 1.0), withheld={"w": 1.0})
+    assert recommended(base, [hidden, fewer]) is base
+    assert "(w 1.5 instead of 1)" in " ".join(conclusions(base, [hidden]))
+
+
+def test_a_case_without_evidence_recommends_nothing_and_names_failures():
+    base = ended("as stated", math.nan, 1.0)
+    notes = " ".join(conclusions(base, [VariantRun(Variant("typo"), error="no")]))
+    assert notes.startswith("Variants are not ranked")
+    assert "failed: 'typo'" in notes
+
+
+def test_an_interval_that_is_not_known_refutes_nothing():
+    unknown = Interval(1.0, math.nan, math.nan, math.nan)
+    assert unknown.overlaps(unknown)
+    content = ended("gradient", math.nan, 1.0, estimates={"k": unknown}).to_dict()
+    assert content["estimates"]["k"]["low"] is None
+    json.dumps(content, allow_nan=False)
+
+
+def test_readings_before_the_start_of_the_fit_do_not_count_as_evidence(biased):
+    stated = run_variant(biased, (), Variant("as stated"))
+    late = run_variant(biased, (), variant_of("data.assimilate_from='4 min'"))
+    assert late.readings["T_30"] < stated.readings["T_30"]
+    assert math.isnan(late.gained(stated))
+
+
+def test_the_unit_of_a_column_does_not_change_the_evidence(biased):
+    stated = run_variant(biased, (), Variant("as stated"))
+    table = pd.read_csv(biased.parent / "rod.csv")
+    table["T_10"] = 1.8 * table["T_10"] + 32.0
+    table.to_csv(biased.parent / "rod.csv", index=False)
+    other = run_variant(biased, (), variant_of("channels.T_10.unit=degF"))
+    count = stated.readings["T_10"]
+    assert count > 30
+    assert other.gained(stated) == pytest.approx(-count * math.log(1.8), abs=1e-3)
 
 
 # --- settings of causes -------------------------------------------------------------------------

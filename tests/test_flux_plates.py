@@ -17,7 +17,7 @@ from livepde.cases import load
 from livepde.errors import CaseError, ObservationError
 from livepde.fem import Inputs, Moment
 from livepde.models import conduction
-from livepde.observation import Combined, Fluxes
+from livepde.observation import Combined, FluxPlates
 from livepde.runs.summary import tables
 from livepde.runs.thermal_resistance import LAYERS, SURFACES, resistance
 
@@ -35,7 +35,7 @@ def bound(model: lp.Model, plates: lp.observation.Observation) -> Any:
 
 
 def read(model: lp.Model, places: dict[str, Any], u: Any) -> np.ndarray:
-    seen = bound(model, Fluxes(places))
+    seen = bound(model, FluxPlates(places))
     return seen.predict(model.state_space.interpolate(u), model.parameter_space.prior, NOW)
 
 
@@ -73,7 +73,7 @@ def test_a_field_of_conductivity_counts_where_the_plate_is() -> None:
     mesh = lp.interval(0.0, 1.0, 16)
     field = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(1.0, 1.0))
     model = conduction(mesh, field, {"right": 0.0}, C=1.0)
-    seen = bound(model, Fluxes({"q": 0.5}))
+    seen = bound(model, FluxPlates({"q": 0.5}))
     q = np.sort(mesh.p[0])[np.argsort(np.argsort(model.parameter_space.fields["k"].doflocs[0]))]
     u = model.state_space.interpolate(lambda x: -2.0 * x[0])
     assert seen.predict(u, 1.0 + q, NOW)[0] == pytest.approx(3.0)
@@ -81,7 +81,7 @@ def test_a_field_of_conductivity_counts_where_the_plate_is() -> None:
 
 def test_derivatives_are_those_of_the_reading() -> None:
     model = wall()
-    seen = bound(model, Fluxes({"l": "left", "m": 0.4}))
+    seen = bound(model, FluxPlates({"l": "left", "m": 0.4}))
     rng = np.random.default_rng(3)
     u, q = rng.standard_normal(model.X.dim), np.array([1.7])
     du, dq, h = rng.standard_normal(model.X.dim), np.array([0.4]), 1e-4
@@ -92,7 +92,7 @@ def test_derivatives_are_those_of_the_reading() -> None:
 
 def test_each_sensor_keeps_its_unit() -> None:
     model = wall()
-    plates = Fluxes({"q": "left"}, noise=0.3, unit="W/m^2")
+    plates = FluxPlates({"q": "left"}, noise=0.3, unit="W/m^2")
     both = Combined([lp.Points({"T": 0.5}, noise=0.1, unit="degC"), plates])
     seen = bound(model, both)
     assert seen.units == ("degC", "W/m^2")
@@ -104,15 +104,15 @@ def test_each_sensor_keeps_its_unit() -> None:
 @pytest.mark.parametrize(
     ("plates", "model", "text"),
     [
-        (lambda: Fluxes({}), wall, "give at least one place"),
-        (lambda: Fluxes({"q": 1.2}), wall, r"'q' is at 1.2, outside of the mesh from 0 to 1"),
+        (lambda: FluxPlates({}), wall, "give at least one place"),
+        (lambda: FluxPlates({"q": 1.2}), wall, r"'q' is at 1.2, outside the mesh from 0 to 1"),
         (
-            lambda: Fluxes({"q": "top"}),
+            lambda: FluxPlates({"q": "top"}),
             wall,
             r"'q' is at 'top'; the mesh names \['left', 'right'\]",
         ),
-        (lambda: Fluxes({"q": 0.1}, "alpha"), wall, r"no unknown 'alpha'; it has \['k'\]"),
-        (lambda: Fluxes({"q": 0.1}), lambda: wall(1), "two cells or more"),
+        (lambda: FluxPlates({"q": 0.1}, "alpha"), wall, r"no unknown 'alpha'; it has \['k'\]"),
+        (lambda: FluxPlates({"q": 0.1}), lambda: wall(1), "two cells or more"),
     ],
 )
 def test_what_is_no_flux_is_refused(plates: Any, model: Any, text: str) -> None:
@@ -124,7 +124,24 @@ def test_a_plate_needs_one_dimension() -> None:
     mesh = lp.rectangle((0, 1), (0, 1), (4, 4))
     model = conduction(mesh, lp.Normal(1.0, 0.5), {"boundary": 0.0}, C=1.0)
     with pytest.raises(ObservationError, match="requires a mesh of one dimension; use Functionals"):
-        bound(model, Fluxes({"q": "left"}))
+        bound(model, FluxPlates({"q": "left"}))
+
+
+def test_a_member_of_a_fleet_reads_its_plate_as_a_single_run() -> None:
+    mesh = lp.interval(0.0, 1.0, 8)
+    model = conduction(mesh, lp.LogNormal(2.0, std=1.0), {"right": lp.Channel("T")}, C=4.0)
+    seen = Combined([lp.Points({"a": 0.5}, noise=0.1), FluxPlates({"q": "right"}, noise=0.1)])
+    singles = [lp.Identifier(model, seen, lp.SensitivityLaw(), u0=0.0) for _ in "ab"]
+    fleet = lp.fleet.Fleet(model, seen, lp.SensitivityLaw(), members=["a", "b"], u0=0.0)
+    for k in range(12):
+        T = math.sin(0.5 * k)
+        rows = [{"a": 0.2 * T, "q": 3.0 * T + b, "T": T} for b in (0.0, 0.3)]
+        if k == 5:
+            rows[1]["q"] = math.nan
+        found = fleet.step(0.1 * k, {name: [row[name] for row in rows] for name in rows[0]})
+        alone = [single.step(0.1 * k, row) for single, row in zip(singles, rows, strict=True)]
+        np.testing.assert_allclose(found.q, [one.q for one in alone], rtol=1e-9)
+    assert abs(found.q[0] - found.q[1]) > 1e-3
 
 
 # --- in a case -----------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import urllib.request
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -455,6 +456,18 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     assert [kind for kind, _ in rest] == ["well"]
     assert run.health["ok"]
     assert run.journal.health == ""
+
+
+def test_looks_that_alternate_between_two_worse_levels_are_not_trusted(tmp_path):
+    run = live(tmp_path, Rows(rows(3)))
+    run.run()
+    found = []
+    for number, level in enumerate(["", "caution", "do not trust", "caution", "do not trust"]):
+        run.result._count = 1000 + JUDGED * number
+        findings = [Finding("x", level, "It is off.")] if level else []
+        run._judge(SimpleNamespace(verdict=Verdict.of(findings)))
+        found.append(run.health["verdict"])
+    assert found == ["trusted", "trusted", "do not trust", "do not trust", "do not trust"]
 
 
 @pytest.mark.slow

@@ -109,6 +109,7 @@ HEADS = {
     "TOA5": TITLE + NAMES + UNITS + KINDS,
     "units": NAMES + UNITS,
     "plain": NAMES,
+    "empty lines": "\n" + TITLE + "\n" + NAMES + "\n" + UNITS + KINDS,
 }
 TOA5_COLUMNS = {"a": Column(("T_1",)), "b": Column(("T_2",))}
 STAMP = Clock("TIMESTAMP")

@@ -19,7 +19,7 @@ from livepde.fleet import Fleet
 from livepde.laws.pauses import InputHistory, pauses
 from livepde.runs import sampling_findings
 from livepde.stepping import Span
-from livepde.streams.sampling import unit_factor
+from livepde.streams.sampling import clock_leaps, unit_factor
 
 ALPHA = 1.5e-5
 DT = 10.0
@@ -127,9 +127,25 @@ def test_a_unit_of_time_that_changes_is_named(tmp_path: Path) -> None:
 
 def test_a_logger_that_gets_slower_changes_no_unit() -> None:
     """One second, then one minute: the times go on."""
-    assert unit_factor(before=100.0, after=160.0, usual=1.0) == 0.0
-    assert unit_factor(before=100.0, after=101e3, usual=1.0) == 1000.0
-    assert unit_factor(before=100.0, after=101e3, usual=0.1) == 0.0
+    assert unit_factor(before=100.0, after=160.0, usual=1.0, later=60.0) == 0.0
+    assert unit_factor(before=100.0, after=101e3, usual=1.0, later=1e3) == 1000.0
+    assert unit_factor(before=100.0, after=101e3, usual=0.1, later=100.0) == 0.0
+
+
+@pytest.mark.parametrize("rows", [20, 1])
+def test_a_pause_overnight_changes_no_unit(rows: int) -> None:
+    """21 hours after 21 minutes are 60 times as long, but later steps are as before."""
+    t = np.concatenate([60.0 * np.arange(21), 21 * 3600.0 + 60.0 * np.arange(rows)])
+    (finding,) = sampling_findings(xr.Dataset(coords={"time": ("time", t, {"units": "s"})}))
+    assert (finding.what, finding.severity) == ("pause", "note")
+
+
+def test_a_sensor_that_began_before_a_pause_shows_nothing_of_the_clock() -> None:
+    t = 10.0 * np.concatenate([np.arange(40), 100.0 + np.arange(10)])
+    drawn = np.random.default_rng(0).standard_normal((50, 2)).cumsum(axis=0)
+    late = drawn.copy()
+    late[:39, 1] = np.nan
+    assert clock_leaps(t, late, [40]) == clock_leaps(t, drawn[:, :1], [40])
 
 
 @pytest.mark.slow
@@ -266,3 +282,56 @@ def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     std = last["alpha"].std
     assert float(smoothed["alpha"][-1]) == pytest.approx(last["alpha"].median, abs=0.1 * std)
     assert float(smoothed["alpha_std"][-1]) == pytest.approx(std, rel=0.03)
+
+
+# --- pauses together with other features ---------------------------------------------------------
+
+SENSORS = ("T_1", "T_2", "T_3")
+
+
+def few(gap: bool) -> list[tuple[float, dict[str, float]]]:
+    """Return the first rows of the rod, eight of which may be left out."""
+    rows = [(t, z) for t, z in samples() if t < 42 * DT]
+    return [row for k, row in enumerate(rows) if not (gap and 30 <= k < 38)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("uncertain", [{}, {"input_noise": {"hot": 0.1}}])
+def test_a_pause_of_one_member_is_none_of_another(uncertain: Any) -> None:
+    """The samples of one member fail for eight rows: its next interval is a pause."""
+    options = {"u0": 20.0, **uncertain}
+    singles = [lp.Identifier(*parts(), **options) for _ in range(2)]
+    fleet, paused = Fleet(*parts(), members=["a", "b"], **options), list[list[bool]]()
+    for k, (t, z) in enumerate(few(gap=False)):
+        rows = [z, {**z, "T_2": z["T_2"] + 0.01, "hot": 1e300 if 30 <= k < 38 else z["hot"]}]
+        found = fleet.step(t, {name: [row[name] for row in rows] for name in z})
+        alone = [single.step(t, row) for single, row in zip(singles, rows, strict=True)]
+        np.testing.assert_allclose(found.q, [one.q for one in alone], rtol=1e-9)
+        paused.append([bool(single._state.now.driven.pause[0]) for single in singles])
+    assert paused[38] == [False, True]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cut", [30, 31])
+def test_a_run_with_all_kinds_of_noise_goes_on_to_the_bit_at_a_pause(cut: int) -> None:
+    """Noise per reading, readings that are missing, an uncertain start and a noisy input."""
+    rng = np.random.default_rng(1)
+    rows = list[tuple[float, dict[str, Any]]]()
+    for t, z in few(gap=True):
+        noise = {name: (z[name], 0.05 + 0.1 * rng.random()) for name in SENSORS}
+        lost = {name: np.nan for name in SENSORS if t > 0.0 and rng.random() < 0.3}
+        rows.append((t, {**z, **noise, **lost}))
+
+    def begun() -> lp.Identifier:
+        errors = [lambda x: 0.3 * np.ones(x.shape[1:]), lambda x: x[0]]
+        return lp.Identifier(*parts(), u0=20.0, u0_errors=errors, input_noise={"hot": 0.1})
+
+    whole, first, second = begun(), begun(), begun()
+    for t, z in rows:
+        whole.step(t, z)
+    for t, z in rows[:cut]:
+        first.step(t, z)
+    second.restore(first.dump())
+    for t, z in rows[cut:]:
+        second.step(t, z)
+    assert second.dump() == whole.dump()

@@ -293,7 +293,7 @@ def sensors_of_any_kind(draw):
             },
             inputs=("x",),
         ),
-        lp.observation.Fluxes({"e": "left", "i": a}, "gain"),
+        lp.observation.FluxPlates({"e": "left", "i": a}, "gain"),
         lp.observation.Moving({"m": "x", "n": "missing"}),
         lp.observation.Transformed(lp.Points({"t": a}), lambda y: np.exp(c * y / 2)),
         lp.Full(),

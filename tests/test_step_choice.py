@@ -134,6 +134,19 @@ def test_a_run_that_is_resumed_takes_the_same_steps(stop: int) -> None:
 
 
 @pytest.mark.slow
+def test_the_noise_of_a_reading_counts_as_that_of_its_sensor() -> None:
+    """The same noise, stated for the sensors or with each reading."""
+    rough = lp.Points(list(PLACES), noise=50.0 * NOISE)
+    stated, own = identifier(), lp.Identifier(pipe(), rough, lp.SensitivityLaw(), u0=begun)
+    for t, z, inputs in rows()[:12]:
+        stated.step(t, z, inputs)
+        readings = {name: (float(x), NOISE) for name, x in zip(own.observed.names, z, strict=True)}
+        own.step(t, readings, inputs)
+    assert parts_of(stated).max() > 1
+    assert parts_of(own).tolist() == parts_of(stated).tolist()
+
+
+@pytest.mark.slow
 def test_members_of_a_fleet_choose_their_own_steps() -> None:
     """One member sees a front, the other does not."""
     law, taken = lp.SensitivityLaw(refit=None, guards=None), rows()[:20]

@@ -37,7 +37,7 @@ from livepde.observation import (
     Calibrated,
     Combined,
     Discrepancy,
-    Fluxes,
+    FluxPlates,
     LineIntegrals,
     Moving,
     Observation,
@@ -209,7 +209,7 @@ def _part(
         common = {**common, "of": of}
     if kind == FLUX:
         places = {name: _flux_place(case, name, item) for name, item in channels.items()}
-        return Fluxes(places, case.equation.conductivity, **common)
+        return FluxPlates(places, case.equation.conductivity, **common)
     if kind == "over":
         return Averages(_regions(case, channels), **common)
     if kind == "along":

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.cases.case import Prepared, load
+from livepde.cases.case_channels import columns_of
 from livepde.cases.read import parse, settings_in
 from livepde.cases.remedies import with_settings
 from livepde.errors import CaseError
@@ -69,8 +70,8 @@ class Interval:
     unit: str = ""
 
     def overlaps(self, other: Interval) -> bool:
-        """Return whether two intervals have a point in common."""
-        return self.low <= other.high and other.low <= self.high
+        """Return whether two intervals have a point in common; true if one is not known."""
+        return not (self.low > other.high or other.low > self.high)
 
 
 @dataclass(frozen=True)
@@ -86,9 +87,10 @@ class VariantRun:
     verdict
         Its verdict, as `Verdict.to_dict` gives it.
     log_evidence
-        Of all readings of the sensors that it assimilates: `Result.log_evidence`.
+        `Result.log_evidence` of all readings that it assimilates, as a density in the unit of the
+        data: variants with another unit of a sensor are comparable.
     readings
-        Sensor that it assimilates -> number of its readings.
+        Sensor that it assimilates -> number of the readings that are assimilated.
     misfits
         Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
         one step ahead, second half of the samples.
@@ -153,7 +155,13 @@ class VariantRun:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the run as JSON can hold it."""
-        numbers = {name: vars(one) for name, one in self.estimates.items()}
+        numbers = {
+            name: {
+                **{key: _number(getattr(one, key)) for key in ("value", "std", "low", "high")},
+                "unit": one.unit,
+            }
+            for name, one in self.estimates.items()
+        }
         return {
             "name": self.variant.name,
             "settings": list(self.variant.settings),
@@ -189,7 +197,7 @@ def variant_of(text: str) -> Variant:
     head, colon, rest = text.partition(":")
     named = bool(colon) and "=" not in head
     settings = settings_in(rest if named else text)
-    if not settings:
+    if not settings or any("=" not in setting for setting in settings):
         raise CaseError(f"--variant {text}: expected 'name: key=value; key=value'.")
     parse(settings)
     return Variant(head.strip() if named else text.strip(), settings)
@@ -241,17 +249,30 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
         unit = str(data[label].attrs.get("units", ""))
         estimates[label] = Interval(value, std, low, high, unit)
     modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
-    seen = np.isfinite(data["innovation"].values).sum(axis=0)
+    used = data["time"].values >= prepared.assimilate_from
+    seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)
+    readings = dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True))
+    evidence = float(data.attrs.get("log_evidence", math.nan))
     return VariantRun(
         variant,
         verdict=found.to_dict(),
-        log_evidence=float(data.attrs.get("log_evidence", math.nan)),
-        readings=dict(zip(map(str, data["sensor"].values), seen.tolist(), strict=True)),
+        log_evidence=evidence + _log_volume(prepared, readings),
+        readings=readings,
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
         withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "withheld"},
         estimates=estimates,
         unknowns=len(labels) + sum(modes),
+    )
+
+
+def _log_volume(prepared: Prepared, readings: Mapping[str, int]) -> float:
+    """Return what turns a log density in the units of the model into one in those of the data."""
+    columns = columns_of(prepared.case)
+    return sum(
+        count * math.log(abs(columns[name].factor))
+        for name, count in readings.items()
+        if name in columns
     )
 
 
@@ -282,22 +303,48 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
 
 
 def _worse(one: VariantRun, base: VariantRun) -> bool:
-    """Return whether a run predicts the withheld sensors worse than another one."""
-    limit = base.withheld_error * (1.0 + WORSE)
-    return math.isfinite(limit) and not one.withheld_error <= limit
+    """Return whether a run predicts one of the withheld sensors worse than another run does.
+
+    Each sensor counts: they may have different units, and one may not hide behind another.
+    """
+    return any(_worse_at(one, name, error) for name, error in base.withheld.items())
+
+
+def _worse_at(one: VariantRun, name: str, error: float) -> bool:
+    """Return whether a run predicts a withheld sensor worse than with this error, or not at all."""
+    limit = error * (1.0 + WORSE)
+    return math.isfinite(error) and not one.withheld.get(name, math.nan) <= limit
 
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     """Return sentences on the recommendation, and on what other variants disagree about."""
     best = recommended(base, others)
-    return [_recommendation(base, best), *_remarks(base, others), *_disagreements(best, others)]
+    if math.isnan(base.log_evidence):
+        text = (
+            "Variants are not ranked: this case has no log evidence (its law has no covariance). "
+            "The case as it is remains."
+        )
+        return [text, *_failures(others), *_disagreements(best, [base, *others])]
+    return [
+        _recommendation(base, best),
+        *_failures(others),
+        *_remarks(base, others),
+        *_disagreements(best, [base, *others]),
+    ]
+
+
+def _failures(others: Sequence[VariantRun]) -> Iterator[str]:
+    """Iterate over a sentence on the variants that failed."""
+    if failed := [f"'{one.variant.name}'" for one in others if one.error]:
+        yield f"Not compared, because they failed: {', '.join(failed)}."
 
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
     if best is base:
+        which = " that predicts the withheld sensors as well" if base.withheld else ""
         return (
-            "Recommended: the case as it is. No variant that predicts the withheld sensors as well "
-            f"gains more than {GAINED:g} of log evidence."
+            f"Recommended: the case as it is. No variant{which} gains more than {GAINED:g} of log "
+            "evidence."
         )
     text = (
         f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
@@ -306,6 +353,8 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
     if math.isfinite(base.withheld_error):
         errors = f"{best.withheld_error:.3g} instead of {base.withheld_error:.3g}"
         text += f" It misses the withheld sensors by {errors}."
+    else:
+        text += " No sensor is withheld to confirm it."
     return text
 
 
@@ -313,10 +362,14 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     """Iterate over variants with better evidence and worse predictions, and refuted ones."""
     for one in others:
         if one.gained(base) > GAINED and _worse(one, base):
+            errors = (
+                f"{name} {one.withheld.get(name, math.nan):.3g} instead of {error:.3g}"
+                for name, error in base.withheld.items()
+                if _worse_at(one, name, error)
+            )
             yield (
-                f"'{one.variant.name}' fits the assimilated sensors better and predicts the "
-                f"withheld ones worse ({one.withheld_error:.3g} instead of "
-                f"{base.withheld_error:.3g}): it is not recommended."
+                f"'{one.variant.name}' fits the assimilated sensors better and predicts withheld "
+                f"ones worse ({', '.join(errors)}): it is not recommended."
             )
     refuted = [f"'{one.variant.name}'" for one in others if one.gained(base) < -GAINED]
     if refuted:
@@ -324,17 +377,19 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     apart = [one for one in others if not one.error and math.isnan(one.gained(base))]
     if apart:
         names = ", ".join(f"'{one.variant.name}'" for one in apart)
-        yield f"The evidence of {names} counts other readings, and is not compared."
+        yield f"The evidence of {names} is missing or counts other readings: it is not compared."
 
 
 def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     """Iterate over unknowns that differ by more than the intervals between variants."""
     found: dict[str, list[str]] = {}
+    shared = False
     for one in others:
+        shared |= one is not best and not best.estimates.keys().isdisjoint(one.estimates)
         for name in one.apart(best):
             found.setdefault(name, []).append(one.variant.name)
     for name, names in found.items():
         others_say = ", ".join(f"'{one}'" for one in names)
         yield f"{name} depends on the variant: its interval in {others_say} does not overlap."
-    if not found and any(not one.error for one in others):
+    if shared and not found:
         yield "All variants agree: their intervals overlap with that of the recommended one."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -167,8 +168,6 @@ def _run(
 
 def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> list[Table]:
     """Return the variants, that of the best evidence first, and those that failed."""
-    import math
-
     from livepde.runs import Table
     from livepde.runs.summary import shown
 
@@ -218,6 +217,8 @@ def _interval(known: Interval | None) -> str:
 
     if known is None:
         return "–"
+    if not math.isfinite(known.high - known.low):
+        return digits(known.value, known.std)[0]
     low, high = (digits(end, known.std)[0] for end in (known.low, known.high))
     return f"{digits(known.value, known.std)[0]} ({low} to {high})"
 

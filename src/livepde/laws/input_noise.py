@@ -110,14 +110,7 @@ def after_pause(
 
     The deviation of an input from its line is a bridge: a sum of MODES sines over the pause with
     independent amplitudes. Each row is the response to one of them, and one row is the change of
-    the state in the pause.
-
-    Parameters
-    ----------
-    propagate
-        Takes a state over a span.
-    x, end
-        The state before and after the span.
+    the state in the pause. Parameters are those of `with_input_noise`.
     """
     pause = end.driven.pause
     length = span.t1 - span.t0

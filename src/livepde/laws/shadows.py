@@ -325,7 +325,7 @@ class StepShadow(Shadow):
         weight = 1.0 + (0.5 * (block.waited + block.next) - 1.0) * alike
         # The error of a step with a jump is exceptional and no measure for the next ones.
         parts = {"halves": kept, "size": np.where(block.jumps | failed, s.size, size)}
-        excess = self.tolerance.excess(error, block.end, block.step.end)
+        excess = self.tolerance.excess(error, block.end, block.step)
         parts["excess"] = np.where(failed, 0.0, excess)
         return ErrorIncrement(failed, parts, u=weight[:, None] * error)
 

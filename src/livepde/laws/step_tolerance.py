@@ -11,7 +11,7 @@ import numpy as np
 from livepde.laws.filter_state import FilterState
 from livepde.laws.law import Problem
 from livepde.linalg import Array
-from livepde.stepping import Moments
+from livepde.stepping import Moments, Span
 
 __all__ = ["ALLOWED", "StepTolerance"]
 
@@ -75,9 +75,13 @@ class StepTolerance:
                 parts.append(number)
         return np.array(states), np.array(parts)
 
-    def excess(self, error: Array, x: FilterState, at: Moments) -> Array:
-        """Return the sizes of errors of the state, (members, n), over what is allowed."""
-        states, parts = self._tests
+    def excess(self, error: Array, x: FilterState, span: Span) -> Array:
+        """Return the sizes of errors of the state after a span, (members, n), over what is allowed.
+
+        A reading counts by its noise if that is smaller than the noise of its sensor.
+        """
+        (states, parts), at = self._tests, span.end
+        noise = self.noise if span.noise is None else np.fmin(self.noise, span.noise)
         members, k = len(error), x.C.shape[2]
         U = np.broadcast_to(states, (members, *states.shape))
         seen = self.rows(x, U, np.zeros((members, len(states), k)), at)
@@ -86,7 +90,7 @@ class StepTolerance:
             # A sensor whose place is missing shows nothing now: elsewhere it shows values.
             seen = np.where(np.isnan(seen) | ~seen.any(axis=1, keepdims=True), 1.0, seen)
         level = np.sqrt(x.level)[:, None]
-        gain = (seen / self.noise).max(axis=2, initial=0.0) / level
+        gain = (seen / noise[..., None, :]).max(axis=2, initial=0.0) / level
         sizes = np.sqrt((error * error) @ self._weights.T)  # (members, parts)
         found = (gain * sizes[:, parts]).max(axis=1, initial=0.0) / ALLOWED
         return np.where(np.isfinite(found), found, 0.0)

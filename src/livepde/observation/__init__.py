@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.observation.combined import Calibrated, Combined
-from livepde.observation.fluxes import Fluxes
+from livepde.observation.flux_plates import FluxPlates
 from livepde.observation.functionals import Functionals
 from livepde.observation.moving import Moving
 from livepde.observation.nonlinear import Transformed, TransformedObserved
@@ -29,7 +29,7 @@ __all__ = [
     "Calibrated",
     "Combined",
     "Discrepancy",
-    "Fluxes",
+    "FluxPlates",
     "Full",
     "Functionals",
     "LineIntegrals",

@@ -59,7 +59,7 @@ Runs = dict[tuple[str, float], "Ensemble"]
 
 
 @dataclass(frozen=True)
-class Variant:
+class PublishedRun:
     """Noise and law of several table rows; the levels 1, 5, 10 % are multiplied by `share`."""
 
     noise: Kind
@@ -69,10 +69,10 @@ class Variant:
 
 # Variants of the paper's example. The last one determines the level at which q* can be learned.
 PAPER = {
-    "nodal, mu = 1": Variant("nodal", NOISY),
-    "band, mu = 1": Variant("band", NOISY),
-    "band, mu = 10": Variant("band", STIFF),
-    "band, c1 = 1": Variant("band", FIRST, 0.01),
+    "nodal, mu = 1": PublishedRun("nodal", NOISY),
+    "band, mu = 1": PublishedRun("band", NOISY),
+    "band, mu = 10": PublishedRun("band", STIFF),
+    "band, c1 = 1": PublishedRun("band", FIRST, 0.01),
 }
 
 

@@ -671,16 +671,21 @@ class Live:
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
 
     def _judge(self, estimate: Estimate) -> None:
-        """Look at the verdict: another level counts once two looks in a row have found it.
+        """Look at the verdict: another level counts once two looks in a row differ in one way.
 
-        The first one that is judged counts at once.
+        Both are worse than the reported level, or both are better: findings that alternate between
+        two levels must not keep a better one. The first one that is judged counts at once.
         """
         if len(self.result) <= self._looked:  # samples that are taken again have been judged
             return
         verdict, self._looked = self._with_errors(estimate), len(self.result)
         before = self._level
         # The first level that is found is told at once.
-        known = before == NOT_JUDGED or verdict.level in (before, self._next)
+        known = before in (NOT_JUDGED, verdict.level) or (
+            self._next != ""
+            and (LEVELS.index(self._next) > LEVELS.index(before))
+            == (LEVELS.index(verdict.level) > LEVELS.index(before))
+        )
         self._next = "" if known else verdict.level
         if known:
             self._level = verdict.level

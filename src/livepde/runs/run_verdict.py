@@ -156,7 +156,8 @@ def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[
         usual = float(np.median(np.diff(t[:k])))
         length, at = float(t[k] - t[k - 1]), when(data, float(t[k]))
         times = f"{length:.6g} {data['time'].attrs.get('units', '')}".rstrip()
-        if factor := unit_factor(float(t[k - 1]), float(t[k]), usual):
+        later = float(np.median(np.diff(t[k:]))) if k + 1 < len(t) else math.nan
+        if factor := unit_factor(float(t[k - 1]), float(t[k]), usual, later):
             found.append(_unit_changed(k, at, factor))
             break  # of later steps nothing is known
         after = "The state is estimated again from there on, and the unknowns are kept."

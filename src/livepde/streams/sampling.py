@@ -36,16 +36,25 @@ class ClockLeap:
     usual: float
 
 
-def unit_factor(before: float, after: float, usual: float) -> float:
+def unit_factor(before: float, after: float, usual: float, later: float) -> float:
     """Return by which factor times count in another unit since a sample; 0: they do not.
 
-    Divided by the factor the later time follows the earlier one, which no gap does by chance.
+    Divided by the factor, the later time follows the earlier one, and the later steps are as long
+    as those before. A pause changes no later step.
 
-    >>> unit_factor(2990.0, 3.0e6, 10.0), unit_factor(2990.0, 6000.0, 10.0)
+    Parameters
+    ----------
+    before, after
+        Times before and after a pause.
+    usual, later
+        Usual steps of time before and after it; NaN where none is known.
+
+    >>> unit_factor(2990.0, 3.0e6, 10.0, 1e4), unit_factor(2990.0, 3.0e6, 10.0, 10.0)
     (1000.0, 0.0)
     """
     for factor in FACTORS:
-        if 0.0 < after / factor - before <= NEAR * usual:
+        follows = 0.0 < after / factor - before <= NEAR * usual
+        if follows and usual / NEAR <= later / factor <= NEAR * usual:
             return factor
     return 0.0
 
@@ -80,7 +89,10 @@ def _odds(x: Array, k: int, lag: int) -> float:
     if k < FEWEST or not np.isfinite(x[k] - x[k - 1]):
         return float("nan")
     lag = min(lag, k - FEWEST // 2)  # over a longer time the changes are no smaller
-    one, many = (np.nanmean(np.square(before[m:] - before[:-m])) for m in (1, max(lag, 1)))
+    changes = [np.square(before[m:] - before[:-m]) for m in (1, max(lag, 1))]
+    if any(np.isnan(each).all() for each in changes):
+        return float("nan")
+    one, many = map(np.nanmean, changes)
     if not (one > 0.0 and many > one):
         return 0.0
     d = float(x[k] - x[k - 1]) ** 2

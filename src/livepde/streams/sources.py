@@ -233,17 +233,10 @@ class Follow(RowSource):
         return True
 
     def _read_header(self, file: io.BufferedReader, start: int) -> None:
-        """Read the header of a file whose lines up to a position are known."""
+        """Read the header, and labels under it, from the lines before a position."""
         file.seek(0)
-        cells = self._cells(_line(file))
-        if is_title(cells):
-            if file.tell() >= start:
-                return
-            cells = self._cells(_line(file))
-        self._header, self._labels = _names(cells), UNDER
-        while self._labels and file.tell() < start:
-            file.readline(LONGEST)
-            self._labels -= 1
+        while file.tell() < start and (self._header is None or self._labels):
+            self._row(_line(file), None)
 
     def _replaced(self) -> bool:
         """Return whether another file has the name now, or this one has become shorter."""

@@ -18,7 +18,7 @@ from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Fluxes", "FluxesObserved", "in_cells"]
+__all__ = ["FluxPlates", "FluxPlatesObserved", "in_cells"]
 
 
 def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
@@ -31,7 +31,7 @@ def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
     """
     if name not in parameter.names:
         raise ObservationError(
-            f"Fluxes: the model has no unknown '{name}'; it has {list(parameter.names)}."
+            f"FluxPlates: the model has no unknown '{name}'; it has {list(parameter.names)}."
         )
     measure = Measure(mesh, 2)
     local = LocalSpace(parameter, measure)
@@ -49,7 +49,7 @@ def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
 
 
 @dataclass(frozen=True, eq=False)
-class Fluxes(Observation):
+class FluxPlates(Observation):
     """Flux sensors in one dimension, z_k = -D u_x at x_k, such as heat-flux plates.
 
     At an end the flux **into** the domain counts as positive, inside the flux towards larger x.
@@ -74,7 +74,7 @@ class Fluxes(Observation):
 
     Examples
     --------
-    >>> plates = Fluxes({"q_inside": "left", "q_middle": 0.12}, noise=0.3, unit="W/m^2")
+    >>> plates = FluxPlates({"q_inside": "left", "q_middle": 0.12}, noise=0.3, unit="W/m^2")
     """
 
     points: Mapping[str, float | str]
@@ -82,7 +82,7 @@ class Fluxes(Observation):
 
     def __post_init__(self) -> None:
         if not self.points:
-            raise ObservationError("Fluxes: give at least one place.")
+            raise ObservationError("FluxPlates: give at least one place.")
 
     def names(self, count: int) -> tuple[str, ...]:
         return tuple(self.points)
@@ -93,18 +93,18 @@ class Fluxes(Observation):
 
     def bind(
         self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
-    ) -> FluxesObserved:
-        return FluxesObserved(self, state, X, parameter)
+    ) -> FluxPlatesObserved:
+        return FluxPlatesObserved(self, state, X, parameter)
 
 
-class FluxesObserved(Observed):
-    """Bound `Fluxes`: z = W (D q * S u), with means D q and slopes S u of the cells."""
+class FluxPlatesObserved(Observed):
+    """Bound `FluxPlates`: z = W (D q * S u), with means D q and slopes S u of the cells."""
 
-    observation: Fluxes
+    observation: FluxPlates
 
     def __init__(
         self,
-        observation: Fluxes,
+        observation: FluxPlates,
         state: FunctionSpace,
         X: HilbertSpace,
         parameter: FunctionSpace,
@@ -113,15 +113,15 @@ class FluxesObserved(Observed):
         block = observation.scalar_block(state)
         if len(block.field.mesh.p) != 1:
             raise ObservationError(
-                "Fluxes requires a mesh of one dimension; use Functionals with an integral over "
-                "a boundary."
+                "FluxPlates requires a mesh of one dimension; use Functionals with an integral "
+                "over a boundary."
             )
         ends = np.sort(block.field.mesh.p[0][block.field.mesh.t], axis=0)
         order = np.argsort(ends[0])
         ends = ends[:, order]
         middles = ends.mean(axis=0)
         if len(middles) < 2:
-            raise ObservationError("Fluxes requires a mesh of two cells or more.")
+            raise ObservationError("FluxPlates requires a mesh of two cells or more.")
         values = block.probe(ends.reshape(1, -1))
         slopes = sp.diags_array(1.0 / np.diff(ends, axis=0)[0]) @ (
             values[len(middles) :] - values[: len(middles)]
@@ -144,17 +144,19 @@ class FluxesObserved(Observed):
             facets = (mesh.boundaries or {}).get(at)
             if facets is None:
                 known = sorted(mesh.boundaries or {})
-                raise ObservationError(f"Fluxes: '{name}' is at '{at}'; the mesh names {known}.")
+                raise ObservationError(
+                    f"FluxPlates: '{name}' is at '{at}'; the mesh names {known}."
+                )
             place = float(mesh.p[0][mesh.facets[0][np.asarray(facets)]].mean())
             if place not in (low, high):
-                raise ObservationError(f"Fluxes: '{name}' is at '{at}', which is no end.")
+                raise ObservationError(f"FluxPlates: '{name}' is at '{at}', which is no end.")
             # Into the domain: at the right end against x.
             sign = -1.0 if place == low else 1.0
         else:
             place = float(at)
         if not low <= place <= high:
             raise ObservationError(
-                f"Fluxes: '{name}' is at {place:g}, outside of the mesh from {low:g} to {high:g}."
+                f"FluxPlates: '{name}' is at {place:g}, outside the mesh from {low:g} to {high:g}."
             )
         k = int(np.clip(np.searchsorted(middles, place) - 1, 0, len(middles) - 2))
         share = (place - middles[k]) / (middles[k + 1] - middles[k])
