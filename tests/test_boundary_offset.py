@@ -34,7 +34,9 @@ def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     assert alpha.low < 9.7e-5 < alpha.high
     assert found.gained(plain) > 100.0
     assert found.withheld_error < plain.withheld_error
-    assert found.level == "trusted"
+    # An error that these data would not show may stand behind a part of the offset.
+    assert plain.level == "do not trust"
+    assert found.level in {"trusted", "caution"}
 
 
 @pytest.mark.long
