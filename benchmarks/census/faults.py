@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import livepde as lp
+from benchmarks.census import rods
 from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS
 
-__all__ = ["FAULTS", "Fault", "Scene"]
+__all__ = ["FAULTS", "Fault", "Scene", "shortened"]
 
 Array = NDArray[Any]
 HALF = 0.5  # of the run, when what is sudden begins
@@ -72,6 +74,21 @@ class Scene:
     def length(self) -> int:
         """Number of samples."""
         return len(self.z)
+
+    def like(self, other: Problem) -> Problem:
+        """Return another problem with as many samples and sensors as this one."""
+        return shortened(other, self.length - 1, self.z.shape[1])
+
+
+def shortened(problem: Problem, intervals: int, sensors: int) -> Problem:
+    """Return the first intervals of a problem with the first sensors."""
+    if intervals >= problem.intervals and sensors >= len(problem.points):
+        return problem
+    found = copy.copy(problem)
+    found.length = problem.length * intervals / problem.intervals
+    found.intervals = intervals
+    found.points = dict(list(problem.points.items())[:sensors])
+    return found
 
 
 Change = Callable[[Scene], Scene]
@@ -174,6 +191,57 @@ def _moved(scene: Scene) -> Scene:
     return replace(scene, points={**scene.points, scene.name: place}, subject=scene.name)
 
 
+def _slow(scene: Scene, values: Array) -> Array:
+    """Return a sensor that follows its surroundings with a time constant of four samples."""
+    found, share = values.copy(), 1.0 - np.exp(-1.0 / 4.0)
+    for k in range(1, len(values)):
+        found[k] = found[k - 1] + share * (values[k] - found[k - 1])
+    return np.asarray(found)
+
+
+def _means(scene: Scene) -> Scene:
+    """Return the scene in which a reading is the mean of the last eight."""
+    z = np.cumsum(np.concatenate([np.repeat(scene.z[:1], 8, axis=0), scene.z]), axis=0)
+    return replace(scene, z=(z[8:] - z[:-8]) / 8.0)
+
+
+def _common(scene: Scene) -> Scene:
+    """Return the scene with an error that all sensors share and that fades slowly."""
+    shared = _following(scene, scene.rng.standard_normal(scene.length))
+    return replace(scene, errors=scene.errors + 1.5 * shared[:, None])
+
+
+def _rounded(scene: Scene) -> Scene:
+    """Return the scene whose readings have steps of three standard deviations."""
+    step = 3.0 * scene.noise
+    shown = np.round((scene.z + scene.noise * scene.errors) / step) * step
+    return replace(scene, errors=(shown - scene.z) / scene.noise)
+
+
+def _depths(scene: Scene) -> Scene:
+    """Return the scene in which all places are 5 % too deep, as far as the process reaches."""
+    points = {
+        name: 1.05 * place if np.ndim(place) == 0 else tuple(1.05 * np.asarray(place))
+        for name, place in scene.points.items()
+    }
+    return replace(scene, points=points)
+
+
+def _saturated(scene: Scene, values: Array) -> Array:
+    low, high = values.min(), values.max()
+    return np.asarray(np.minimum(values, low + 0.8 * (high - low)))
+
+
+def _rod(truth: Callable[[Problem, float], Array]) -> Change:
+    """Return the change by which the readings are those of another rod with the same k."""
+
+    def changed(scene: Scene) -> Scene:
+        k = float(np.exp(scene.problem.latents["k"].value(scene.theta, 0)).item())
+        return replace(scene, z=truth(scene.problem, k))
+
+    return changed
+
+
 def _channel(change: Callable[[Scene, Array], Array]) -> Change:
     def changed(scene: Scene) -> Scene:
         inputs = scene.inputs.copy()
@@ -214,7 +282,7 @@ def _lacks(of: str, **other: float) -> Change:
     """Return the change by which the truth is that of another problem with the same sensors."""
 
     def changed(scene: Scene) -> Scene:
-        truth = PROBLEMS[of]
+        truth = scene.like(PROBLEMS[of])
         theta = np.zeros(truth.coordinates)
         for place, value in other.items():
             theta[int(place[1:])] = value
@@ -225,7 +293,7 @@ def _lacks(of: str, **other: float) -> Change:
 
 
 def _layers(scene: Scene) -> Scene:
-    wall = PROBLEMS["wall"]
+    wall = scene.like(PROBLEMS["wall"])
     theta = np.array([1.5, -1.5, 1.5, -1.5])
     names = list(wall.points)
     z = wall.predict(theta)
@@ -238,7 +306,7 @@ def _layers(scene: Scene) -> Scene:
 def _bent(scene: Scene) -> Scene:
     theta = scene.theta.copy()
     theta[1] = 1.5
-    rod = PROBLEMS["rod"]
+    rod = scene.like(PROBLEMS["rod"])
     z = scene.problem.predict(theta)
     return replace(scene, z=z, theta=theta, model=rod.model, told=rod)
 
@@ -347,6 +415,22 @@ FAULTS: Mapping[str, Fault] = {
         _bent,
         only=("warm-rod",),
     ),
+    "slow": Fault("a sensor with a time constant of 4 samples", _sensor(_slow), ("lag",)),
+    "means": Fault("readings are means of the last 8 samples", _means, ("lag",)),
+    "saturates": Fault("a sensor saturates at 80 % of its range", _sensor(_saturated)),
+    "common noise": Fault("an error of all sensors that fades slowly", _common, traced=False),
+    "rounded": Fault("readings have steps of three sigma", _rounded, traced=False),
+    "depths": Fault("all depths are 5 % too large", _depths, only=("rod", "profile", "wall")),
+    "advection": Fault("a flow is missing in the model", _rod(rods.advected), only=("rod",)),
+    "contact": Fault("a contact resistance is missing", _rod(rods.contact), only=("rod",)),
+    "averages": Fault("sensors average over a fifth", _rod(rods.averaged), only=("rod",)),
+    "source, late": Fault(
+        "a source from the middle on", _rod(rods.heated_late), ("source",), only=("rod",), late=True
+    ),
+    "loss, late": Fault(
+        "a loss from the middle on", _rod(rods.cooled_late), ("loss",), only=("rod",), late=True
+    ),
+    "nonlinear sink": Fault("a sink of 0.5 u |u| is missing", _rod(rods.nonlinear), only=("rod",)),
     "steps": Fault(
         "implicit Euler, one step a sample",
         lambda s: replace(s, scheme=lp.ImplicitEuler()),

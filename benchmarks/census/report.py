@@ -19,6 +19,9 @@ __all__ = ["outcome"]
 
 WRONG = 3.0  # standard deviations
 SILENT = 0.01  # share of all runs that are wrong and trusted, at most
+SILENT_WRONG = 0.03  # share of wrong runs that are trusted and off, at most
+GRAVE = 0.2  # relative error that may be trusted in `FALSE` of the wrong runs
+NEAR, REFUSED = 0.05, 0.2  # of runs with a smaller error, at most this share are not to be trusted
 FALSE = 0.02  # share of sound runs that are doubted, at most
 COVERED = 0.90  # share of numbers of wrong runs in the interval that allows for model errors
 COVERED_CAUTION = 0.95  # the same of runs with a caution
@@ -38,14 +41,28 @@ def outcome(scores: Sequence[Score]) -> Outcome:
     shown = [s for s in whole if not s.trace < VISIBLE]
     told = [s for s in shown if s.named is not None and s.verdict != "trusted"]
     delays = [s.delay for s in whole if s.delay is not None and s.delay >= 0 and not s.early]
+    wrong = [score for score in whole if score.fault]
+    grave = [s for s in wrong if s.verdict == "trusted" and s.error > GRAVE]
+    near = [s for s in wrong if s.error < NEAR]
+    refused = [s for s in near if s.verdict == "do not trust"]
+    strong = [s for s in wrong if not s.weak]
     checks = [
         Check("wrong by three deviations and trusted", _share(silent, whole), SILENT, "<="),
+        Check("the same of wrong runs", _share(silent, wrong), SILENT_WRONG, "<="),
+        Check(
+            "the same of wrong runs with many data",
+            _share([s for s in silent if not s.weak], strong),
+            SILENT,
+            "<=",
+        ),
+        Check("error above 20 % and trusted", _share(grave, wrong), FALSE, "<="),
+        Check("error below 5 % and do not trust", _share(refused, near), REFUSED, "<="),
         Check("the same of those with a trace", _share(shown_silent, shown), SILENT, "<="),
         Check("nothing wrong and doubted", _share(false, sound), FALSE, "<="),
         Check("cause among the first two", _share([s for s in told if s.named], told), NAMED, ">="),
         Check("runs that ended early", len(scores) - len(whole), 0, "<="),
     ]
-    allowed, found = _intervals([s for s in whole if s.fault], sound)
+    allowed, found = _intervals(wrong, sound)
     checks += found
     rows = []
     for fault in dict.fromkeys(score.fault for score in scores):
@@ -127,8 +144,7 @@ def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, l
     columns = ["runs", "numbers", "plain holds", "allowing holds", "width", "mean", "95 %"]
     nothing = (float("nan"), [float("nan")] * 3)
     widths = numbers.get("nothing", nothing)[1]
-    every = np.array([row for score in wrong for row in score.allowed], dtype=float)
-    rank = spearmanr(every[:, 3], every[:, 4]).statistic if len(every) > 2 else float("nan")
+    weak, strong = [s for s in wrong if s.weak], [s for s in wrong if not s.weak]
     held = [numbers.get(name, nothing)[0] for name in parts]
     checks = [
         Check("allowing interval holds the truth", held[0], COVERED, ">="),
@@ -136,10 +152,20 @@ def _intervals(wrong: Sequence[Score], sound: Sequence[Score]) -> tuple[Table, l
         Check("its width where nothing is wrong, median", widths[0], WIDER[0], "<="),
         Check("the same, mean", widths[1], WIDER[1], "<="),
         Check("the same, 95 %", widths[2], WIDER[2], "<="),
-        Check("rank correlation of effect and error", float(rank), RANKED, ">="),
+        Check("rank correlation of effect and error", _rank(wrong), RANKED, ">="),
+        Check("the same of runs with few data", _rank(weak), RANKED, ">="),
+        Check("the same of the others", _rank(strong), RANKED, ">="),
     ]
     title = "Intervals that allow for errors of the model (width over that of the noise alone)"
     return Table(title, columns, rows), checks
+
+
+def _rank(scores: Sequence[Score]) -> float:
+    """Return the rank correlation of the stated effects with the errors made."""
+    every = np.array([row for score in scores for row in score.allowed], dtype=float)
+    if len(every) < 3:
+        return float("nan")
+    return float(spearmanr(every[:, 3], every[:, 4]).statistic)
 
 
 def _share(some: Sequence[Score], of: Sequence[Score]) -> float:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 import livepde as lp
-from benchmarks.census.faults import FAULTS, HALF, Scene
+from benchmarks.census.faults import FAULTS, HALF, Scene, shortened
 from benchmarks.census.report import outcome
 from benchmarks.census.trace import trace
 from benchmarks.honest.problem import Problem
@@ -28,6 +28,8 @@ STATED = (1.0, 3.0, 1.0 / 3.0)
 """Stated over true noise."""
 LEVELS = (0.25, 1.0, 4.0)
 """True noise over that of the problem, about 2 % of the signal."""
+WEAK = 90, 2, 1.5
+"""Intervals, sensors and level of the noise of each fourth run: few data."""
 LOOKED = 10  # samples between two looks at the verdict after a fault
 NAMED = 2  # causes among which the right one has to be
 
@@ -40,6 +42,8 @@ class Score:
     ----------
     problem, fault, stated, level, seed
         Which run; no fault: nothing is wrong.
+    weak
+        Whether it has few data.
     verdict
         At the end.
     off
@@ -77,7 +81,13 @@ class Score:
     said: str = ""
     trace: float = np.nan
     failure: str = ""
+    weak: bool = False
     allowed: tuple[tuple[bool, bool, float, float, float], ...] = ()
+
+    @property
+    def error(self) -> float:
+        """Largest error of a number, relative to its value; NaN without numbers."""
+        return max((row[4] for row in self.allowed), default=np.nan)
 
 
 def census(
@@ -96,7 +106,8 @@ def census(
     faults
         Some of `FAULTS`; default all.
     seeds
-        Runs of each fault and problem; statements of the noise and its level take turns.
+        Runs of each fault and problem; statements of the noise and its level take turns, and each
+        fourth has few data.
     sound
         Runs of each problem with nothing wrong.
     """
@@ -126,17 +137,20 @@ def scored(name: str, fault: str, seed: int) -> Score:
     """Return the score of one run; the same arguments give the same numbers."""
     problem = TRUTHS[name]
     rng = np.random.default_rng([zlib.crc32(f"{name} {fault}".encode()), seed])
-    stated, level = STATED[seed % 3], LEVELS[(seed // 3 + 1) % 3]
+    stated, level, weak = STATED[seed % 3], LEVELS[(seed // 3 + 1) % 3], seed % 4 == 3
+    if weak:
+        intervals, sensors, level = WEAK
+        problem = shortened(problem, min(problem.intervals, intervals), sensors)
     with threadpool_limits(1):
         theta, shown = problem.draw(rng)
         scene = scene_of(problem, theta, shown, problem.noise * level, rng)
         if fault:
             scene = FAULTS[fault].change(scene)
-        score = Score(name, fault, stated, level, seed, "", np.nan)
+        score = Score(name, fault, stated, level, seed, "", np.nan, weak=weak)
         try:
             return _judged(scene, score)
         except (lp.errors.LivepdeError, ArithmeticError, np.linalg.LinAlgError) as error:
-            return Score(name, fault, stated, level, seed, "", np.nan, failure=repr(error))
+            return replace(score, failure=repr(error))
 
 
 def scene_of(
@@ -185,19 +199,15 @@ def _judged(scene: Scene, score: Score) -> Score:
     estimate = identifier.settled(estimate)  # as at the end of a run
     verdict = estimate.verdict
     kinds = about.kinds if about else ()
-    return Score(
-        score.problem,
-        score.fault,
-        score.stated,
-        score.level,
-        score.seed,
-        verdict.level,
-        _off(problem, scene, estimate),
-        _names(verdict, kinds, scene.subject) if kinds else None,
-        delay if late else None,
-        early,
-        verdict.sentences[0] if verdict.sentences else "",
-        trace(scene) if about and about.traced else np.nan,
+    return replace(
+        score,
+        verdict=verdict.level,
+        off=_off(problem, scene, estimate),
+        named=_names(verdict, kinds, scene.subject) if kinds else None,
+        delay=delay if late else None,
+        early=early,
+        said=verdict.sentences[0] if verdict.sentences else "",
+        trace=trace(scene) if about and about.traced else np.nan,
         allowed=tuple(_allowed(problem, scene, estimate)),
     )
 
