@@ -82,10 +82,13 @@ def test_readings_of_any_noise_give_the_weighted_least_squares():
         A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
     )
     one, unit = identifier(model=model), {}
+    # The forecasts take the same steps as the run.
+    stated = lp.laws.Shadows(parts=1)
+    law = lp.SensitivityLaw(gate=np.inf, shadows=stated)
     q1, q0 = (
-        lp.Identifier(
-            model, one.observed.observation, lp.SensitivityLaw(), q0={"s": s}, u0=0.0
-        ).forecast(H * np.arange(1, STEPS + 1))
+        lp.Identifier(model, one.observed.observation, law, q0={"s": s}, u0=0.0).forecast(
+            H * np.arange(1, STEPS + 1)
+        )
         for s in (1.0, 0.0)
     )
     for name in ("a", "b"):
@@ -94,9 +97,7 @@ def test_readings_of_any_noise_give_the_weighted_least_squares():
     rng = np.random.default_rng(0)
     std = rng.choice([0.001, 0.01, 0.1], size=rows.shape)
     z = 2.0 * rows + std * rng.standard_normal(rows.shape)
-    one = lp.Identifier(
-        model, lp.Points({"a": 0.3, "b": 0.6}, noise=1.0), lp.SensitivityLaw(gate=np.inf), u0=0.0
-    )
+    one = lp.Identifier(model, lp.Points({"a": 0.3, "b": 0.6}, noise=1.0), law, u0=0.0)
     for k in range(STEPS):
         one.step(H * (k + 1), np.column_stack([z[k], std[k]]))
     information = 1.0 / 10.0**2 + ((rows / std) ** 2).sum()
