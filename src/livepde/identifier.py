@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identifier", "Sample"]
 
-FORMAT = 11  # of the checkpoint
+FORMAT = 12  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 

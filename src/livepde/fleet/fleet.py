@@ -36,7 +36,7 @@ from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
 __all__ = ["Fleet"]
 
-FORMAT = 11  # of the checkpoint
+FORMAT = 12  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]
 

@@ -35,6 +35,9 @@ UNSURE = 0.5  # only where a direction keeps more than this share of its prior s
 ROUNDING = 1e-12  # share of a variance
 QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
 SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
+# Samples over those of a search that began again in vain, from which another one does: the model is
+# most likely in error. The second at the end of a run.
+ANEW, ANEW_LAST = 4, 2
 LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
 GATE_ROUNDS = 4
 WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
@@ -57,15 +60,20 @@ class Found:
         unknowns: then the model is in error, not the search.
     passes
         Passes over the samples that it took.
+    screened
+        True if it began again at screened points, and none explains the samples.
     """
 
     best: Passed
     used: Mask
     converged: bool
     passes: float
+    screened: bool
 
 
-def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | None:
+def refitted(
+    samples: StoredSamples, options: Refit, *, last: bool, screened: int = 0
+) -> Found | None:
     """Return the end of a search from the present estimate; None if no trajectory is possible.
 
     Parameters
@@ -73,10 +81,14 @@ def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | N
     last
         True for the end of a run: the search converges. Else it ends within a standard deviation,
         as the same samples are fitted again later.
+    screened
+        How many samples the last search had that began again at screened points in vain.
     """
     search = _Search(samples, options, last)
     search.descend(samples.reached)
-    if search.suspicious:
+    again = len(samples.spans) >= (ANEW_LAST if last else ANEW) * screened
+    screens = search.lost or (search.suspicious and again)
+    if screens:
         search.screen()
     if last and search.lost:
         search.draw()
@@ -87,8 +99,13 @@ def refitted(samples: StoredSamples, options: Refit, *, last: bool) -> Found | N
         if (used == search.used).all():
             break
         search.begin(used)
-    converged = search.settled and not search.lost
-    return Found(best=search.best, used=search.used, converged=converged, passes=search.passes)
+    return Found(
+        best=search.best,
+        used=search.used,
+        converged=search.settled and not search.lost,
+        passes=search.passes,
+        screened=screens and search.suspicious,
+    )
 
 
 def plausible(samples: StoredSamples, options: Refit, one: Passed) -> Mask:

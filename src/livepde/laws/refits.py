@@ -69,7 +69,7 @@ def settle(
         one = take(state, k)
         if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
             samples = StoredSamples.of(work, one)
-            found = refitted(samples, options, last=True)
+            found = refitted(samples, options, last=True, screened=int(one.fit.screened[0]))
             used[k] = None if found is None else found.used
             one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
             each[k] = _after(work, one, samples, found, last=True)
@@ -81,7 +81,8 @@ def refitted_now(
 ) -> SensitivityState:
     """Return one member after a refit that another one follows."""
     samples = StoredSamples.of(work, state)
-    return _after(work, state, samples, refitted(samples, options, last=False), last=False)
+    found = refitted(samples, options, last=False, screened=int(state.fit.screened[0]))
+    return _after(work, state, samples, found, last=False)
 
 
 def _after(
@@ -106,6 +107,7 @@ def _after(
         refused=np.array([float((there & ~found.used).sum())]),
         work=spent + found.passes * len(samples.spans),
         converged=np.array([float(found.converged)]),
+        screened=np.array([len(samples.spans)]) if found.screened else state.fit.screened,
     )
     now = work.filter.relinearised(x)
     # A filter to go back to that was set with this sample is that after the fit.

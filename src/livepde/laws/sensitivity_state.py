@@ -202,6 +202,8 @@ class FitState:
         Samples that all refits of the window have taken, one with derivatives counting 1.
     converged
         1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
+    screened
+        How many samples the last search had that began again in vain, 0 before, shape (members,).
     """
 
     samples: IntArray
@@ -210,13 +212,20 @@ class FitState:
     refused: Array
     work: Array
     converged: Array
+    screened: IntArray
 
     @classmethod
     def none(cls, members: int = 1) -> FitState:
         """Return the value before any refit."""
         zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
         return cls(
-            samples=nothing, cost=zero, readings=zero, refused=zero, work=zero, converged=zero
+            samples=nothing,
+            cost=zero,
+            readings=zero,
+            refused=zero,
+            work=zero,
+            converged=zero,
+            screened=nothing,
         )
 
     def member(self, k: int) -> Fit | None:
