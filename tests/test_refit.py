@@ -275,7 +275,8 @@ def test_a_reading_whose_place_is_missing_is_not_fitted():
     one, other = missing.settled(one), never.settled(other)
     assert one.fit is not None
     assert one.fit.cost == pytest.approx(other.fit.cost)
-    assert one.q == pytest.approx(other.q)
+    (_, std) = one.parameters["alpha"]
+    assert one.q == pytest.approx(other.q, abs=0.03 * std)  # where a search ends
 
 
 def test_a_fit_that_leaves_out_many_readings_says_so():
