@@ -115,7 +115,7 @@ def test_a_sensor_that_is_set_aside_is_named_until_it_fits_again():
     assert used == [False] * 9 + [True] * 41
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_change_that_most_sensors_show_is_followed():
     """Unknowns that may jump are learned anew, and constants are not trusted meanwhile."""
     z = readings(FIRST + 150, change=2.0, after=FIRST)

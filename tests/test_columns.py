@@ -199,6 +199,7 @@ def test_a_fault_that_is_in_no_column_is_not_put_on_one():
     assert not any(cause.share > 0.9 for cause in columns_named)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("options", [{"refit": None}, {"drift": 1e-6}, {"verdict": False}])
 def test_laws_without_a_fit_have_the_causes_that_they_had(options: dict[str, Any]):
     _, columns = bar(5)

@@ -91,7 +91,7 @@ def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
         assert best["level"] == "trusted"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_variants_in_processes_are_those_of_this_process(biased):
     options = ["--variant", FREED, "--json", "--jobs"]
     each = [json.loads(call("compare", biased, *options, jobs)[1]) for jobs in ("1", "2")]

@@ -113,7 +113,7 @@ def test_sensors_name_their_component(mesh):
         lp.Points([0.25], of="w").bind(*spaces)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sparse", [True, False])
 def test_both_laws_learn_an_exchange_rate(mesh, sparse):
     model = exchange(mesh, {"k": lp.Normal(1.0, 1.0, bounds=(0.0, 20.0))})

@@ -357,7 +357,7 @@ def test_samples_of_the_filter_are_checked():
     assert other.step(0.0, [np.nan, 20.0], inputs).x.tolist() == by_name.tolist()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_offset_removes_the_lasting_error_at_a_sensor():
     model, plant = reduced(), Plant(40.0)
     plain = ct.Kalman(model, PERIOD, drive={"heater": 0.001})

@@ -308,7 +308,7 @@ def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float =
 # --- identities -----------------------------------------------------------------------------------
 
 
-@drawn(10)
+@drawn(5)
 def test_a_run_that_is_restored_continues_to_the_bit(examples):
     def same(o: Options) -> None:
         taken, who, other = samples(o), identifier(o), identifier(o)
@@ -327,7 +327,7 @@ def test_a_run_that_is_restored_continues_to_the_bit(examples):
     check(options(), examples, same)
 
 
-@drawn(10)
+@drawn(5)
 def test_a_forecast_is_the_next_prediction(examples):
     def same(o: Options) -> None:
         who, taken, last, bounded = identifier(o), samples(o), {}, False
@@ -348,7 +348,7 @@ def test_a_forecast_is_the_next_prediction(examples):
     check(options(), examples, same)
 
 
-@drawn(10)
+@drawn(5)
 def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     def same(o: Options) -> None:
         assume(o.linear)

@@ -316,6 +316,7 @@ def test_order_and_units_of_the_readings_change_no_interval(wrong, gaps):
     assert numbers(ended_with(z, scale=40.0)) == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.long
 def test_what_is_uncertain_of_the_start_is_no_misfit():
     """The residuals are those of the best fit, in which the start has its most probable value."""
     clean = truth(5)

@@ -374,7 +374,7 @@ def test_a_boundary_flux_and_one_point_find_the_conductivity():
     identified(heated(), sensors, {"k": 0.6}, 0.01)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_moving_sensor_finds_the_conductivity():
     def inputs(t):
         return {"x": np.nan if t < 0.3 else 0.5 + 0.6 * np.sin(t)}  # out of the rod at times
@@ -382,7 +382,7 @@ def test_a_moving_sensor_finds_the_conductivity():
     identified(heated(), lp.observation.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_offsets_by_direct_and_gain_by_calibration():
     model = heated(a=lp.Normal(0.0, std=0.3), b=lp.Normal(0.0, std=0.3))
     direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}

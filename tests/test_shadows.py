@@ -226,7 +226,7 @@ def test_intervals_hold_on_a_coarse_mesh() -> None:
     assert np.mean(held) >= 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_nothing_is_wrong_intervals_grow_little() -> None:
     rows = samples(width=WIDTH / 2)
     widened = ran(identifier(), rows)
@@ -256,7 +256,7 @@ def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, refit: Any) -> Non
     assert one.diagnostics.named() == other.diagnostics.named()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
     law = lp.SensitivityLaw(refit=None)
@@ -277,7 +277,7 @@ def test_holds_with_gaps() -> None:
     assert abs(estimate.diagnostics.shifts.by("mesh")["k"]) > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_field_is_prolonged() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     line = lp.linear(mesh)
@@ -293,7 +293,7 @@ def test_a_field_is_prolonged() -> None:
     assert abs(estimate.diagnostics.shifts.sizes["mesh"]) > 0.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_says_where_the_mesh_is_not_followed() -> None:
     mesh = lp.interval(0.0, 1.0, 8)
     model = lp.Model(
@@ -323,7 +323,7 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert not ran(identifier(8), samples()[:30]).verdict.untested
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
     mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (8, 8, 8))
     model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})

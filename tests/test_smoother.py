@@ -119,7 +119,7 @@ def test_the_smoother_weighs_each_reading_by_its_noise(names):
     samples = [
         (t, dict(zip("abc", z.tolist(), strict=True))) if names else (t, z) for t, z in pairs
     ]
-    law = lp.SensitivityLaw(refit=None, gate=np.inf, guards=None)
+    law = lp.SensitivityLaw(refit=None, gate=np.inf, guards=None, shadows=None)
     result = lp.Identifier(model, SENSORS, law, u0=0.0).run(samples)
     data = result.smoothed()
     for name in "sc":

@@ -78,7 +78,7 @@ def parts_of(given: lp.Identifier) -> np.ndarray[Any, Any]:
 STATED = lp.SensitivityLaw(shadows=Shadows(parts=1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_front_is_stepped_as_finely_as_the_unknowns_need() -> None:
     exact = ran(identifier(STATED, dt_max=2.5))
     coarse, chosen = ran(identifier(STATED)), ran(given := identifier())

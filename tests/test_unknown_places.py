@@ -159,6 +159,7 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
         assert std < 0.1, label
 
 
+@pytest.mark.long
 def test_a_scalar_and_a_field_are_found_together():
     field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.2, std=0.1), name="D")
     model = lp.Model(

@@ -460,7 +460,7 @@ def test_priors_of_their_own_that_equal_the_common_one_change_nothing():
     np.testing.assert_allclose(own.q_std, plain.q_std, rtol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_region_moves_and_another_does_not():
     walk = lp.Scalar(lp.Normal(0.5, 0.3), evolution=lp.RandomWalk(0.2))
     a = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), own={"r": walk})

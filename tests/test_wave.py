@@ -91,7 +91,7 @@ def test_speed_and_damping_from_two_points():
     assert abs(d - 0.5) < 4 * d_std
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_speed_as_a_field():
     field = lp.Field(STRING, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=0.3))
     model = wave(STRING, field, 0.1, FIXED)
