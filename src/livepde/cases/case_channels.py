@@ -88,9 +88,10 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
         if channel.valid is not None:
             valid = case.pair(channel.valid, unit, f"channels.{name}.valid")
         needed = channel.gaps == "skip"
+        factor = 1.0 if channel.factor is None else channel.factor
         found[name] = Column(
             channel.sources,
-            rule.factor,
+            factor * rule.factor,
             rule.offset,
             valid,
             needed,
@@ -98,7 +99,7 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
             between=channel.between,
         )
         if channel.noise_column is not None:
-            found[noise_channel(name)] = _noise_column(case, name, channel, rule.factor)
+            found[noise_channel(name)] = _noise_column(case, name, channel, factor * rule.factor)
     return found
 
 

@@ -53,6 +53,7 @@ __all__ = [
     "publishers_of",
     "read_data",
     "reader_of",
+    "refuse_late",
     "source_of",
     "source_text",
     "suspect_start",
@@ -71,6 +72,10 @@ TOKEN = "LIVEPDE_TOKEN"  # which opens the page and /health, and is no password 
 LOG = logging.getLogger("livepde.run")
 FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
 START = "start"  # kind of remark on values of the first rows
+LATE = (
+    "late belongs to data that are complete. For a source that goes on, delay the other channels "
+    "at the source, or correct the clock."
+)
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
 
@@ -118,6 +123,45 @@ def read_data(
     source: str | Iterable[str] | None,
 ) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
+    late = _late(case)
+    found = _all_read(case, columns, clock, source)
+    if isinstance(found, JsonLines):
+        refuse_late(case)
+    if not late or isinstance(found, JsonLines):
+        return found
+    from livepde.streams.join import not_late
+
+    return _merged(case, not_late(found, late), columns)
+
+
+def _late(case: CaseContent) -> dict[str, float]:
+    """Return channel -> how late its times are, of those that state it."""
+    unit, channels = case.equation.time_unit, case.spec.channels
+    return {
+        name: case.convert(channel.late, unit, f"channels.{name}.late")
+        for name, channel in channels.items()
+        if channel.late is not None
+    }
+
+
+def refuse_late(case: CaseContent) -> None:
+    """Refuse late channels of a source that goes on.
+
+    Raises
+    ------
+    CaseError
+        A channel states how late it is.
+    """
+    for name in _late(case):
+        raise case.error(f"channels.{name}.late", LATE)
+
+
+def _all_read(
+    case: CaseContent,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    source: str | Iterable[str] | None,
+) -> DataTable | JsonLines:
     spec = case.spec.data
     if source is None and isinstance(spec.file, tuple):
         return _joined(case, spec.file, columns)
@@ -158,8 +202,6 @@ def _joined(
     case: CaseContent, files: Sequence[FileSpec], columns: Mapping[str, Column]
 ) -> DataTable:
     """Return several files as one table, joined by time; each channel comes from one of them."""
-    from livepde.streams.join import join_tables
-
     specs = [case.spec.data.of(file) for file in files]
     paths = [_found(case, str(spec.file)) for spec in specs]
     headers = list(map(partial(_header, case), specs, paths))
@@ -175,6 +217,15 @@ def _joined(
         if not own:
             raise case.error("data.file", f"no channel has a column of {path}; leave it out.")
         tables.append(_read(path, own, clock_of(case, spec), spec))
+    return _merged(case, tables, columns)
+
+
+def _merged(
+    case: CaseContent, tables: Sequence[DataTable], columns: Mapping[str, Column]
+) -> DataTable:
+    """Return tables as one, joined by time."""
+    from livepde.streams.join import join_tables
+
     second = clock_of(case).second
     sensors = case.roles(*SENSORS)
     needed = [name for name, column in columns.items() if column.needed]

@@ -23,6 +23,7 @@ from livepde.cases.data import (
     policy_of,
     publishers_of,
     read_data,
+    refuse_late,
     source_of,
     suspect_start,
     wild_start,
@@ -277,6 +278,7 @@ class LiveCase:
             self._origin = table.origin
             last = -math.inf if self._journal is None else self._journal.last
             return SampleFeed(table, after=last)
+        refuse_late(case)
         self._intake, position = self._new_intake()
         return Gathered(source_of(case, data, position, self._passwords), self._intake)
 

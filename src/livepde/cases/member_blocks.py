@@ -32,6 +32,8 @@ READ = {
     "columns",
     "noise_column",
     "unit",
+    "factor",
+    "late",
     "valid",
     "missing",
     "spikes",

@@ -50,12 +50,14 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
     case = prepared.case
     if case.spec.law.kind != "sensitivity":
         return ()
-    if cause.kind in KEYS:
-        return _of_sensor(case, cause)
     process = {"source": _source, "loss": _loss, "flux": _flux, "boundary": _boundary}
+    if cause.kind == "offset" and cause.subject in case.roles("boundary"):
+        return _boundary(prepared, cause)
     if cause.kind in process:
         return process[cause.kind](prepared, cause)
-    return settings_in(cause.setting)
+    if cause.kind in KEYS:
+        return _of_sensor(case, cause)
+    return _stated(case, cause)
 
 
 def adding(case: Case, name: str, std: float, **keys: float | str) -> str:
@@ -68,7 +70,9 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
     """Return the setting of an error of a sensor, with the prior that other sensors state."""
     key, channels = KEYS[cause.kind], case.roles("sensor")
     channel = channels.get(cause.subject)
-    if channel is None or getattr(channel, key) is not None:
+    if channel is None:
+        return _stated(case, cause)
+    if getattr(channel, key) is not None:
         return ()
     if key == "at_std" and not channel.is_point:
         return ()
@@ -81,6 +85,13 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
         return settings_in(cause.setting)
     given = float(f"{WIDE * abs(size):.2g}") if stated is None else stated
     return (channel_setting(cause.subject, key, toml_value(given)),)
+
+
+def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
+    """Return the settings that a cause has; none if the case states a factor or a delay already."""
+    channel = case.spec.channels.get(cause.subject)
+    known = channel is not None and (channel.factor, channel.late) != (None, None)
+    return () if known else settings_in(cause.setting)
 
 
 def _capacity(case: Case) -> float:

@@ -418,6 +418,8 @@ class ChannelSpec(Spec):
     noise: Quantity | None = None
     noise_column: Name | None = None
     unit: str | None = None
+    factor: PositiveFloat | None = None
+    late: Quantity | None = None
     offset: Quantity | None = None
     gain: PositiveFloat | None = None
     correlated: CorrelatedSpec | None = None

@@ -27,7 +27,7 @@ from livepde.laws.refit_options import Refit
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
-from livepde.verdict import Cause
+from livepde.verdict import Cause, channel_setting
 
 __all__ = ["Columns", "Explained", "likely_columns"]
 
@@ -43,18 +43,28 @@ PLAIN = 0.02  # range of a column over its size below which it is constant
 WHOLE = 0.95  # of the misfit
 SETTLED = 0.02  # relative change of a size that is none
 CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelier
-UNITS: tuple[tuple[str, float, float], ...] = (
-    ("are in degF where degC is expected", 1.0 / 1.8, -32.0 / 1.8),
-    ("are in degC where degF is expected", 1.8, 32.0),
-    ("are in K where degC is expected", 1.0, -273.15),
-    ("are in degC where K is expected", 1.0, 273.15),
+
+
+class Unit(NamedTuple):
+    """What the values of a column look like; their unit, and factor and constant that mend them."""
+
+    text: str
+    name: str
+    factor: float
+    constant: float
+
+
+UNITS: tuple[Unit, ...] = (
+    Unit("are in degF where degC is expected", "degF", 1.0 / 1.8, -32.0 / 1.8),
+    Unit("are in degC where degF is expected", "degC", 1.8, 32.0),
+    Unit("are in K where degC is expected", "K", 1.0, -273.15),
+    Unit("are in degC where K is expected", "degC", 1.0, 273.15),
     *(
-        (f"are {factor:g} times too {word}, as in another unit", power, 0.0)
+        Unit(f"are {factor:g} times too {word}, as in another unit", "", power, 0.0)
         for factor in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
         for word, power in (("large", 1.0 / factor), ("small", factor))
     ),
 )
-"""What the values of a column look like, and factor and constant that mend them."""
 
 
 class Explained(NamedTuple):
@@ -174,8 +184,8 @@ class Columns:
         elif error.kind == "gain":
             values = values / (1.0 + error.size)
         elif error.kind == "unit":
-            _, factor, constant = UNITS[error.unit]
-            values = factor * values + constant
+            unit = UNITS[error.unit]
+            values = unit.factor * values + unit.constant
         else:
             values = self._later(names[0], values[:, 0], error.size)[:, None]
         log[0][:, at] = values
@@ -335,7 +345,7 @@ class _Trials:
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
-        for number, (_, factor, constant) in enumerate(UNITS):
+        for number, (_, _, factor, constant) in enumerate(UNITS):
             # values - offset, then divided by 1 + gain: to first order in the change of the column.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
@@ -452,7 +462,7 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
             f"Check the clock, the averaging and the response time of {first}.",
         ),
         "unit": lambda: (
-            f"the values of {what} {first} {UNITS[error.unit][0]}",
+            f"the values of {what} {first} {UNITS[error.unit].text}",
             f"State the unit of {first}: channels.{first}.unit.",
         ),
         "exchange": lambda: (
@@ -461,4 +471,14 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
         ),
     }
     text, remedy = words[error.kind]()
-    return Cause(error.kind, first, text, float(min(share, 1.0)), remedy)
+    late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
+    mended = UNITS[error.unit]
+    factor = mended.factor if error.kind == "unit" else 1.0 / (1.0 + size)
+    keys = {
+        "gain": ("factor", f"{factor:.6g}"),
+        "lag": ("late", late),
+        "unit": ("unit", f'"{mended.name}"') if mended.name else ("factor", f"{factor:.6g}"),
+    }
+    setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
+    known = float("nan") if error.kind in ("unit", "exchange") else size
+    return Cause(error.kind, first, text, float(min(share, 1.0)), remedy, setting, known)

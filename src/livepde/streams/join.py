@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +15,7 @@ from livepde.stepping import Between
 from livepde.streams.clock import origin_at, since_1970
 from livepde.streams.table import DataTable
 
-__all__ = ["join_tables"]
+__all__ = ["join_tables", "not_late"]
 
 SAME = 1e-10  # of the whole time: times that differ by less are one moment
 
@@ -93,6 +94,25 @@ def join_tables(
     return DataTable(
         t - t[0], values, tuple(names), origin=origin_at(first + t[0] / second), remarks=remarks
     )
+
+
+def not_late(table: DataTable, late: Mapping[str, float]) -> list[DataTable]:
+    """Return a table as several, in which the times of late channels are earlier.
+
+    Parameters
+    ----------
+    late
+        Channel -> how much later than its values its times are, in the unit of the times.
+    """
+    rest = [name not in late for name in table.names]
+    names = tuple(name for name in table.names if name not in late)
+    found = [replace(table, values=table.values[:, rest], names=names)] if names else []
+    for name, by in late.items():
+        values = table.values[:, table.names.index(name)]
+        seen = np.isfinite(values)
+        t, own = table.t[seen] - by, values[seen, None]
+        found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
+    return found
 
 
 def _opening(t: float, times: Array, values: Array, between: Between) -> float:

@@ -310,7 +310,7 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
 
 
 def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
-    """Return the setting of a case that frees a cause of a size, empty if there is none.
+    """Return the setting of a case that frees or corrects a cause of a size; empty if none does.
 
     The freed unknown has a prior standard deviation of twice the size.
     """
@@ -318,6 +318,16 @@ def _setting(direction: ScoreDirection, size: float, at: Position) -> str:
     if direction.kind in keys:
         width = 2.0 * abs(_amount(direction, size, at))
         return channel_setting(direction.subject, keys[direction.kind], f"{width:.2g}")
+    if direction.kind == "lag":
+        by = f"{size * LAG * float(at.ledger.times[1]):.4g}"
+        late = f'"{by} {at.time_unit}"' if at.time_unit else by
+        return channel_setting(direction.subject, "late", late)
+    if direction.kind == "channel":
+        return channel_setting(
+            direction.subject, "factor", f"{1.0 + _amount(direction, size, at):.4g}"
+        )
+    if direction.kind == "drift":
+        return channel_setting(direction.subject, "role", '"ignored"')
     if direction.kind == "jump":
         return _jump(direction.subject)
     if direction.kind == "initial" and not at.start_uncertain:

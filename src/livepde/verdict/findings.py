@@ -82,11 +82,12 @@ class Cause:
     remedy
         Recommended action, as a sentence.
     setting
-        "key=value" of a case that makes the cause an unknown, as `livepde run --set` takes it;
+        "key=value" of a case that makes the cause an unknown, or corrects a column, as `livepde run
+        --set` takes it;
         several are separated by "; ". Empty if no setting frees the cause.
     size
-        Its size in units of the model: of a gain the share, of a source the change of the state per
-        unit of time, of a loss the rate; NaN if not known.
+        Its size in units of the model: of a gain the share, of a lag the time, of a source the
+        change of the state per unit of time, of a loss the rate; NaN if not known.
     """
 
     kind: str

@@ -1,0 +1,96 @@
+"""Keys of a channel that correct its column: `factor` and `late`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from factories import short_rod
+
+from livepde import cases
+from livepde.cases.remedies import with_settings
+from livepde.errors import CaseError
+
+ROWS = 41
+
+
+def changed(folder: Path, change) -> Path:
+    path = short_rod(folder, ROWS)
+    table = pd.read_csv(path.parent / "rod.csv")
+    change(table)
+    table.to_csv(path.parent / "rod.csv", index=False)
+    return path
+
+
+def read(path: Path, **settings: object):
+    raw = cases.load(path, settings=settings).prepare().raw
+    return pd.DataFrame(raw.values, index=raw.t, columns=list(raw.names))
+
+
+def late_by(name: str, rows: int):
+    def change(table: pd.DataFrame) -> None:
+        table[name] = table[name].shift(rows)
+
+    return change
+
+
+@pytest.mark.parametrize("name", ["T_10", "T_left"])
+def test_a_late_column_is_read_at_its_times(tmp_path, name):
+    plain = read(short_rod(tmp_path / "plain", ROWS))
+    step = float(np.median(np.diff(plain.index)))
+    path = changed(tmp_path / "late", late_by(name, 3))
+    found = read(path, **{f"channels.{name}.late": f"{3 * step} s"})
+    times = plain.index[:-4]
+    np.testing.assert_allclose(
+        found.loc[times, list(plain.columns)], plain.loc[times], rtol=1e-12, equal_nan=True
+    )
+
+
+def test_an_early_column_is_read_at_its_times(tmp_path):
+    plain = read(short_rod(tmp_path / "plain", ROWS))
+    step = float(np.median(np.diff(plain.index)))
+    path = changed(tmp_path / "early", late_by("T_10", -3))
+    found = read(path, **{"channels.T_10.late": f"{-3 * step} s"})
+    late = plain.index[plain.index > 4 * step]
+    found = found[np.isin(np.round(found.index, 6), np.round(plain.index, 6))]
+    shared = found.index.intersection(late)
+    assert len(shared) > ROWS // 2
+    np.testing.assert_allclose(found.loc[shared, "T_10"], plain.loc[shared, "T_10"], rtol=1e-12)
+
+
+def test_a_factor_corrects_a_scale(tmp_path):
+    plain = read(short_rod(tmp_path / "plain", ROWS))
+
+    def scaled(table: pd.DataFrame) -> None:
+        table["T_left"] *= 1.25
+
+    found = read(changed(tmp_path / "scaled", scaled), **{"channels.T_left.factor": 0.8})
+    np.testing.assert_allclose(found[list(plain.columns)], plain, rtol=1e-12)
+
+
+def test_a_source_that_goes_on_has_no_late_columns(tmp_path):
+    path = short_rod(tmp_path, ROWS)
+    case = cases.load(path, settings={"channels.T_10.late": "5 s"})
+    with pytest.raises(CaseError, match=r"T_10\.late: late belongs to data that are complete"):
+        case.read(iter(['{"time": 0.0}']))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        (late_by("T_10", 4), "channels.T_10.late="),
+        (lambda table: table.__setitem__("T_left", 1.3 * table["T_left"]), "channels.T_left."),
+    ],
+)
+def test_the_cause_of_a_wrong_column_has_the_key_that_corrects_it(tmp_path, change, key):
+    path = short_rod(tmp_path, 121)
+    table = pd.read_csv(path.parent / "rod.csv")
+    change(table)
+    table.to_csv(path.parent / "rod.csv", index=False)
+    prepared = cases.load(path).prepare()
+    verdict = with_settings(prepared, prepared.identifier.run(prepared.stream).last.verdict)
+    settings = [cause.setting for finding in verdict.findings for cause in finding.causes]
+    assert any(setting.startswith(key) for setting in settings), verdict.sentences
