@@ -113,8 +113,12 @@ class Problem(ABC):
         return self.unknowns[name].declared(priors[name])
 
     def identifier(self, priors: Priors, **options: Any) -> lp.Identifier:
-        """Return an identifier with its defaults and some more options of the law."""
-        law = lp.SensitivityLaw(**{**self.law, **options})
+        """Return an identifier with its defaults and some more options of the law.
+
+        Its steps are those that are stated, as in the forward model that it is compared with.
+        """
+        stated = {"shadows": lp.laws.Shadows(parts=1)}
+        law = lp.SensitivityLaw(**{**stated, **self.law, **options})
         model, sensors = self.model(priors), self.sensors(priors)
         return lp.Identifier(model, sensors, law, u0=self.u0, dt_max=self.longest)
 
