@@ -70,6 +70,9 @@ def test_each_row_is_a_run_of_its_own(here):
     table = pd.read_csv("rods/fleet.csv").set_index("name")
     assert table["status"].tolist() == ["finished", "finished", "failed", "failed"]
     assert table["samples"].tolist() == [39, 29, 0, 0]
+    plain = Path("rods/plain")
+    assert table.loc["plain", "verdict"] == runs.verdict(runs.open(plain).dataset).level
+    assert table["verdict"].isna().tolist() == [False, False, True, True]
     assert not Path("rods/lost").exists()
     for name, options in {
         "plain": (),

@@ -64,6 +64,8 @@ class MemberOutcome:
         "finished", "interrupted" or "failed".
     samples
         How many it has taken.
+    level
+        Level of its verdict; empty without samples.
     unknowns
         Label of each number -> last value and standard deviation.
     failed
@@ -79,6 +81,7 @@ class MemberOutcome:
     name: str
     status: str
     samples: int = 0
+    level: str = ""
     unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)
     failed: tuple[str, ...] = ()
     lost: dict[str, int] = field(default_factory=dict)
@@ -433,6 +436,7 @@ def _outcome_of(
     name: str, run: Driven | Run, dataset: xr.Dataset, checks: Sequence[Check]
 ) -> MemberOutcome:
     from livepde.records import STATUS_CODES
+    from livepde.runs import verdict
 
     unknowns = {
         label: (float(dataset[label][-1]), float(dataset[f"{label}_std"][-1]))
@@ -444,7 +448,14 @@ def _outcome_of(
     samples = dataset.sizes["time"]
     lost = dict(Counter(STATUS_CODES[code] for code in dataset["status"].values.tolist() if code))
     return MemberOutcome(
-        name, run.status, samples, unknowns, failed, lost, str(error) if error else ""
+        name,
+        run.status,
+        samples,
+        level=verdict(dataset).level if samples else "",
+        unknowns=unknowns,
+        failed=failed,
+        lost=lost,
+        error=str(error) if error else "",
     )
 
 
@@ -470,7 +481,7 @@ def _how(ended: Sequence[MemberOutcome]) -> list[str]:
 
 
 def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
-    """Return a row for each run: status, number of samples and final estimates."""
+    """Return a row for each run: status, number of samples, level and final estimates."""
     import pandas as pd
 
     rows = []
@@ -480,7 +491,8 @@ def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
             for label, (value, std) in item.unknowns.items()
             for key, number in ((label, value), (f"{label}_std", std))
         }
-        rows.append({NAME: item.name, "status": item.status, "samples": item.samples, **found})
+        own = {NAME: item.name, "status": item.status, "samples": item.samples}
+        rows.append({**own, "verdict": item.level, **found})
     return pd.DataFrame(rows)
 
 
