@@ -71,6 +71,8 @@ class LiveCase:
     ----------
     prepared
         The case with its first sample; None before that.
+    running
+        The run, also while it takes samples again; None before.
     silent
         Whether the source has been silent for too long while waiting for the first sample.
     why
@@ -100,6 +102,7 @@ class LiveCase:
             raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
         self.case = case
         self.prepared: Prepared | None = None
+        self.running: Live | None = None
         self.silent = False
         self.why = ""
         # An invalid case is refused here, before anything is connected.
@@ -184,6 +187,7 @@ class LiveCase:
             patient=True,
             stopping=stopping,
         )
+        self.running = live
         again = live.resume()
         if len(live.result):
             LOG.info("goes on after %d samples, %d of them taken again", len(live.result), again)

@@ -22,6 +22,7 @@ from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
+from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
@@ -29,7 +30,11 @@ __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
-CHECKPOINT = 256  # samples between two checkpoints
+CHECKPOINT = 256  # most samples between two checkpoints
+# Checkpoints also follow the time spent in steps, so that a run that is killed every few seconds
+# makes progress: they are a second of steps apart, or more where they would cost more than 5 %.
+APART, COST = 1.0, 0.05
+GRACE = 0.5  # seconds after a signal in which a step may end; then it is interrupted
 JUDGED = 50  # samples between two looks at the verdict
 SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
 # Keys of a stored verdict: the level that was reported last, the samples at the last look, another
@@ -45,6 +50,10 @@ UNUSED = frozenset(  # rows and values of no use
 )
 HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
+
+
+class Interrupted(KeyboardInterrupt):
+    """A step was left between two substeps, since the run is to stop; the state is that before."""
 
 
 class Sink(Protocol):
@@ -227,6 +236,9 @@ class Live:
         self._uncounted: deque[Remark] = deque()
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
+        self._stopped_at = math.inf  # when a step first saw that the run is to stop
+        self._kept_at = self._cost = 0.0  # `_seconds` at the last checkpoint, and its duration
+        self._replay = (0, 0)  # samples taken again so far, and their number
         stored = json.loads(journal.verdict) if journal.verdict else Verdict.unjudged().to_dict()
         self._verdict = Verdict.from_dict(stored)
         self._level, self._next = stored.get(TOLD, NOT_JUDGED), stored.get(NEXT, "")
@@ -240,7 +252,8 @@ class Live:
     def resume(self) -> int:
         """Take again the samples after the journal's last checkpoint; return their number.
 
-        A sample in whose step the process has ended three times is set aside.
+        A sample in whose step the process has ended three times is set aside. If `stopping` is set
+        meanwhile, the state so far is kept, and the rest is taken again the next time.
         """
         try:
             again = self._again(self.journal.estimated)
@@ -337,18 +350,36 @@ class Live:
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
-        again = 0
+        again, total = 0, self.journal.pending
         for taken in self.journal.samples():
+            self._replay = again, total
             new = taken.id > reached
-            if new and self.journal.mark() > TRIES:
-                self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
-                continue
-            self._step(taken, again=True)
-            if new:
-                # The step has ended, so a later crash must not count as one of its tries.
-                self.journal.commit()
+            if self.stopping.is_set() or not self._taken_again(taken, new):
+                # The next session continues from here.
+                self._keep_state()
+                break
             again += 1
+        self._replay = 0, 0
         return again
+
+    def _taken_again(self, taken: Taken, new: bool) -> bool:
+        """Take a sample again; return whether its step has ended.
+
+        `new`: the sample has no estimate yet, and its tries are counted.
+        """
+        if new and self.journal.mark() > TRIES:
+            self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
+            return True
+        try:
+            self._step(taken, again=True)
+        except Interrupted:
+            if new:
+                self.journal.unmark()
+            return False
+        if new:
+            # The step has ended, so a later crash must not count as one of its tries.
+            self.journal.commit()
+        return True
 
     def _read(self) -> Result:
         """Return the result that reads estimates from the journal."""
@@ -367,6 +398,10 @@ class Live:
         """Run until the source ends or `stopping` is set, and keep a final checkpoint."""
         try:
             self._run()
+        except Interrupted:
+            self._commit()
+            self._keep_state()
+            return
         except BaseException:
             # The first error is the one to report, not one that follows from it.
             with suppress(LivepdeError):
@@ -382,14 +417,20 @@ class Live:
         attempted("What is under way at the end", self._settled, None, notes)
         for note in notes:
             self._tell("unfinished", note)
-        self.journal.checkpoint(self.identifier.dump())
+        self._keep_state()
 
     def _settled(self) -> None:
         """Keep the verdict and the fields of the final estimate."""
         last = self.result.last
         if last is not None:
-            self.result.settle(last := self.identifier.settled(last))
-            self._keep_verdict(last.verdict)
+            try:
+                with interruptible(self._check):
+                    last = self.identifier.settled(last)
+                    verdict = last.verdict
+                self.result.settle(last)
+                self._keep_verdict(verdict)
+            except Interrupted:
+                self._tell("unfinished", "the fit at the end was left out: the run was stopped")
         if self.journal.estimated:
             # Nothing was left to do where there is no last estimate: the fields stay the same.
             final = last or self.identifier.settled(self.identifier.estimate())
@@ -517,12 +558,19 @@ class Live:
             "samples": len(self.result),
             "waiting": len(self._waiting),
             "silent": self.silent,
-            "status": "" if last is None else last.status.code,
+            "status": self.replaying or ("" if last is None else last.status.code),
+            "replaying": self.replaying,
             "seconds": self._seconds,
             "verdict": verdict.level,
             "findings": verdict.sentences,
             "counts": [[*key, number] for key, number in sorted(counts.items())],
         }
+
+    @property
+    def replaying(self) -> str:
+        """How many samples since the checkpoint were taken again; empty if none are to be."""
+        again, total = self._replay
+        return f"replaying {again} of {total} since the checkpoint" if total else ""
 
     @property
     def why(self) -> str:
@@ -598,15 +646,25 @@ class Live:
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
         try:
-            estimate = self._estimate(taken)
-            if estimate is not None:
-                self._hand_on(estimate, again)
+            with interruptible(self._check):
+                estimate = self._estimate(taken)
+                if estimate is not None:
+                    self._hand_on(estimate, again)
         finally:
             self.busy = False
+
+    def _check(self) -> None:
+        """Raise `Interrupted` once the run was to stop a while ago; called between substeps."""
+        if self.stopping.is_set():
+            now = self._clock()
+            self._stopped_at = min(self._stopped_at, now)
+            if now - self._stopped_at >= GRACE:
+                raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
         """Take a step; return None if the sample was refused or set aside."""
         before, begun = self.identifier.place, time.monotonic()
+        self._tell_pause(taken.t)
         try:
             estimate = self.identifier.step(taken.t, taken.values)
             self._seconds += time.monotonic() - begun
@@ -624,6 +682,9 @@ class Live:
                 raise
         except RunError:  # of the journal
             raise
+        except Interrupted:
+            self.identifier.return_to(before)
+            raise
         except Exception as error:
             # A failure of the numerics belongs to this sample; any other is an error in the code.
             if self.strict and numerical(error) is None:
@@ -634,6 +695,17 @@ class Live:
         else:
             return estimate
         return None
+
+    def _tell_pause(self, t: float) -> None:
+        """Report an interval of so many substeps that they are longer than `dt_max`."""
+        control, length = self.identifier.problem.control, t - self.identifier.t
+        if control.stretches(length):
+            text = (
+                f"no sample for {length:g} until t = {t:g}: the interval was divided into "
+                f"{LONG_SUBSTEPS} substeps longer than dt_max = {control.dt_max:g}; check the "
+                "time, or state a longer steps.dt_max"
+            )
+            self._tell("pause", text)
 
     def _withdraw(self) -> None:
         """Withdraw the last sample; waiting samples are later, and taken in their turn."""
@@ -664,11 +736,18 @@ class Live:
         # Counted from the start of the run, so that a resumed run judges the same samples.
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
-        if self._steps % CHECKPOINT == 0:
+        by_count = self._steps % CHECKPOINT == 0
+        if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
             self._record()
-            self.journal.checkpoint(self.identifier.dump())
-            if math.isfinite(self.retention.span):
+            self._keep_state()
+            if by_count and math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
+
+    def _keep_state(self) -> None:
+        """Keep a checkpoint of the state after the last estimated sample."""
+        begun = time.monotonic()
+        self.journal.checkpoint(self.identifier.dump())
+        self._cost, self._kept_at = time.monotonic() - begun, self._seconds
 
     def _judge(self, estimate: Estimate) -> None:
         """Look at the verdict: another level counts once two looks in a row differ in one way.

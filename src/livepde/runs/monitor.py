@@ -106,7 +106,8 @@ class Monitor:
     """Serves /livez, /readyz, /health and /metrics from threads of its own.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
-    else 503. A verdict changes none of these codes: it is in the content of /health, and a metric.
+    else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes
+    none of these codes: it is in the content of /health, and a metric.
 
     Parameters
     ----------
@@ -152,8 +153,9 @@ class Monitor:
         found = dict(self._health())
         code = "200 OK" if found.get("ok") else "503 Service Unavailable"
         if path == "/readyz":
-            start(code, plain)
-            return [f"{found.get('why') or 'ok'}\n".encode()]
+            waits = found.get("why") or found.get("replaying")
+            start("503 Service Unavailable" if waits else code, plain)
+            return [f"{waits or 'ok'}\n".encode()]
         start(code, [("Content-Type", "application/json")])
         return [json.dumps(found).encode()]
 
