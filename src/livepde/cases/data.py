@@ -405,6 +405,8 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
         path,
         separator=spec.separator,
         encoding=spec.encoding,
+        skip=spec.skip,
+        times=spec.times,
         follow=spec.follow,
         position=position,
     )

@@ -295,7 +295,8 @@ class LiveCase:
             raise case.error("data.every", text)
         whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
         # These options are of files: lines that are sent have neither titles nor a second column.
-        listed = spec.every > 1 or spec.skip > 0 or len(spec.times) > 1
+        above = not spec.follow and (spec.skip > 0 or len(spec.times) > 1)
+        listed = spec.every > 1 or above
         return whole or (bool(file) and listed)
 
     def _new_intake(self) -> tuple[Intake, str]:

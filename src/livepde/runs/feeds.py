@@ -105,7 +105,7 @@ class Gathered(Feed):
     def _outcome(self, row: Row, token: Any, received: float) -> IntakeOutcome:
         if row.broken:
             return IntakeOutcome(
-                remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token]
+                remarks=[Remark(row.kind, "", row.broken, row=token)], spent=[token]
             )
         return self.intake.take(row.values, token, received)
 

@@ -381,6 +381,8 @@ def _cells(
         rows: list[int] = []
         columns: list[list[str]] = [[] for _ in needed]
         for number, row in numbered:
+            if row[0].startswith("#"):  # a comment
+                continue
             if too_wide(row, header):
                 raise SampleError(
                     f"{path}, row {number}: {len(row)} fields, but the header has "
