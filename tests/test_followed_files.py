@@ -15,7 +15,10 @@ from live_rod import OPENED, live, rows
 
 from livepde.errors import DataError
 from livepde.streams import growing_file
+from livepde.streams.clock import Clock
+from livepde.streams.csvfile import read_csv
 from livepde.streams.sources import Follow, Row
+from livepde.streams.table import Column
 
 HEADER = "t,a\n"
 
@@ -266,6 +269,11 @@ def test_what_is_no_file_is_refused_in_a_sentence(tmp_path: Path, name: str, fol
     said = pytest.raises(DataError, match=r"is a device, a pipe or a folder, not a file: name")
     with closing(Follow(place, follow=follow)) as source, said:
         source.poll(0.0)
+
+
+def test_a_device_is_no_table() -> None:
+    with pytest.raises(DataError, match="/dev/zero is a device, not a file"):
+        read_csv("/dev/zero", {"a": Column(("a",))}, Clock("t"))
 
 
 def test_a_run_counts_what_it_cannot_know(tmp_path: Path) -> None:

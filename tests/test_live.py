@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from contextlib import suppress
@@ -419,6 +420,32 @@ def test_silence_is_noticed(tmp_path):
     assert [event.kind for event in run.journal.events] == ["silent", "heard", "silent"]
 
 
+@pytest.mark.slow
+def test_a_source_that_is_dead_is_silent_without_a_key(tmp_path):
+    """By ten of its usual steps, a minute or more, and not in the silence that it is used to."""
+
+    class Bursts(Rows):
+        def poll(self, wait):
+            now[0] += 20.0
+            if now[0] > 8000.0:
+                run.stopping.set()
+            count = {20.0: 30, 1000.0: 1, 1060.0: 1, 3100.0: 1}.get(now[0], 0)
+            return [row for _ in range(count) for row in super(Bursts, self).poll(wait)]
+
+    now = [0.0]
+    given = [{**row, "t": 120.0 * row["t"]} for row in rows(40)]  # 12 s apart
+    run = live(tmp_path, Bursts(given), clock=lambda: now[0])
+    assert run.silence == math.inf
+    run.run()
+    found = [(event.kind, event.message) for event in run.journal.events]
+    assert [kind for kind, _ in found if kind in ("silent", "heard")] == ["silent", "heard"] * 2 + [
+        "silent"
+    ]
+    waits = [float(text.split()[-2]) for kind, text in found if kind == "silent"]
+    assert waits == [120.0, 1960.0, 4080.0]
+    assert run.health["ailment"] == "silent"
+
+
 class Sequence_(Rows):
     """Brings one row a poll, and lets the clock go on; None: nothing then."""
 
@@ -665,6 +692,7 @@ def test_health_and_metrics(tmp_path):
     assert health == {
         "ok": True,
         "why": "",
+        "ailment": "",
         "t": 0.4,
         "samples": 5,
         "waiting": 0,
@@ -679,6 +707,11 @@ def test_health_and_metrics(tmp_path):
     told = ask("/metrics")
     assert 'livepde_remarks_total{channel="a",kind="conflict"} 1.0' in told
     assert "livepde_waiting_samples 0.0" in told
+    assert "livepde_model_time_seconds 0.4" in told
+    assert f'livepde_build_info{{version="{lp.__version__}"}} 1.0' in told
+    assert 'livepde_unknown_info{unit="",unknown="k"} 1.0' in told
+    (stamp,) = re.findall("^livepde_last_sample_timestamp_seconds (.*)$", told, re.MULTILINE)
+    assert 0.0 <= time.time() - float(stamp) < PATIENCE
     assert "livepde_verdict -1.0" in told
     assert "livepde_silent 0.0" in told
     assert f"livepde_step_seconds_total {run.health['seconds']!r}" in told
@@ -686,7 +719,8 @@ def test_health_and_metrics(tmp_path):
     run.silent = True
     assert "livepde_silent 1.0" in ask("/metrics")
     assert "livepde_ok 0.0" in ask("/metrics")
-    assert f'livepde_unwell{{why="{run.why}"}} 1.0' in ask("/metrics")
+    assert 'livepde_unwell{why="silent"} 1.0' in ask("/metrics")
+    assert run.why not in ask("/metrics")
     with pytest.raises(urllib.error.HTTPError, match="503"):
         ask("/health")
     with pytest.raises(urllib.error.HTTPError, match="404"):

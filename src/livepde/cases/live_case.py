@@ -264,7 +264,7 @@ class LiveCase:
 
     def _listened(self, heard: float) -> float:
         """Note whether the source is silent, and return when something came from it last."""
-        silence = self._limits[-1]
+        silence = math.inf if self._limits[-1] is None else self._limits[-1]
         if self._feed.heard():
             self.silent, self.why = False, ""
             return time.monotonic()

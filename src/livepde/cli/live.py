@@ -126,7 +126,15 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
         return wiring.running.health
     status = "waits for the first sample"
     silent, why = wiring.silent, wiring.why
-    return {"ok": not why, "why": why, "samples": 0, "silent": silent, "status": status}
+    ailment = "silent" if silent else "start" if why else ""
+    return {
+        "ok": not why,
+        "why": why,
+        "ailment": ailment,
+        "samples": 0,
+        "silent": silent,
+        "status": status,
+    }
 
 
 class _Heartbeat:
@@ -167,7 +175,7 @@ def _observers(
     if how.listen is not None:
         from livepde.runs.monitor import Metrics, Monitor
 
-        metrics = Metrics(case.sensors)
+        metrics = Metrics(case.sensors, case.clock.second)
         monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)
         stack.callback(monitor.close)
         LOG.info("health and metrics at %s", monitor.shown)

@@ -40,6 +40,8 @@ SELDOM = 128  # looks of which one computes errors of the model, beside those at
 # Keys of a stored verdict: the level that was reported last, the samples at the last look, another
 # level that this look was the first to find, and the errors of the model as they were computed.
 TOLD, LOOKED, NEXT, ERRORS = "told", "looked", "next", "computed_errors"
+# Without `intake.silence`: usual intervals and seconds after which a source without rows is silent.
+SILENT, LEAST_SILENCE = 10.0, 60.0
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
@@ -151,7 +153,8 @@ class Live:
     retention
         Retention policy of the journal.
     silence
-        Seconds without a row after which the source is reported as silent.
+        Seconds without a row after which the source is reported as silent; None: ten usual
+        intervals of its rows, twice its longest silence so far, and at least a minute.
     strict
         A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
         an event.
@@ -170,9 +173,9 @@ class Live:
     Attributes
     ----------
     ailments
-        Functions that return the reason why the run is not well, in one sentence, or an empty
-        string; /health, the metrics, the log and the page report the first reason. A verdict is no
-        ailment: the process is well while its model is not.
+        Kind -> function that returns the reason why the run is not well, in one sentence, or an
+        empty string; /health, the log and the page report the first reason, the metrics its kind. A
+        verdict is no ailment: the process is well while its model is not.
     """
 
     def __init__(
@@ -185,7 +188,7 @@ class Live:
         fields_every: int = 1,
         backlog: Backlog | None = None,
         retention: Retention | None = None,
-        silence: float = math.inf,
+        silence: float | None = None,
         strict: bool = False,
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
@@ -202,7 +205,7 @@ class Live:
         self.sinks = list(sinks)
         self.backlog = backlog or Backlog()
         self.retention = retention or Retention()
-        self.silence = silence
+        self._stated_silence = silence
         self.strict = strict
         self.waits = waits
         self.patient = patient
@@ -213,7 +216,8 @@ class Live:
         self._heard = self._taken = clock()
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
-        self._unwell, self._told = "", (-1, "well")
+        self._longest = 0.0  # silence of the source that has ended
+        self._unwell, self._told = "", ("", "well")
         self._unwritten = ""  # why the journal cannot be written
         self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
         # Of the group, to be stored at its end: number of the sample, and whether with its fields.
@@ -222,14 +226,14 @@ class Live:
         self._committed = self._heard
         self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
         self._put_last = -math.inf  # time of the last estimate that sinks were given
-        self.ailments: list[Callable[[], str]] = [
-            lambda: self._unwritten,
-            self._unlinked,
-            self._silence,
-            lambda: self.feed.doubt,
-            self._refusing,
-            self._failing,
-        ]
+        self.ailments: dict[str, Callable[[], str]] = {
+            "disk": lambda: self._unwritten,
+            "journal": self._unlinked,
+            "silent": self._silence,
+            "clock": lambda: self.feed.doubt,
+            "refused": self._refusing,
+            "steps": self._failing,
+        }
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
@@ -280,7 +284,7 @@ class Live:
                 about = {"kind": "disk", "channel": "", "t": self.identifier.t}
                 LOG.warning("disk: %s, and the run goes on", why, extra=about)
             self._unwritten = self._unwell = why
-            self._told = 0, "unwell"
+            self._told = "disk", "unwell"
             if self.stopping.wait(LOOK):
                 raise error
             try:
@@ -550,10 +554,11 @@ class Live:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
         counts = self._counts.copy()  # requests come from other threads
-        why, verdict = self.why, self._verdict
+        (ailment, why), verdict = self._ill(), self._verdict
         return {
             "ok": not why,
             "why": why,
+            "ailment": ailment,
             "t": self.identifier.t,
             "samples": len(self.result),
             "waiting": len(self._waiting),
@@ -578,13 +583,25 @@ class Live:
 
         While the same ailment lasts, the sentence is that of its beginning.
         """
-        ailing, why = self._ailing()
-        return self._unwell if ailing == self._told[0] else why
+        return self._ill()[1]
 
-    def _ailing(self) -> tuple[int, str]:
-        """Return the index of the first active ailment and its reason; -1 and '' if all is well."""
-        found = ((k, why) for k, ailment in enumerate(self.ailments) if (why := ailment()))
-        return next(found, (-1, ""))
+    def _ill(self) -> tuple[str, str]:
+        """Return the kind of the first active ailment and its sentence; empty if all is well."""
+        ailing, why = self._ailing()
+        return ailing, self._unwell if ailing == self._told[0] else why
+
+    def _ailing(self) -> tuple[str, str]:
+        """Return the kind of the first active ailment and its reason; empty if all is well."""
+        found = ((kind, why) for kind, ailment in self.ailments.items() if (why := ailment()))
+        return next(found, ("", ""))
+
+    @property
+    def silence(self) -> float:
+        """Seconds without a row after which the source is reported as silent."""
+        if self._stated_silence is not None:
+            return self._stated_silence
+        # A source that brings a day of rows once a day is silent for a day.
+        return max(LEAST_SILENCE, SILENT * self.feed.interval, 2.0 * self._longest)
 
     def _unlinked(self) -> str:
         if self.journal.in_place:
@@ -600,7 +617,7 @@ class Live:
         return f"nothing has come from the source for more than {self.silence:g} s"
 
     def _refusing(self) -> str:
-        long = self._clock() - self._taken > self.silence
+        long = not self.busy and self._clock() - self._taken > self.silence
         if not (long or self._refused >= REFUSED):
             return ""
         if not self._refused:
@@ -817,6 +834,7 @@ class Live:
         if heard:
             if self.silent:
                 self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
+            self._longest = max(self._longest, now - self._heard)
             self._heard, self.silent = now, False
         elif now - self._heard > self.silence:
             self.silent = True

@@ -68,6 +68,11 @@ class ChannelTimes:
         known = (self._known[name] for name in present(values) if name in self._known)
         return max((usual_of(times.steps) for times in known if times.steps), default=NAN)
 
+    @property
+    def slowest(self) -> float:
+        """Usual step of the slowest channel; NaN if unknown."""
+        return self.usual(dict.fromkeys(self._known, 0.0))
+
     def use(self, t: float, values: Mapping[str, float]) -> None:
         """Note the time of a row that is used."""
         for name in present(values):

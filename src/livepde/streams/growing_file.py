@@ -279,6 +279,7 @@ class GrowingFile:
     # Number -> first bytes and inode number of the last files.
     _known: dict[int, tuple[bytes, int]] = field(default_factory=dict, init=False)
     _number: int = field(default=0, init=False)
+    _left: tuple[int, int] = field(default=(0, 0), init=False)  # where it was closed
 
     def lines(self) -> list[Line]:
         """Return the next lines, or none."""
@@ -300,7 +301,7 @@ class GrowingFile:
     @property
     def here(self) -> tuple[int, int]:
         """Number of the file that is read, and the offset in it; (0, 0) before any."""
-        return (0, 0) if self._now is None else (self._now.number, self._now.offset)
+        return self._left if self._now is None else (self._now.number, self._now.offset)
 
     def place_of(self, number: int, start: int, header: int) -> Place:
         """Return a place in one of the files."""
@@ -318,6 +319,9 @@ class GrowingFile:
 
     def close(self) -> None:
         """Close all files."""
+        if self._now is not None:
+            self._remember(self._now)
+            self._left = self.here
         older = (content for content, _ in self._older)
         for content in (*([self._now] if self._now else []), *self._next, *older):
             content.close()

@@ -285,6 +285,14 @@ class Intake:
         return found + [one.token for one in self._ahead]
 
     @property
+    def interval(self) -> float:
+        """Seconds between two samples as they usually come; infinite if that is not known."""
+        step = self._times.slowest
+        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
+        seconds = (step + max(waits, default=0.0)) / self.clock.second
+        return math.inf if math.isnan(seconds) else seconds
+
+    @property
     def why(self) -> str:
         """Reason to doubt the clocks of the source, in one sentence; empty if there is none."""
         remedy = "if a clock is wrong, state its correction with intake.shift"

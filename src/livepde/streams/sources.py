@@ -63,6 +63,11 @@ class RowSource(Protocol):
     def done(self) -> bool:
         """True if nothing more will come."""
 
+    @property
+    def steady(self) -> bool:
+        """Whether rows come while nothing changes, so that their absence is a fault."""
+        return True
+
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the rows that are there, or after at most `wait` seconds none."""
 
@@ -213,7 +218,7 @@ class Follow(RowSource):
     def _rows(self) -> list[Row]:
         """Return the next rows, or none."""
         rows: list[Row] = []
-        while len(rows) < BATCH:
+        while len(rows) < BATCH and not self._ended:
             if not self._ready:
                 self._ready.extend(self._file.lines())
             if not self._ready:
