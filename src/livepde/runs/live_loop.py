@@ -242,6 +242,7 @@ class Live:
         self._steps = 0
         self._stopped_at = math.inf  # when a step first saw that the run is to stop
         self._kept_at = self._cost = 0.0  # `_seconds` at the last checkpoint, and its duration
+        self._wild = False  # whether wild readings have been reported
         self._replay = (0, 0)  # samples taken again so far, and their number
         stored = json.loads(journal.verdict) if journal.verdict else Verdict.unjudged().to_dict()
         self._verdict = Verdict.from_dict(stored)
@@ -506,6 +507,19 @@ class Live:
         finally:
             self.busy = before
 
+    def _tell_wild(self, estimate: Estimate) -> None:
+        """Report the first readings that a law without a covariance has refused."""
+        if self._wild or self.identifier.law.weighs_readings():
+            return
+        refused = estimate.diagnostics.refused
+        if refused > 0.0:
+            self._wild = True
+            text = (
+                f"t = {estimate.t:g}: {refused:g} readings lie far outside of all before them, and "
+                "are not used; further ones are in the report"
+            )
+            self._tell("wild", text)
+
     def _is_due(self, taken: Taken) -> bool:
         """Return whether a sample must be committed before its step; see the class."""
         return (
@@ -749,6 +763,7 @@ class Live:
         if not estimate.status.ok:
             self._failure = str(estimate.status)
             self._tell(estimate.status.code, self._failure)
+        self._tell_wild(estimate)
         self._steps += 1
         # Counted from the start of the run, so that a resumed run judges the same samples.
         if len(self.result) % JUDGED == 0:
