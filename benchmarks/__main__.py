@@ -439,7 +439,7 @@ def faults(
         list[str] | None,
         several(
             "One of file, stdin, mqtt, progress, restart, disk, malformed, messages, journals, "
-            "clocks, visitors, cases."
+            "files, clocks, visitors, cases."
         ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,

@@ -22,6 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.faults.broken import broken_messages, broken_rows
 from benchmarks.faults.clocks import clock_faults
 from benchmarks.faults.disk import failing_disks
+from benchmarks.faults.files import file_faults
 from benchmarks.faults.flips import damaged_journals
 from benchmarks.faults.hostile import hostile_cases
 from benchmarks.faults.kills import KILLED
@@ -43,6 +44,7 @@ PARTS: Mapping[str, Callable[[Plan], Outcome]] = {
     "malformed": broken_rows,
     "messages": broken_messages,
     "journals": damaged_journals,
+    "files": file_faults,
     "clocks": clock_faults,
     "visitors": slow_visitors,
     "cases": hostile_cases,
