@@ -34,7 +34,8 @@ CHECKPOINT = 256  # most samples between two checkpoints
 # Checkpoints also follow the time spent in steps, so that a run that is killed every few seconds
 # makes progress: they are a second of steps apart, or more where they would cost more than 5 %.
 APART, COST = 1.0, 0.05
-GRACE = 0.5  # seconds after a signal in which a step may end; then it is interrupted
+# Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
+GRACE, LAST_GRACE = 0.5, 2.0
 JUDGED = 50  # samples between two looks at the verdict
 SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
 # Keys of a stored verdict: the level that was reported last, the samples at the last look, another
@@ -689,7 +690,7 @@ class Live:
         if self.stopping.is_set():
             now = self._clock()
             self._stopped_at = min(self._stopped_at, now)
-            if now - self._stopped_at >= GRACE:
+            if now - self._stopped_at >= (GRACE if self.busy else LAST_GRACE):
                 raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
