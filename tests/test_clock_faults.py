@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from live_rod import COLUMNS, OPENED, live, rows
 
+from livepde.runs import clock_findings
 from livepde.runs.feeds import Gathered
 from livepde.runs.live_loop import Live
 from livepde.streams.clock import Clock
@@ -217,7 +218,29 @@ def test_a_clock_that_goes_back_again_and_again(tmp_path):
     run.run()
     assert run.journal.counts["clock", ""] == 9
     assert run.journal.counts["late", "a"] == 300 - len(used(given)) == 27
+    assert run.journal.counts["shifted", ""] == 9
+    assert "goes back again and again" in run.health["why"]
+    (finding,) = clock_findings(run.journal)
+    assert finding.severity == "do not trust"
+    assert "9 times the clock stayed set back" in finding.text
     same_run(run, used(given), tmp_path / "alone")
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_wrong_for_some_rows_again_and_again(tmp_path):
+    """Later intervals are right; health is false until it is steady for a while."""
+    given = [
+        {**row, "t": row["t"] - 0.35 * (k % 30 < 3 and 30 <= k < 160)}
+        for k, row in enumerate(right(250))
+    ]
+    run = run_of(tmp_path, given, source=AtOnce)
+    run.run()
+    assert run.journal.counts["clock", ""] == 5
+    assert ("shifted", "") not in run.journal.counts
+    (finding,) = clock_findings(run.journal)
+    assert finding.severity == "caution"
+    assert run.health["ok"]
+    assert any("goes back again and again" in one.message for one in run.journal.events)
 
 
 @pytest.mark.slow

@@ -94,9 +94,11 @@ def test_the_health_check_asks_the_run():
 
 
 @pytest.mark.slow
-def test_the_dashboard_draws_metrics_that_are_served():
+@pytest.mark.parametrize("name", ["grafana.json", "alerts.yml"])
+def test_the_dashboard_and_the_alerts_use_metrics_that_are_served(name):
     metrics = Metrics(["T_1"])
     health = {"ok": True, "silent": False, "waiting": 0, "seconds": 1.0, "counts": ()}
+    health |= {"verdict": "caution"}
     monitor = Monitor(Address(), lambda: health, metrics)
     try:
         served = {sample.name for family in metrics.registry.collect() for sample in family.samples}
@@ -104,9 +106,30 @@ def test_the_dashboard_draws_metrics_that_are_served():
     finally:
         monitor.close()
     served |= {f"{name}_total" for name in served}
-    text = (DEPLOY / "grafana.json").read_text(encoding="utf-8")
+    text = (DEPLOY / name).read_text(encoding="utf-8")
     drawn = set(re.findall(r"\blivepde_\w+", text))
     assert drawn
     assert drawn <= served
-    panels = json.loads(text)["panels"]
-    assert len({panel["id"] for panel in panels}) == len(panels)
+    if name == "grafana.json":
+        panels = json.loads(text)["panels"]
+        assert len({panel["id"] for panel in panels}) == len(panels)
+
+
+def test_names_of_metrics_keep_the_conventions_of_prometheus():
+    """Units of time are seconds, counters end in _total, and labels are bounded."""
+    metrics = Metrics(["T_1"], second=2.0)
+    health = {"ok": False, "why": "a sentence with 12 s in it", "ailment": "silent", "seconds": 1.0}
+    monitor = Monitor(Address(), lambda: health, metrics)
+    try:
+        found = list(metrics.registry.collect())
+    finally:
+        monitor.close()
+    for family in found:
+        assert re.fullmatch("livepde(_[a-z]+)+", family.name)
+        assert not family.name.endswith(("_time", "_ms", "_minutes"))
+        samples = [sample for sample in family.samples if not sample.name.endswith("_created")]
+        if family.type == "counter":
+            assert all(sample.name.endswith("_total") for sample in samples)
+        assert all(" " not in text for one in samples for text in one.labels.values())
+    (unwell,) = [sample for family in found for sample in family.samples if "unwell" in sample.name]
+    assert unwell.labels == {"why": "silent"}

@@ -1004,6 +1004,8 @@ def test_any_line_of_a_file_is_a_row_or_says_why_not(tmp_path, lines, suffix):
     while not follow.done:
         found += follow.poll(0.0)
     shown = [line for line in lines if line.strip()]
+    if suffix == "csv":
+        shown = [line for line in shown if not line.lstrip(b' "').startswith(b"#")]
     # The first two lines under a header may be labels, as of units.
     under = itertools.takewhile(_labels, shown[:2] if suffix == "csv" else [])
     assert len(found) == len(shown) - len(list(under))

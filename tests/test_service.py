@@ -19,9 +19,9 @@ import livepde as lp
 from livepde import cases, runs
 from livepde.cases.data import source_of
 from livepde.cases.live_case import LiveCase
-from livepde.cli import live as beside
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.feeds import Paced, SampleFeed
+from livepde.runs.live_loop import Live
 from livepde.streams.sources import Rows
 
 pytestmark = pytest.mark.process
@@ -103,8 +103,10 @@ def test_it_follows_a_file_stops_gracefully_and_goes_on(here):
     until(lambda: estimates("live") == 60, second)
     stopped(second, signal.SIGINT)
     found = runs.open("live").dataset
-    for name in ("alpha", "alpha_std", "innovation", "time"):
-        assert np.array_equal(found[name], expected[name])
+    assert np.array_equal(found["time"], expected["time"])
+    for name in ("alpha", "alpha_std", "innovation"):
+        # The last estimate is that of the fit at the end, which a signal leaves two seconds.
+        assert np.array_equal(found[name][:-1], expected[name][:-1])
     assert found.attrs["origin"] == "2026-11-21 00:00:00"
     assert len(runs.open("live").record["resumed"]) == 1
 
@@ -380,16 +382,15 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
         signal.raise_signal(signal.SIGINT)
         return begin(*arguments, **options)
 
-    class Health(beside._LiveHealth):
-        def __setattr__(self, name, value):
-            if name == "live" and value is not None:
-                signal.raise_signal(signal.SIGINT)
-            super().__setattr__(name, value)
+    def resumes(self):
+        signal.raise_signal(signal.SIGINT)
+        return resume(self)
 
+    resume = Live.resume
     if moment == "the case begins":
         monkeypatch.setattr(cases.Case, "begin", begins)
     else:
-        monkeypatch.setattr(beside, "_LiveHealth", Health)
+        monkeypatch.setattr(Live, "resume", resumes)
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
     arguments = ["run", case('file = "rows.csv"'), "--realtime", "--speed", "inf", "--out", "live"]
     assert call(*arguments)[0] == 0

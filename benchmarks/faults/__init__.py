@@ -22,11 +22,13 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.faults.broken import broken_messages, broken_rows
 from benchmarks.faults.clocks import clock_faults
 from benchmarks.faults.disk import failing_disks
+from benchmarks.faults.files import file_faults
 from benchmarks.faults.flips import damaged_journals
 from benchmarks.faults.hostile import hostile_cases
 from benchmarks.faults.kills import KILLED
 from benchmarks.faults.outages import outages
 from benchmarks.faults.plan import Plan
+from benchmarks.faults.progress import frequent_kills
 from benchmarks.faults.visitors import slow_visitors
 from livepde.runs import Check, Outcome, Table
 
@@ -36,11 +38,13 @@ KILLS, SAMPLES, MALFORMED, FLIPS = 600, 2000, 100_000, 200
 
 PARTS: Mapping[str, Callable[[Plan], Outcome]] = {
     **KILLED,
+    "progress": frequent_kills,
     "restart": outages,
     "disk": failing_disks,
     "malformed": broken_rows,
     "messages": broken_messages,
     "journals": damaged_journals,
+    "files": file_faults,
     "clocks": clock_faults,
     "visitors": slow_visitors,
     "cases": hostile_cases,

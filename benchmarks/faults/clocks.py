@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.rod import Row, case_text, rod_rows
+from benchmarks.faults.rod import STEP, Row, case_text, rod_rows
 from livepde.cases import load
 from livepde.cases.live_case import LiveCase
 from livepde.runs import Check, Outcome, Table
@@ -47,6 +47,9 @@ INSERTED: Mapping[str, Any] = {
     "one row 10 years ahead": lambda rows: _with(rows, _moved(rows[200:201], 3650 * DAY), 200),
     "two rows 10 years ahead": lambda rows: _with(rows, _moved(rows[200:202], 3650 * DAY), 200),
     "eight rows 3 hours ahead": lambda rows: _with(rows, _moved(rows[200:208], 3 * HOUR), 200),
+    "every 25th row an hour ahead": lambda rows: [
+        one for k, row in enumerate(rows) for one in (*_moved([row], HOUR)[: k % 25 == 24], row)
+    ],
     "one row of 1970": lambda rows: _with(rows, [{**rows[0], "time": "1970-01-01"}], 200),
     "100 rows again": lambda rows: _with(rows, rows[200:300], 300),
 }
@@ -55,12 +58,16 @@ MOVED: Mapping[str, Any] = {
     "set back by an hour": lambda rows: [*rows[:200], *_moved(rows[200:], -HOUR)],
     "set back by a day": lambda rows: [*rows[:200], *_moved(rows[200:], -DAY)],
     "set ahead by an hour": lambda rows: [*rows[:200], *_moved(rows[200:], HOUR)],
+    "back by 3.5 steps every 30 rows": lambda rows: [
+        _moved([row], -timedelta(seconds=3.5 * STEP * (k // 30)))[0] for k, row in enumerate(rows)
+    ],
     "an hour ahead for 100 rows": lambda rows: [
         *rows[:200], *_moved(rows[200:300], HOUR), *rows[300:],
     ],
 }  # fmt: skip
 CLOCKS = {**INSERTED, **MOVED}
-LASTING = ("set back by a day",)  # rows are late until the end, and the run is not well
+# Rows are late until the end, or the clock is never steady: the run is not well.
+LASTING = ("set back by a day", "back by 3.5 steps every 30 rows")
 
 
 def clock_faults(plan: Plan) -> Outcome:

@@ -72,6 +72,11 @@ class Run:
             self._journal = Journal.open(self.out / JOURNAL)
         return 0 if self._journal is None else self._journal.accepted
 
+    def estimated(self) -> int:
+        """Return how many samples have been estimated."""
+        self.look()
+        return 0 if self._journal is None else len(self._journal)
+
     def counted(self, kind: str) -> int:
         """Return how many remarks of a kind the journal has."""
         self.look()
@@ -114,12 +119,11 @@ class Run:
     def wait_for(self, samples: int) -> None:
         """Wait until so many samples have been estimated."""
 
-        def estimated() -> bool:
+        def enough() -> bool:
             self.alive()
-            self.look()
-            return self._journal is not None and len(self._journal) >= samples
+            return self.estimated() >= samples
 
-        wait(estimated, f"a run did not take {samples} samples")
+        wait(enough, f"a run did not take {samples} samples")
 
     def wait_for_event(self, kind: str, number: int) -> None:
         """Wait until something has happened so often."""

@@ -56,7 +56,6 @@ __all__ = ["Identifier", "Sample"]
 
 FORMAT = 12  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
-MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
 class Identifier:
@@ -363,7 +362,8 @@ class Identifier:
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
-        self._steps = self._steps.add(report.status.code)
+        stretched = self.problem.control.stretches(t - self._t)
+        self._steps = self._steps.add(report.status.code, stretched)
         if report.status.taken:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
@@ -394,7 +394,6 @@ class Identifier:
             t = number(t, "time t")
             if math.isnan(t):
                 raise SampleError("time t is NaN; give the time of the sample.")
-        self._check_reachable(t)
         if t < self._t or (t == self._t and self._samples):
             raise TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {self._t!r}: "
@@ -525,7 +524,7 @@ class Identifier:
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names, ignored = self.withheld.names if self.withheld is not None else (), self.ignored
         inputs = self._channels.inputs
-        if not names and not steps.failed and gaps.silent:
+        if not names and not steps.irregular and gaps.silent:
             return judge
 
         def found() -> Verdict:
@@ -647,7 +646,6 @@ class Identifier:
                 f"forecast: times must increase from the last sample at t = {self._t!r} on; got "
                 f"{t.tolist()}."
             )
-        self._check_reachable(float(t[-1]))
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._known)
         state, last = self._state, self._last
         if state is None:
@@ -752,15 +750,6 @@ class Identifier:
         data = run.fixed_interval(fields_every)
         beliefs = data and self.law.smoothed(self._work, before, who._state, data)
         return run.dataset(result, self.problem, beliefs or ())
-
-    def _check_reachable(self, t: float) -> None:
-        """Refuse a time that is too many substeps away."""
-        if t - self._t > MOST_SUBSTEPS * self.problem.control.dt_max:
-            raise SampleError(
-                f"the sample at t = {t:g} is more than {MOST_SUBSTEPS} substeps of dt_max = "
-                f"{self.problem.control.dt_max:g} after t = {self._t:g}: check its time, or take a "
-                "longer dt_max."
-            )
 
     @property
     def fingerprint(self) -> Fingerprint:

@@ -456,6 +456,8 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
         path,
         separator=spec.separator,
         encoding=spec.encoding,
+        skip=spec.skip,
+        times=spec.times,
         follow=spec.follow,
         position=position,
     )
@@ -528,13 +530,18 @@ def _password(case: CaseContent, variable: str, key: str, allowed: Collection[st
     return os.environ[variable]
 
 
-def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float]:
-    """Return limits of backlog and retention, and the seconds until a source is silent."""
+def limits_of(case: CaseContent) -> tuple[Backlog, Retention, float | None]:
+    """Return limits of backlog and retention, and the seconds until a source is silent.
+
+    None: that follows from its usual interval.
+    """
     spec = case.spec
-    # Without these keys all estimates are kept, and no source counts as silent.
+    # Without this key all estimates are kept.
     unit, never = case.equation.time_unit, math.inf
     span = case.positive(spec.output.retain, unit, "output.retain", never)
-    silence = case.positive(spec.intake.silence, "s", "intake.silence", never)
+    silence = None
+    if spec.intake.silence is not None:
+        silence = case.positive(spec.intake.silence, "s", "intake.silence")
     backlog = Backlog(spec.intake.overflow, spec.intake.queue)
     return backlog, Retention(span, spec.output.thin), silence
 

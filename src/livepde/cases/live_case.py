@@ -72,6 +72,8 @@ class LiveCase:
     ----------
     prepared
         The case with its first sample; None before that.
+    running
+        The run, also while it takes samples again; None before.
     silent
         Whether the source has been silent for too long while waiting for the first sample.
     why
@@ -101,6 +103,7 @@ class LiveCase:
             raise ConfigurationError(f"a replay needs a speed > 0; got {pace}.")
         self.case = case
         self.prepared: Prepared | None = None
+        self.running: Live | None = None
         self.silent = False
         self.why = ""
         # An invalid case is refused here, before anything is connected.
@@ -185,6 +188,7 @@ class LiveCase:
             patient=True,
             stopping=stopping,
         )
+        self.running = live
         again = live.resume()
         if len(live.result):
             LOG.info("goes on after %d samples, %d of them taken again", len(live.result), again)
@@ -261,7 +265,7 @@ class LiveCase:
 
     def _listened(self, heard: float) -> float:
         """Note whether the source is silent, and return when something came from it last."""
-        silence = self._limits[-1]
+        silence = math.inf if self._limits[-1] is None else self._limits[-1]
         if self._feed.heard():
             self.silent, self.why = False, ""
             return time.monotonic()
@@ -293,7 +297,8 @@ class LiveCase:
             raise case.error("data.every", text)
         whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
         # These options are of files: lines that are sent have neither titles nor a second column.
-        listed = spec.every > 1 or spec.skip > 0 or len(spec.times) > 1
+        above = not spec.follow and (spec.skip > 0 or len(spec.times) > 1)
+        listed = spec.every > 1 or above
         return whole or (bool(file) and listed)
 
     def _new_intake(self) -> tuple[Intake, str]:

@@ -291,8 +291,8 @@ class DataSpec(Spec):
     def _source_that_goes_on(self) -> DataSpec:
         if self.follow and not isinstance(self.file, str):
             raise ValueError("follow belongs to one file that grows; several are not followed")
-        if self.live and (self.skip or not isinstance(self.time, str)):
-            raise ValueError("skip and a time in two columns belong to a file that is complete")
+        if self.live and not self.follow and (self.skip or not isinstance(self.time, str)):
+            raise ValueError("skip and a time in two columns are only valid with a file")
         if self.live and self.every > 1:
             raise ValueError("every belongs to data that are there, not to a source that goes on")
         return self

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from livepde.cases.live_case import LiveCase
     from livepde.result import Estimate
     from livepde.runs import Driven, RunWriter
-    from livepde.runs.live_loop import Live, Sink
+    from livepde.runs.live_loop import Sink
 
 __all__ = ["LiveOptions", "run_live"]
 
@@ -102,7 +103,7 @@ def run_live(
     wiring = stack.enter_context(
         LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
     )
-    health, stopping = _LiveHealth(wiring), threading.Event()
+    health, stopping = partial(_health, wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
     if how.page is not None:
@@ -114,30 +115,26 @@ def run_live(
             writer.finish(status="failed", notes=[str(error)])
             raise
         if live is not None and wiring.prepared is not None:
-            health.live = live
             return writer, (wiring.prepared, conduct(live, patient=True))
     writer.finish(status="interrupted", notes=["Ended before the first sample."])
     raise typer.Exit(INTERRUPTED)
 
 
-class _LiveHealth:
-    """Content of /health, also before the first sample."""
-
-    def __init__(self, wiring: LiveCase) -> None:
-        self.live: Live | None = None
-        self._wiring = wiring
-
-    def __call__(self) -> Mapping[str, Any]:
-        if self.live is None:
-            why, status = self._wiring.why, "waits for the first sample"
-            return {
-                "ok": not why,
-                "why": why,
-                "samples": 0,
-                "silent": self._wiring.silent,
-                "status": status,
-            }
-        return self.live.health
+def _health(wiring: LiveCase) -> Mapping[str, Any]:
+    """Return the content of /health, also before the first sample."""
+    if wiring.running is not None:
+        return wiring.running.health
+    status = "waits for the first sample"
+    silent, why = wiring.silent, wiring.why
+    ailment = "silent" if silent else "start" if why else ""
+    return {
+        "ok": not why,
+        "why": why,
+        "ailment": ailment,
+        "samples": 0,
+        "silent": silent,
+        "status": status,
+    }
 
 
 class _Heartbeat:
@@ -178,7 +175,7 @@ def _observers(
     if how.listen is not None:
         from livepde.runs.monitor import Metrics, Monitor
 
-        metrics = Metrics(case.sensors)
+        metrics = Metrics(case.sensors, case.clock.second)
         monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)
         stack.callback(monitor.close)
         LOG.info("health and metrics at %s", monitor.shown)

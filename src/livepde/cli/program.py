@@ -22,6 +22,7 @@ from livepde.cli.report import report
 from livepde.cli.run import run
 from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
+from livepde.library_messages import tame_libraries
 
 __all__ = ["app", "main"]
 
@@ -56,6 +57,7 @@ for command in COMMANDS:
 
 def main(program: typer.Typer | None = None) -> int:
     """Run a command line and return its exit code: by default that of livepde."""
+    tame_libraries()
     try:
         # The dense matrices of a step are small: threads for them cost more than they save.
         with threadpool_limits(1):

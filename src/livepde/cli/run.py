@@ -142,7 +142,9 @@ def run(
         else:
             writer, taken = run_batch(loaded.prepare(source), folder, write, stack, quiet=as_json)
         prepared, driven = taken
-        found = concluded(prepared, prepared.identifier, driven, writer)
+        # A service that is stopped has seconds: `livepde report` draws its figures.
+        draw = not (live and driven.status == "interrupted")
+        found = concluded(prepared, prepared.identifier, driven, writer, draw=draw)
     if driven.error is not None:
         raise driven.error
     if not estimates:  # which are all that standard output is for then

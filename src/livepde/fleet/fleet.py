@@ -24,8 +24,9 @@ from livepde.fem import Inputs, Moment
 from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
-from livepde.identifier import MOST_SUBSTEPS, Identifier
+from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
+from livepde.laws.step_ledger import COUNTS
 from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
@@ -148,7 +149,7 @@ class Fleet:
         # What verdicts count, member by member, as `InputLedger` and `StepLedger` do.
         self._held_counts = np.zeros((count, 1 + len(self.inputs)), dtype=np.int64)
         self._unstated = np.zeros((count, len(self.inputs)))
-        self._steps = np.zeros((count, len(STATUS_CODES)), dtype=np.int64)
+        self._steps = np.zeros((count, COUNTS), dtype=np.int64)
         self._samples = 0
         self._starts: dict[int, Identifier] = {}
         if not self.inputs:
@@ -270,12 +271,6 @@ class Fleet:
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
         missing = missing.reshape(len(self.inputs), len(self)).T
-        longest = MOST_SUBSTEPS * self.problem.control.dt_max
-        if t - last > longest:
-            raise SampleError(
-                f"the sample at t = {t:g} is more than {longest:g} after t = {last:g}: check its "
-                "time, or take a longer dt_max."
-            )
         if self._state is None:
             if t > last:
                 held = {**held, **self._held_at_start(held)}
@@ -311,7 +306,8 @@ class Fleet:
             self._state, report = self._engine.step(self._state, span)
         self._samples += 1
         codes = [STATUS_CODES.index(status.code) for status in report.statuses]
-        self._steps = self._steps + np.eye(len(STATUS_CODES), dtype=np.int64)[codes]
+        self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
+        self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
         # A member whose step failed keeps its time and values: its next step covers both intervals.
         good = np.array([status.taken for status in report.statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing

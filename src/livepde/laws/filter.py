@@ -46,6 +46,7 @@ Steps: TypeAlias = int | IntArray
 
 __all__ = ["Filter", "Update", "contraction"]
 
+FEW_SUBSTEPS = 600  # of a pause, to find how uncertain it leaves the state
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once
 
@@ -256,7 +257,8 @@ class Filter:
             return x, taken, failure
         end = changed(end, driven=x.driven.after(span))
         if np.count_nonzero(end.driven.pause):
-            end, failure = after_pause(self.carried, self.problem, x, end, span)
+            coarse = self._coarse(span.t1 - span.start)
+            end, failure = after_pause(coarse.carried, self.problem, x, end, span)
             if failure is not None:
                 return x, taken, failure
             end = self.compressed(end) if end.U.shape[1] > self.rank else end
@@ -265,6 +267,15 @@ class Filter:
         if self.fading < math.inf:  # exponential decay of the cross-covariance
             end = changed(end, U=np.exp(-(span.t1 - span.start) / self.fading) * end.U)
         return end, taken, None
+
+    def _coarse(self, length: float) -> Filter:
+        """Return the filter with so long substeps that an interval has at most `FEW_SUBSTEPS`."""
+        control, longest = self.problem.control, length / FEW_SUBSTEPS
+        if longest <= control.dt_max:
+            return self
+        return replace(
+            self, problem=replace(self.problem, control=replace(control, dt_max=longest))
+        )
 
     def _divided(
         self, x: FilterState, span: Span

@@ -19,6 +19,7 @@ from livepde.laws.information import InformationMetric
 from livepde.laws.law import Belief, Deferred, Law, Problem, Report, Status
 from livepde.laws.metrics import StepBegin, Transition
 from livepde.laws.step_diagnostics import Diagnostics
+from livepde.laws.wild_readings import ReadingRange
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
@@ -48,6 +49,8 @@ class GradientState:
         States of the rules for u_alpha and for the metric of Q, and of the excitation gate.
     tested
         Sums of the tests of the equation.
+    readings
+        Range of the readings, outside of which they are wild.
     """
 
     u: Array
@@ -63,6 +66,7 @@ class GradientState:
     metric: Any
     excitation: ExcitationLevel
     tested: EquationLedger
+    readings: ReadingRange
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,9 @@ class GradientLaw(Law[GradientParts, GradientState]):
     these are (noisy_q) and (noisy_u), and the diagnostics of each report hold alpha and the misfit
     ||G u_alpha - z||_Z. For a `Subdomain` the integrals are split as the paper splits them: over
     omega the forms see the data, M_op and r are integrated there, and N_op over the rest.
+
+    A reading ten times the range of all readings so far outside of its own is wild: up to three in
+    a row of a sensor are not used.
 
     For observed subdomains and averages. A few noisy point sensors mislead it (jumps of the flux at
     the sensors reward a vanishing diffusivity): use `SensitivityLaw` there.
@@ -183,6 +190,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             metric=work.metric.init(q0),
             excitation=ExcitationLevel.none(),
             tested=EquationLedger.none(),
+            readings=ReadingRange.start(work.problem.observed.size),
         )
 
     def start(self, work: GradientParts, q0: Array, u0: Array, moment: Moment) -> GradientState:
@@ -197,7 +205,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
     def step(
         self, work: GradientParts, state: GradientState, interval: Interval
     ) -> tuple[GradientState, Report]:
+        interval, readings = state.readings.screened(interval, work.problem.observed.noise)
+        refused = int(np.count_nonzero(readings.wild > state.readings.wild))
         interval = work.problem.linear_readings(interval, state.u)
+        given, state = state, replace(state, readings=readings)
         closed = work.closed(state.excitation)
         new, report = self._advanced(work, state, interval, closed)
         # A q that prior and data cannot explain is not believed: the step is taken again with q
@@ -209,6 +220,10 @@ class GradientLaw(Law[GradientParts, GradientState]):
         elif closed and report.status.ok:
             tested = replace(new.tested, rests=new.tested.rests + 1)
             new, report = replace(new, tested=tested), report.updated(Diagnostics(at_rest=1.0))
+        if not report.status.taken:
+            return given, report
+        if refused:
+            report = report.updated(Diagnostics(refused=float(refused)))
         return new, report
 
     def _advanced(
@@ -268,6 +283,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
             metric=learned,
             excitation=work.excited(state.excitation, u - r, u, q, moment),
             tested=work.tested(state.tested, interval.present, equation),
+            readings=state.readings,
         )
         found = path.diagnostics().updated(work.metric.diagnostics(learned, q, length))
 

@@ -10,9 +10,12 @@ import numpy as np
 from livepde.laws.law import Status
 from livepde.linalg import IntArray
 from livepde.records import STATUS_CODES
+from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import Finding, Severity
 
-__all__ = ["StepLedger", "step_findings"]
+__all__ = ["COUNTS", "StepLedger", "step_findings"]
+
+COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
 
 SOME = 0.02  # share of the samples from which failed steps are more than a mishap
 MOST = 0.5  # share from which little is left of the data
@@ -28,30 +31,42 @@ WORDS = {
 
 
 class StepLedger(NamedTuple):
-    """Numbers of samples by the status of their step, in the order of `STATUS_CODES`."""
+    """Numbers of samples by the status of their step, in the order of `STATUS_CODES`.
+
+    The last number counts the intervals whose substeps were longer than `dt_max`.
+    """
 
     counts: IntArray
 
     @classmethod
     def start(cls) -> StepLedger:
         """Return the value before any sample."""
-        return cls(np.zeros(len(STATUS_CODES), dtype=np.int64))
+        return cls(np.zeros(COUNTS, dtype=np.int64))
 
-    def add(self, code: str) -> StepLedger:
+    def add(self, code: str, stretched: bool) -> StepLedger:
         """Return the value after a sample whose step ended with a status."""
         counts = self.counts.copy()
         counts[PLACES[code]] += 1
+        counts[-1] += stretched
         return StepLedger(counts)
 
     @property
-    def failed(self) -> bool:
-        """Whether any step was not ok."""
+    def irregular(self) -> bool:
+        """Whether any step was not ok, or had substeps longer than `dt_max`."""
         counts = self.counts.tolist()
         return bool(sum(counts) > counts[PLACES["ok"]])
 
     def findings(self) -> Iterator[Finding]:
-        """Return a finding for each way in which steps have failed."""
-        return step_findings(dict(zip(STATUS_CODES, self.counts.tolist(), strict=True)))
+        """Return a finding for each way in which steps have failed, and one on long intervals."""
+        *counts, stretched = self.counts.tolist()
+        yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        if stretched:
+            text = (
+                f"{stretched} intervals between two samples have more than {MOST_SUBSTEPS} "
+                "substeps of dt_max: their substeps were longer."
+            )
+            remedy = "Check the times of the samples, or state a longer `steps.dt_max`."
+            yield Finding("steps", "note", text, "dt_max", float(stretched), remedy=remedy)
 
 
 def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:

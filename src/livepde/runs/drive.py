@@ -124,7 +124,8 @@ def drive(
     live = Live(
         identifier, feed, journal, fields_every=fields_every, strict=True, waits=not _ends(stream)
     )
-    live.resume()
+    with stopped_by_signals(live.stopping, lambda: True):
+        live.resume()
     return conduct(live)
 
 

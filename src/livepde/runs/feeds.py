@@ -37,6 +37,11 @@ class Feed(Protocol):
         return True
 
     @property
+    def interval(self) -> float:
+        """Seconds between two samples as they usually come; infinite if that is not known."""
+        return math.inf
+
+    @property
     def doubt(self) -> str:
         """Reason to doubt the times of rows, in one sentence; empty if there is none."""
         return ""
@@ -105,7 +110,7 @@ class Gathered(Feed):
     def _outcome(self, row: Row, token: Any, received: float) -> IntakeOutcome:
         if row.broken:
             return IntakeOutcome(
-                remarks=[Remark("malformed", "", row.broken, row=token)], spent=[token]
+                remarks=[Remark(row.kind, "", row.broken, row=token)], spent=[token]
             )
         return self.intake.take(row.values, token, received)
 
@@ -122,6 +127,11 @@ class Gathered(Feed):
         """Return whether a row has come since the last call."""
         heard, self._heard = self._heard, False
         return heard
+
+    @property
+    def interval(self) -> float:
+        """Seconds of a usual step, and for which a sample waits for its channels."""
+        return self.intake.interval if self.source.steady else math.inf
 
     @property
     def doubt(self) -> str:

@@ -347,6 +347,11 @@ class Journal:
         self._write(self._db.commit)
         return int(self._one("SELECT number FROM tries WHERE id = ?", self._current))
 
+    def unmark(self) -> None:
+        """Count one try of the last sample less: it was interrupted, and the process is well."""
+        self._execute("UPDATE tries SET number = number - 1 WHERE id = ?", self._current)
+        self._write(self._db.commit)
+
     def append(self, record: Record, /, number: int | None = None) -> None:
         """Keep the estimate of a sample; default the last that `accept` or `samples` has returned.
 
@@ -491,6 +496,11 @@ class Journal:
     def estimated(self) -> int:
         """Number of the last estimated sample; earlier estimates may have been thinned."""
         return self._last
+
+    @property
+    def pending(self) -> int:
+        """Number of accepted samples after the last estimated one."""
+        return int(self._one("SELECT COUNT(*) FROM samples WHERE id > ?", self._last))
 
     @property
     def first(self) -> Taken | None:

@@ -22,6 +22,7 @@ from livepde.result import Estimate, Result
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
 from livepde.runs.outcome import attempted
+from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
@@ -29,12 +30,19 @@ __all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
 
 GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
-CHECKPOINT = 256  # samples between two checkpoints
+CHECKPOINT = 256  # most samples between two checkpoints
+# Checkpoints also follow the time spent in steps, so that a run that is killed every few seconds
+# makes progress: they are a second of steps apart, or more where they would cost more than 5 %.
+APART, COST = 1.0, 0.05
+# Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
+GRACE, LAST_GRACE = 0.5, 2.0
 JUDGED = 50  # samples between two looks at the verdict
 SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
 # Keys of a stored verdict: the level that was reported last, the samples at the last look, another
 # level that this look was the first to find, and the errors of the model as they were computed.
 TOLD, LOOKED, NEXT, ERRORS = "told", "looked", "next", "computed_errors"
+# Without `intake.silence`: usual intervals and seconds after which a source without rows is silent.
+SILENT, LEAST_SILENCE = 10.0, 60.0
 LOOK = 0.5  # seconds between two checks whether to stop
 LONGEST = 500  # characters of an event
 RECENT = 1000  # events that are written again when a journal has lost them
@@ -45,6 +53,10 @@ UNUSED = frozenset(  # rows and values of no use
 )
 HARMLESS = frozenset({"heard", "well", "missing", "disordered", "outside"})
 LOG = logging.getLogger("livepde.run")
+
+
+class Interrupted(KeyboardInterrupt):
+    """A step was left between two substeps, since the run is to stop; the state is that before."""
 
 
 class Sink(Protocol):
@@ -142,7 +154,8 @@ class Live:
     retention
         Retention policy of the journal.
     silence
-        Seconds without a row after which the source is reported as silent.
+        Seconds without a row after which the source is reported as silent; None: ten usual
+        intervals of its rows, twice its longest silence so far, and at least a minute.
     strict
         A sample that the identifier cannot use ends the run with its `DataError`; otherwise it is
         an event.
@@ -161,9 +174,9 @@ class Live:
     Attributes
     ----------
     ailments
-        Functions that return the reason why the run is not well, in one sentence, or an empty
-        string; /health, the metrics, the log and the page report the first reason. A verdict is no
-        ailment: the process is well while its model is not.
+        Kind -> function that returns the reason why the run is not well, in one sentence, or an
+        empty string; /health, the log and the page report the first reason, the metrics its kind. A
+        verdict is no ailment: the process is well while its model is not.
     """
 
     def __init__(
@@ -176,7 +189,7 @@ class Live:
         fields_every: int = 1,
         backlog: Backlog | None = None,
         retention: Retention | None = None,
-        silence: float = math.inf,
+        silence: float | None = None,
         strict: bool = False,
         begun: Iterable[Ready] = (),
         irregular: Iterable[Remark] = (),
@@ -193,7 +206,7 @@ class Live:
         self.sinks = list(sinks)
         self.backlog = backlog or Backlog()
         self.retention = retention or Retention()
-        self.silence = silence
+        self._stated_silence = silence
         self.strict = strict
         self.waits = waits
         self.patient = patient
@@ -204,7 +217,8 @@ class Live:
         self._heard = self._taken = clock()
         self._refused = self._failed = 0  # in a row
         self._refusal = self._failure = ""
-        self._unwell, self._told = "", (-1, "well")
+        self._longest = 0.0  # silence of the source that has ended
+        self._unwell, self._told = "", ("", "well")
         self._unwritten = ""  # why the journal cannot be written
         self._group: deque[Ready] = deque()  # to be acknowledged once they are committed
         # Of the group, to be stored at its end: number of the sample, and whether with its fields.
@@ -213,20 +227,24 @@ class Live:
         self._committed = self._heard
         self._one_by_one = journal.accepted + GROUP  # the last sample that has its own commit
         self._put_last = -math.inf  # time of the last estimate that sinks were given
-        self.ailments: list[Callable[[], str]] = [
-            lambda: self._unwritten,
-            self._unlinked,
-            self._silence,
-            lambda: self.feed.doubt,
-            self._refusing,
-            self._failing,
-        ]
+        self.ailments: dict[str, Callable[[], str]] = {
+            "disk": lambda: self._unwritten,
+            "journal": self._unlinked,
+            "silent": self._silence,
+            "clock": lambda: self.feed.doubt,
+            "refused": self._refusing,
+            "steps": self._failing,
+        }
         self._waiting = deque(begun)
         self._counts = Counter(journal.counts)
         self._remarked = set(self._counts)
         self._uncounted: deque[Remark] = deque()
         self._events: deque[Event] = deque(maxlen=RECENT)
         self._steps = 0
+        self._stopped_at = math.inf  # when a step first saw that the run is to stop
+        self._kept_at = self._cost = 0.0  # `_seconds` at the last checkpoint, and its duration
+        self._wild = False  # whether wild readings have been reported
+        self._replay = (0, 0)  # samples taken again so far, and their number
         stored = json.loads(journal.verdict) if journal.verdict else Verdict.unjudged().to_dict()
         self._verdict = Verdict.from_dict(stored)
         self._level, self._next = stored.get(TOLD, NOT_JUDGED), stored.get(NEXT, "")
@@ -240,7 +258,8 @@ class Live:
     def resume(self) -> int:
         """Take again the samples after the journal's last checkpoint; return their number.
 
-        A sample in whose step the process has ended three times is set aside.
+        A sample in whose step the process has ended three times is set aside. If `stopping` is set
+        meanwhile, the state so far is kept, and the rest is taken again the next time.
         """
         try:
             again = self._again(self.journal.estimated)
@@ -267,7 +286,7 @@ class Live:
                 about = {"kind": "disk", "channel": "", "t": self.identifier.t}
                 LOG.warning("disk: %s, and the run goes on", why, extra=about)
             self._unwritten = self._unwell = why
-            self._told = 0, "unwell"
+            self._told = "disk", "unwell"
             if self.stopping.wait(LOOK):
                 raise error
             try:
@@ -337,18 +356,36 @@ class Live:
         state = self.journal.rewind()
         self.identifier.restore(self._begun if state is None else state, str(self.journal.path))
         self.result = self._read()
-        again = 0
+        again, total = 0, self.journal.pending
         for taken in self.journal.samples():
+            self._replay = again, total
             new = taken.id > reached
-            if new and self.journal.mark() > TRIES:
-                self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
-                continue
-            self._step(taken, again=True)
-            if new:
-                # The step has ended, so a later crash must not count as one of its tries.
-                self.journal.commit()
+            if self.stopping.is_set() or not self._taken_again(taken, new):
+                # The next session continues from here.
+                self._keep_state()
+                break
             again += 1
+        self._replay = 0, 0
         return again
+
+    def _taken_again(self, taken: Taken, new: bool) -> bool:
+        """Take a sample again; return whether its step has ended.
+
+        `new`: the sample has no estimate yet, and its tries are counted.
+        """
+        if new and self.journal.mark() > TRIES:
+            self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
+            return True
+        try:
+            self._step(taken, again=True)
+        except Interrupted:
+            if new:
+                self.journal.unmark()
+            return False
+        if new:
+            # The step has ended, so a later crash must not count as one of its tries.
+            self.journal.commit()
+        return True
 
     def _read(self) -> Result:
         """Return the result that reads estimates from the journal."""
@@ -367,6 +404,10 @@ class Live:
         """Run until the source ends or `stopping` is set, and keep a final checkpoint."""
         try:
             self._run()
+        except Interrupted:
+            self._commit()
+            self._keep_state()
+            return
         except BaseException:
             # The first error is the one to report, not one that follows from it.
             with suppress(LivepdeError):
@@ -382,14 +423,20 @@ class Live:
         attempted("What is under way at the end", self._settled, None, notes)
         for note in notes:
             self._tell("unfinished", note)
-        self.journal.checkpoint(self.identifier.dump())
+        self._keep_state()
 
     def _settled(self) -> None:
         """Keep the verdict and the fields of the final estimate."""
         last = self.result.last
         if last is not None:
-            self.result.settle(last := self.identifier.settled(last))
-            self._keep_verdict(last.verdict)
+            try:
+                with interruptible(self._check):
+                    last = self.identifier.settled(last)
+                    verdict = last.verdict
+                self.result.settle(last)
+                self._keep_verdict(verdict)
+            except Interrupted:
+                self._tell("unfinished", "the fit at the end was left out: the run was stopped")
         if self.journal.estimated:
             # Nothing was left to do where there is no last estimate: the fields stay the same.
             final = last or self.identifier.settled(self.identifier.estimate())
@@ -461,6 +508,19 @@ class Live:
         finally:
             self.busy = before
 
+    def _tell_wild(self, estimate: Estimate) -> None:
+        """Report the first readings that a law without a covariance has refused."""
+        if self._wild or self.identifier.law.weighs_readings():
+            return
+        refused = estimate.diagnostics.refused
+        if refused > 0.0:
+            self._wild = True
+            text = (
+                f"t = {estimate.t:g}: {refused:g} readings lie far outside of all before them, and "
+                "are not used; further ones are in the report"
+            )
+            self._tell("wild", text)
+
     def _is_due(self, taken: Taken) -> bool:
         """Return whether a sample must be committed before its step; see the class."""
         return (
@@ -509,15 +569,17 @@ class Live:
         """State of the run for a watchdog: "ok", the reason if not, and counters."""
         last = self.result.last
         counts = self._counts.copy()  # requests come from other threads
-        why, verdict = self.why, self._verdict
+        (ailment, why), verdict = self._ill(), self._verdict
         return {
             "ok": not why,
             "why": why,
+            "ailment": ailment,
             "t": self.identifier.t,
             "samples": len(self.result),
             "waiting": len(self._waiting),
             "silent": self.silent,
-            "status": "" if last is None else last.status.code,
+            "status": self.replaying or ("" if last is None else last.status.code),
+            "replaying": self.replaying,
             "seconds": self._seconds,
             "verdict": verdict.level,
             "findings": verdict.sentences,
@@ -525,18 +587,36 @@ class Live:
         }
 
     @property
+    def replaying(self) -> str:
+        """How many samples since the checkpoint were taken again; empty if none are to be."""
+        again, total = self._replay
+        return f"replaying {again} of {total} since the checkpoint" if total else ""
+
+    @property
     def why(self) -> str:
         """Reason why the run is not well, in one sentence; empty if it is.
 
         While the same ailment lasts, the sentence is that of its beginning.
         """
-        ailing, why = self._ailing()
-        return self._unwell if ailing == self._told[0] else why
+        return self._ill()[1]
 
-    def _ailing(self) -> tuple[int, str]:
-        """Return the index of the first active ailment and its reason; -1 and '' if all is well."""
-        found = ((k, why) for k, ailment in enumerate(self.ailments) if (why := ailment()))
-        return next(found, (-1, ""))
+    def _ill(self) -> tuple[str, str]:
+        """Return the kind of the first active ailment and its sentence; empty if all is well."""
+        ailing, why = self._ailing()
+        return ailing, self._unwell if ailing == self._told[0] else why
+
+    def _ailing(self) -> tuple[str, str]:
+        """Return the kind of the first active ailment and its reason; empty if all is well."""
+        found = ((kind, why) for kind, ailment in self.ailments.items() if (why := ailment()))
+        return next(found, ("", ""))
+
+    @property
+    def silence(self) -> float:
+        """Seconds without a row after which the source is reported as silent."""
+        if self._stated_silence is not None:
+            return self._stated_silence
+        # A source that brings a day of rows once a day is silent for a day.
+        return max(LEAST_SILENCE, SILENT * self.feed.interval, 2.0 * self._longest)
 
     def _unlinked(self) -> str:
         if self.journal.in_place:
@@ -552,7 +632,7 @@ class Live:
         return f"nothing has come from the source for more than {self.silence:g} s"
 
     def _refusing(self) -> str:
-        long = self._clock() - self._taken > self.silence
+        long = not self.busy and self._clock() - self._taken > self.silence
         if not (long or self._refused >= REFUSED):
             return ""
         if not self._refused:
@@ -598,15 +678,25 @@ class Live:
     def _step(self, taken: Taken, *, again: bool = False) -> None:
         self.busy = True
         try:
-            estimate = self._estimate(taken)
-            if estimate is not None:
-                self._hand_on(estimate, again)
+            with interruptible(self._check):
+                estimate = self._estimate(taken)
+                if estimate is not None:
+                    self._hand_on(estimate, again)
         finally:
             self.busy = False
+
+    def _check(self) -> None:
+        """Raise `Interrupted` once the run was to stop a while ago; called between substeps."""
+        if self.stopping.is_set():
+            now = self._clock()
+            self._stopped_at = min(self._stopped_at, now)
+            if now - self._stopped_at >= (GRACE if self.busy else LAST_GRACE):
+                raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
         """Take a step; return None if the sample was refused or set aside."""
         before, begun = self.identifier.place, time.monotonic()
+        self._tell_pause(taken.t)
         try:
             estimate = self.identifier.step(taken.t, taken.values)
             self._seconds += time.monotonic() - begun
@@ -624,6 +714,9 @@ class Live:
                 raise
         except RunError:  # of the journal
             raise
+        except Interrupted:
+            self.identifier.return_to(before)
+            raise
         except Exception as error:
             # A failure of the numerics belongs to this sample; any other is an error in the code.
             if self.strict and numerical(error) is None:
@@ -634,6 +727,17 @@ class Live:
         else:
             return estimate
         return None
+
+    def _tell_pause(self, t: float) -> None:
+        """Report an interval of so many substeps that they are longer than `dt_max`."""
+        control, length = self.identifier.problem.control, t - self.identifier.t
+        if control.stretches(length):
+            text = (
+                f"no sample for {length:g} until t = {t:g}: the interval was divided into "
+                f"{LONG_SUBSTEPS} substeps longer than dt_max = {control.dt_max:g}; check the "
+                "time, or state a longer steps.dt_max"
+            )
+            self._tell("pause", text)
 
     def _withdraw(self) -> None:
         """Withdraw the last sample; waiting samples are later, and taken in their turn."""
@@ -660,15 +764,23 @@ class Live:
         if not estimate.status.ok:
             self._failure = str(estimate.status)
             self._tell(estimate.status.code, self._failure)
+        self._tell_wild(estimate)
         self._steps += 1
         # Counted from the start of the run, so that a resumed run judges the same samples.
         if len(self.result) % JUDGED == 0:
             self._judge(estimate)
-        if self._steps % CHECKPOINT == 0:
+        by_count = self._steps % CHECKPOINT == 0
+        if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
             self._record()
-            self.journal.checkpoint(self.identifier.dump())
-            if math.isfinite(self.retention.span):
+            self._keep_state()
+            if by_count and math.isfinite(self.retention.span):
                 self.journal.thin(estimate.t - self.retention.span, self.retention.every)
+
+    def _keep_state(self) -> None:
+        """Keep a checkpoint of the state after the last estimated sample."""
+        begun = time.monotonic()
+        self.journal.checkpoint(self.identifier.dump())
+        self._cost, self._kept_at = time.monotonic() - begun, self._seconds
 
     def _judge(self, estimate: Estimate) -> None:
         """Look at the verdict: another level counts once two looks in a row differ in one way.
@@ -738,6 +850,7 @@ class Live:
         if heard:
             if self.silent:
                 self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
+            self._longest = max(self._longest, now - self._heard)
             self._heard, self.silent = now, False
         elif now - self._heard > self.silence:
             self.silent = True

@@ -6,7 +6,9 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from livepde import __version__
 from livepde.errors import RunError, optional
+from livepde.readout import unknown_of
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 from livepde.runs.web import Address, Server
@@ -24,18 +26,21 @@ class Metrics(Sink):
     """Estimates as Prometheus metrics; a sink of a run.
 
     `livepde_estimate{unknown}`, `livepde_deviation{unknown}`, `livepde_innovation{sensor}`,
-    `livepde_time`, `livepde_samples_total`, `livepde_failed_steps_total`. A `Monitor` adds the
-    health of its run: `livepde_ok`, `livepde_unwell{why}`, `livepde_silent`,
-    `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
+    `livepde_model_time_seconds`, `livepde_last_sample_timestamp_seconds`, `livepde_samples_total`,
+    `livepde_failed_steps_total`, `livepde_build_info{version}`, `livepde_unknown_info{unknown,
+    unit}`. A `Monitor` adds the health of its run: `livepde_ok`, `livepde_unwell{why}`,
+    `livepde_silent`, `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
     `livepde_remarks_total{kind, channel}`.
 
     Parameters
     ----------
     sensors
         Names of the sensors.
+    second
+        One second in the model's unit of time.
     """
 
-    def __init__(self, sensors: Iterable[str]) -> None:
+    def __init__(self, sensors: Iterable[str], second: float = 1.0) -> None:
         with optional("service", "Metrics need prometheus-client", RunError):
             from prometheus_client import CollectorRegistry, Counter, Gauge
         self.registry = CollectorRegistry()
@@ -49,7 +54,14 @@ class Metrics(Sink):
         self._deviation = gauge("deviation", about, "unknown")
         about = "Measured minus expected of the last sample, in the unit of the sensors"
         self._innovation = gauge("innovation", about, "sensor")
-        self._time = gauge("time", "Time of the last sample, in the model's unit")
+        about = "Time of the last sample since the start of the model"
+        self._time = gauge("model_time_seconds", about)
+        about = "When the last sample was processed, in seconds since 1970"
+        self._stamp = gauge("last_sample_timestamp_seconds", about)
+        build = gauge("build_info", "1, with the version of the program", "version")
+        build.labels(__version__).set(1)
+        self._unit = gauge("unknown_info", "1, with the unit of an unknown", "unknown", "unit")
+        self._second = second
         self._samples = Counter("livepde_samples", "Samples taken", registry=self.registry)
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 
@@ -58,9 +70,11 @@ class Metrics(Sink):
         for label, (value, std) in estimate.parameters.items():
             self._estimate.labels(label).set(value)
             self._deviation.labels(label).set(std)
+            self._unit.labels(label, unknown_of(estimate.space, label).unit).set(1)
         for name, value in zip(self._sensors, estimate.innovation.tolist(), strict=True):
             self._innovation.labels(name).set(value)
-        self._time.set(estimate.t)
+        self._time.set(estimate.t / self._second)
+        self._stamp.set_to_current_time()
         self._samples.inc()
         if not estimate.status.ok:
             self._failed.inc()
@@ -88,9 +102,11 @@ class _Health:
             text = ", ".join(f"{number} {level}" for level, number in NUMBERS.items())
             level = float(NUMBERS[found["verdict"]])
             yield GaugeMetricFamily("livepde_verdict", text, level)
-        unwell = GaugeMetricFamily("livepde_unwell", "1 with the reason, if any", labels=["why"])
-        if why := str(found.get("why", "")):
-            unwell.add_metric([why], 1.0)
+        # A sentence would make a new series of each event.
+        about = "1 with the kind of the reason, if any; /health has the sentence"
+        unwell = GaugeMetricFamily("livepde_unwell", about, labels=["why"])
+        if ailment := str(found.get("ailment", "")):
+            unwell.add_metric([ailment], 1.0)
         yield unwell
         if "seconds" in found:
             text = "Seconds spent in steps"
@@ -106,7 +122,8 @@ class Monitor:
     """Serves /livez, /readyz, /health and /metrics from threads of its own.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
-    else 503. A verdict changes none of these codes: it is in the content of /health, and a metric.
+    else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes
+    none of these codes: it is in the content of /health, and a metric.
 
     Parameters
     ----------
@@ -152,8 +169,9 @@ class Monitor:
         found = dict(self._health())
         code = "200 OK" if found.get("ok") else "503 Service Unavailable"
         if path == "/readyz":
-            start(code, plain)
-            return [f"{found.get('why') or 'ok'}\n".encode()]
+            waits = found.get("why") or found.get("replaying")
+            start("503 Service Unavailable" if waits else code, plain)
+            return [f"{waits or 'ok'}\n".encode()]
         start(code, [("Content-Type", "application/json")])
         return [json.dumps(found).encode()]
 

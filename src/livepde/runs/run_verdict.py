@@ -56,6 +56,7 @@ __all__ = [
 
 MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
 MOST_JUMPS = 5  # that get a sentence of their own
+SHIFTED = 3  # times that a clock is set back for good, from which intervals are wrong as a rule
 WANDERS = 0.3  # scatter of an estimate over its change since the first: it follows the noise
 SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
@@ -130,12 +131,18 @@ def clock_findings(journal: Journal) -> list[Finding]:
     if not count:
         return []
     often = "once" if count == 1 else f"{count} times"
+    shifted = journal.counts.get(("shifted", ""), 0)
     text = (
         f"Times of rows went back {often}, and rows were not used until their times were new "
         "again. Later times are only right if the clock was right afterwards."
     )
     remedy = "If the clock was wrong, state its correction with `intake.shift`."
-    return [Finding("clock", "caution", text, "", count, remedy=remedy)]
+    severity: Severity = "caution"
+    if shifted >= SHIFTED:
+        text += f" {shifted} times the clock stayed set back: intervals there are too short."
+        remedy += " Synchronise it gradually."
+        severity = "do not trust"
+    return [Finding("clock", severity, text, "", count, remedy=remedy)]
 
 
 def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[Finding]:

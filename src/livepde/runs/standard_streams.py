@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import TextIO
 
 from livepde.errors import RunError, optional
+from livepde.library_messages import OneLine
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 
@@ -44,6 +45,7 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
         lines = JsonFormatter(names, datefmt="%Y-%m-%dT%H:%M:%SZ", rename_fields=renamed)
         lines.converter = time.gmtime
         handler.setFormatter(lines)
+    handler.addFilter(OneLine())
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("livepde").setLevel(level)
     # asyncua logs each lost connection with a traceback; livepde.opcua logs it in one line.

@@ -17,10 +17,25 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 from livepde.stepping.between import LINES, Held
+from livepde.stepping.interruption import safe_point
 from livepde.stepping.newton import StepFailed
 
-__all__ = ["Advance", "Alexander2", "ImplicitEuler", "Scheme", "Stage", "advance"]
+__all__ = [
+    "LONG_SUBSTEPS",
+    "MOST_SUBSTEPS",
+    "Advance",
+    "Alexander2",
+    "ImplicitEuler",
+    "Scheme",
+    "Stage",
+    "advance",
+]
 
+# An interval of more than so many substeps of `dt_max`, such as a pause of the source, is divided
+# into fewer and longer ones: hourly readings with steps of a second are below, and any pause costs
+# seconds on a rod. The schemes are L-stable, and shadows divide longer substeps again where
+# their error matters.
+MOST_SUBSTEPS, LONG_SUBSTEPS = 10_000, 1000
 # Beyond this number of halvings a substep would be shorter than the resolution of usual times.
 MOST_HALVINGS = 30
 # With three halvings a tenth is left of the error of the first steps of a solution that goes with
@@ -91,7 +106,8 @@ class Advance:
     scheme
         Time scheme.
     dt_max
-        Longest substep; a longer interval is divided evenly.
+        Longest substep; a longer interval is divided evenly. An interval of more than
+        `MOST_SUBSTEPS` of them is divided into `LONG_SUBSTEPS` longer substeps.
     halvings
         Maximum number of successive halvings of a failed substep; 0: no retry.
     held
@@ -129,7 +145,13 @@ class Advance:
         if length <= self.dt_max:
             return self.parts
         # The factor keeps rounding of the length from adding a substep when dt_max divides it.
+        if self.stretches(length):
+            return self.parts * LONG_SUBSTEPS
         return self.parts * math.ceil(length / self.dt_max * (1 - 1e-12))
+
+    def stretches(self, length: float) -> bool:
+        """Return whether an interval of that length has substeps longer than `dt_max`."""
+        return length * (1 - 1e-12) > MOST_SUBSTEPS * self.dt_max
 
     def grade(self, t: float, h: float) -> int:
         """Return how often a substep h from t is halved because it is near the start."""
@@ -192,6 +214,7 @@ def advance(
         # length serves all equal steps. For very short steps that would change more than digits.
         unit, length = 16.0 * math.ulp(max(stop, -t)), stop - t
         length = round(length / unit) * unit if length > 1e6 * unit else length
+        safe_point()
         begin(t, length)
         try:
             y = control.scheme.advance(stage, y, t, length)

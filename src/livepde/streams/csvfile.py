@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -204,7 +205,9 @@ def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]
 
 
 def _check_text(path: Path) -> None:
-    """Refuse a workbook, some of which can be taken for text."""
+    """Refuse a workbook, some of which can be taken for text, and a device, which has no end."""
+    if stat.S_ISCHR(path.stat().st_mode):
+        raise DataError(f"{path} is a device, not a file: name a file.")
     with path.open("rb") as file:
         if file.read(4).startswith(BOOKS):
             raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
@@ -381,6 +384,8 @@ def _cells(
         rows: list[int] = []
         columns: list[list[str]] = [[] for _ in needed]
         for number, row in numbered:
+            if row[0].startswith("#"):  # a comment
+                continue
             if too_wide(row, header):
                 raise SampleError(
                     f"{path}, row {number}: {len(row)} fields, but the header has "

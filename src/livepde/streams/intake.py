@@ -125,7 +125,8 @@ class Remark:
         "leap" (a time too far ahead), "repeated" (a row that was accepted before with the same
         values), "outside" (not between start and stop), "skipped" (a sample without a needed
         channel). "clock": late rows follow one another, so that a clock went back. Used all the
-        same: "disordered" (came after a later row), "missing" (a sample without this channel),
+        same: "shifted" (late rows lead on to it: the clock was set back), "disordered" (came after
+        a later row), "missing" (a sample without this channel),
         "interpolated" (the same, with a value between known ones).
     channel
         Channel of the value; '' for a whole row.
@@ -285,6 +286,14 @@ class Intake:
         return found + [one.token for one in self._ahead]
 
     @property
+    def interval(self) -> float:
+        """Seconds between two samples as they usually come; infinite if that is not known."""
+        step = self._times.slowest
+        waits = (self.policy.longest(self.policy.habit(channel)) for channel in self.columns)
+        seconds = (step + max(waits, default=0.0)) / self.clock.second
+        return math.inf if math.isnan(seconds) else seconds
+
+    @property
     def why(self) -> str:
         """Reason to doubt the clocks of the source, in one sentence; empty if there is none."""
         remedy = "if a clock is wrong, state its correction with intake.shift"
@@ -292,6 +301,11 @@ class Intake:
             return (
                 f"the times of {name} went back to t = {late:g}, and its rows are late until they "
                 f"are later than t = {self._last:g}; {remedy}"
+            )
+        if unsteady := self._times.unsteady:
+            return (
+                f"the clock of {', '.join(unsteady)} goes back again and again: the time between "
+                f"samples is not known then; {remedy}, and synchronise it gradually"
             )
         # One row far ahead is counted when it is refuted; several are a matter of health.
         if self._begun and len({one.t for one in self._ahead}) > 1:
@@ -494,7 +508,9 @@ class Intake:
                 text = f"t = {t:g} came after {self._newest:g}"
                 found.remark("disordered", "", text)
             self._add(moment, values, held.token, found)
-            self._times.use(t, values)
+            if self._times.use(t, values):
+                text = f"times that went back go on at t = {t:g}: the clock was set back before it"
+                found.remark("shifted", "", text)
         self._newest = max(self._newest, t)
         found.row = about
         return moment is not None

@@ -188,6 +188,11 @@ class OpcuaSource(RowSource):
         """False: the data of a server never end."""
         return False
 
+    @property
+    def steady(self) -> bool:
+        """False: a server does not send a value that stays the same."""
+        return False
+
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the changes that have come.
 

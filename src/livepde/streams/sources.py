@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
-import io
 import json
 import os
 import queue
 import threading
 import time
-import zlib
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
 from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, too_wide
+from livepde.streams.growing_file import LONGEST, UTF_16, GrowingFile, Line, Place
 from livepde.streams.table import JSON_LINES, no_file
 
-__all__ = ["Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
+__all__ = ["LONGEST", "Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
 
 T = TypeVar("T")
 
-LONGEST = 1_000_000  # characters of a line or message; longer ones are refused unread
 BATCH = 100  # most rows of one poll
-HEAD = 4096  # bytes at the start of a file that identify it
+HEADERS = 16  # of a file that are remembered
 NAP = 0.05  # seconds between looks at a file that does not grow
 
 
@@ -42,12 +41,16 @@ class Row:
         Token by which the source identifies the row.
     broken
         Reason why there are no values; '' if there are.
+    kind
+        Kind of the remark on a row without values: "malformed"; "rewritten": rows before it may be
+        missing, since the file was replaced; "header": the columns are other ones from here on.
     """
 
     values: Mapping[str, Any]
     _: KW_ONLY
     token: Any = None
     broken: str = ""
+    kind: str = "malformed"
 
 
 class RowSource(Protocol):
@@ -59,6 +62,11 @@ class RowSource(Protocol):
     @property
     def done(self) -> bool:
         """True if nothing more will come."""
+
+    @property
+    def steady(self) -> bool:
+        """Whether rows come while nothing changes, so that their absence is a fault."""
+        return True
 
     def poll(self, wait: float) -> Sequence[Row]:
         """Return the rows that are there, or after at most `wait` seconds none."""
@@ -104,14 +112,6 @@ def drained(waiting: queue.Queue[T], wait: float) -> list[T]:
     return found
 
 
-def _line(file: io.BufferedReader) -> bytes:
-    """Return the next line; a line that is too long is cut after its limit."""
-    line = piece = file.readline(LONGEST + 1)
-    while len(piece) > LONGEST and not piece.endswith(b"\n"):
-        piece = file.readline(LONGEST + 1)
-    return line if piece is line else line + piece[-1:]
-
-
 def _names(cells: list[str]) -> list[str]:
     """Return the header; of two columns with one name neither is taken: both are missing."""
     return [name if cells.count(name) == 1 else "" for name in cells]
@@ -120,11 +120,13 @@ def _names(cells: list[str]) -> list[str]:
 class Follow(RowSource):
     """A CSV file with a header, or a file of JSON lines (.jsonl), also while it grows.
 
-    The title of a logger (TOA5) and lines of units under the header are skipped.
+    The title of a logger (TOA5), lines of units under the header and lines that begin with # are
+    skipped. A line is read once its end has been written. If a header appears again, its order of
+    the columns holds from there on.
 
-    A line is read once its end has been written. A file that is replaced by another (rotated logs)
-    is read to its end before the new one; one that has become shorter is read again from its start,
-    where known rows are repeated. Unread rows of a file that was renamed are lost after a crash.
+    What becomes of the file is described in `livepde.streams.growing_file`: one that is renamed is
+    read to its end before the new one, and one that is cut or written again is read from its start,
+    where known rows are repeated. If rows may be missing, a row without values reports it.
 
     Parameters
     ----------
@@ -132,6 +134,10 @@ class Follow(RowSource):
         The file; it need not exist yet if `follow`.
     separator, encoding
         Of a CSV file; an encoding in which the letters of English are single bytes.
+    skip
+        Lines before the header.
+    times
+        Columns whose texts together are the time, which stands under the first name.
     follow
         Wait for more at the end of the file.
     position
@@ -144,20 +150,24 @@ class Follow(RowSource):
         *,
         separator: str = ",",
         encoding: str = UTF_8,
+        skip: int = 0,
+        times: Sequence[str] = (),
         follow: bool = False,
         position: str = "",
     ) -> None:
         self.path = Path(path)
         self.follow = follow
         self._separator, self._encoding = separator, encoding
+        self._skip, self._times = skip, tuple(times)
         self._json = self.path.suffix in JSON_LINES
-        self._resumed = tuple(map(int, position.split())) if position else None
-        self._file: io.BufferedReader | None = None
-        self._number = 0  # of the file: 1 for the first, 2 for that which replaced it
-        self._head = b""  # how the file begins, to know it again
+        self._resumed = Place.read(position)
+        self._file = GrowingFile(self.path, follow, self._resumed)
+        self._ready: deque[Line] = deque()
+        self._number = 0  # of the file whose lines are read
+        self._headers: dict[tuple[int, int], list[str]] = {}  # file and first byte -> columns
         self._header: list[str] | None = None
+        self._above = 0  # lines above the header that are still to come
         self._labels = 0  # lines under the header that may be labels
-        self._offset = 0
         self._ended = False
         # Lines are told apart as bytes, before they are decoded.
         if b"a\n".decode(encoding, "replace") != "a\n":
@@ -165,7 +175,7 @@ class Follow(RowSource):
                 f"{self.path}: a file in {encoding} cannot be read while it grows; write it in "
                 "UTF-8, or run it without --realtime when it is complete."
             )
-        if not follow and not self.path.is_file():
+        if not follow and not self.path.exists():
             raise no_file(self.path)
 
     @property
@@ -178,7 +188,7 @@ class Follow(RowSource):
         until = time.monotonic() + wait
         while True:
             try:
-                rows = self._read()
+                rows = self._rows()
             except OSError as error:
                 text = f"{self.path} cannot be read: {error.strerror or error}."
                 raise DataError(text) from error
@@ -194,119 +204,121 @@ class Follow(RowSource):
 
     def position(self, waiting: Iterable[Any]) -> str:
         """Return the place of the first line that still waits, or of the next one, and the file."""
-        here = (start for number, start in waiting if number == self._number)
-        start = min(here, default=self._offset)
-        return f"{start} {zlib.crc32(self._head[:start])}"
+        if self._resumed is not None:
+            return str(self._resumed)  # no line was read yet
+        following = [(line.number, line.start) for line in islice(self._ready, 1)]
+        number, start = min(chain(waiting, following), default=self._file.here)
+        headers = [at for of, at in self._headers if of == number and at <= start]
+        return str(self._file.place_of(number, start, max(headers, default=0)))
 
     def close(self) -> None:
         """Close the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        self._file.close()
 
-    def _read(self) -> list[Row]:
-        if self._ended or (self._file is None and not self._opened()):
-            return []
-        rows = self._lines()
-        if not rows and self._replaced() and self._opened():
-            rows = self._lines()
-        return rows
-
-    def _opened(self) -> bool:
-        """Open the file that is there now, at its start or where an earlier run has left it."""
-        try:
-            file = self.path.open("rb")
-        except FileNotFoundError:
-            return False
-        self.close()
-        self._file, self._header, self._head, self._offset = file, None, b"", 0
-        self._labels = 0
-        self._number += 1
-        start, known = self._resumed or (0, 0)
-        self._resumed = None
-        # The same file if its beginning up to the position has the same checksum.
-        head = file.read(HEAD)
-        if start <= os.fstat(file.fileno()).st_size and zlib.crc32(head[:start]) == known:
-            if not self._json and start:
-                self._read_header(file, start)
-            self._head, self._offset = head[:start], start
-        return True
-
-    def _read_header(self, file: io.BufferedReader, start: int) -> None:
-        """Read the header, and labels under it, from the lines before a position."""
-        file.seek(0)
-        while file.tell() < start and (self._header is None or self._labels):
-            self._row(_line(file), None)
-
-    def _replaced(self) -> bool:
-        """Return whether another file has the name now, or this one has become shorter."""
-        try:
-            named = self.path.stat()
-        except FileNotFoundError:
-            return False
-        if self._file is None:
-            return False
-        mine = os.fstat(self._file.fileno())
-        return (named.st_dev, named.st_ino) != (mine.st_dev, mine.st_ino) or (
-            named.st_size < self._offset
-        )
-
-    def _lines(self) -> list[Row]:
-        """Return the rows of the next lines that are ended."""
+    def _rows(self) -> list[Row]:
+        """Return the next rows, or none."""
         rows: list[Row] = []
-        if self._file is None:
-            return rows
-        self._file.seek(self._offset)
-        while len(rows) < BATCH:
-            start = self._offset
-            # A line without its end is still being written.
-            line = _line(self._file)
-            if not line or (self.follow and not line.endswith(b"\n")):
+        while len(rows) < BATCH and not self._ended:
+            if not self._ready:
+                self._ready.extend(self._file.lines())
+            if not self._ready:
                 break
-            self._offset = self._file.tell()
-            self._head += line[: HEAD - len(self._head)]
-            row = self._row(line, (self._number, start))
+            line = self._ready.popleft()
+            if line.number != self._number:
+                self._enter(line)
+            row = self._row(line)
             if row is not None:
                 rows.append(row)
         return rows
 
-    def _row(self, line: bytes, token: Any) -> Row | None:
-        if not line.strip():
+    def _enter(self, line: Line) -> None:
+        """Begin with the lines of another file; after a resume with the header it has."""
+        self._number, self._header = line.number, None
+        self._above, self._labels = self._skip, 0
+        resumed, self._resumed = self._resumed, None
+        if any(number == line.number for number, _ in self._headers):
+            # Lines that were added to an earlier file.
+            self._header = self._headers[max(at for at in self._headers if at[0] == line.number)]
+            self._above = 0
+        elif line.start and not self._json:
+            self._read_header(line, resumed.header if resumed is not None else 0)
+        for place in list(self._headers)[:-HEADERS]:
+            del self._headers[place]
+
+    def _read_header(self, line: Line, at: int) -> None:
+        """Read the header at a place, and labels under it, from what is before a line."""
+        self._above = 0 if at else self._skip
+        for content in self._file.before(at):
+            if at >= line.start or (self._header is not None and not self._labels):
+                return
+            self._row(Line(line.number, at, content))
+            at += len(content)
+
+    def _row(self, line: Line) -> Row | None:
+        token = line.number, line.start
+        if line.kind:
+            return Row({}, token=token, broken=line.told, kind=line.kind)
+        content = line.content
+        if not self._json and self._above:
+            self._above -= 1
             return None
+        if not content.strip():
+            return None
+        if b"\0" in content and self.follow and not content.startswith(UTF_16):
+            return Row({}, token=token, broken="NUL bytes instead of a row")
         if self._json:
-            return json_row(line, token)
-        if len(line) > LONGEST:
-            return Row({}, token=token, broken=f"longer than {LONGEST} characters")
+            return json_row(content, token)
         try:
-            cells = self._cells(line)
+            cells = self._cells(content)
         except (UnicodeError, csv.Error) as error:
             self._labels = 0  # rows have begun
-            if self._head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            if content.startswith(UTF_16):
                 return Row(
                     {}, token=token, broken="the file is in UTF-16, not to be followed: write UTF-8"
                 )
             return Row({}, token=token, broken=f"not a line of a CSV file ({type(error).__name__})")
         if self._header is None:
-            if is_title(cells):
-                return None
-            self._header, self._labels = _names(cells), UNDER
-            twice = sorted(set(cells) - set(self._header))
-            text = "two columns are called '{}', and none of them is taken: rename one"
-            return Row({}, token=token, broken=text.format(twice[0])) if twice else None
+            return None if is_title(cells) else self._headed(cells, token)
+        if cells[0].startswith("#"):
+            return None
         if self._labels:
             labels = are_labels(cells)
             self._labels = self._labels - 1 if labels else 0
             if labels:
                 return None
+        if self._is_header(cells):
+            return self._headed(cells, token)
         if too_wide(cells, self._header):
             text = f"{len(cells)} fields, the header has {len(self._header)}"
             return Row({}, token=token, broken=text)
-        return Row(dict(zip(self._header, cells, strict=False)), token=token)
+        values = dict(zip(self._header, cells, strict=False))
+        if len(self._times) > 1 and all(name in values for name in self._times):
+            values[self._times[0]] = " ".join(values[name] for name in self._times)
+        return Row(values, token=token)
+
+    def _is_header(self, cells: list[str]) -> bool:
+        """Return whether a line has most of the names of the header."""
+        names = {name for name in self._header or () if name}
+        found = len(names.intersection(cells))
+        return 2 * found > len(names) or (found > 0 and found == len(names))
+
+    def _headed(self, cells: list[str], token: tuple[int, int]) -> Row | None:
+        """Take a line as the header; return a row that reports a wrong or another one."""
+        before, self._header, self._labels = self._header, _names(cells), UNDER
+        self._headers[token] = self._header
+        twice = sorted(set(cells) - set(self._header))
+        if twice:
+            text = "two columns are called '{}', and none of them is taken: rename one"
+            return Row({}, token=token, broken=text.format(twice[0]))
+        if before is None or before == self._header:
+            return None
+        text = f"the header appears again with other columns: {', '.join(cells)}"
+        return Row({}, token=token, broken=text, kind="header")
 
     def _cells(self, line: bytes) -> list[str]:
         text = line.decode(self._encoding)
         found = csv.reader([text], delimiter=self._separator, skipinitialspace=True)
-        return [cell.strip() for cell in next(found, [])]
+        return [cell.strip() for cell in next(found, [""])]
 
 
 class Lines(RowSource):
