@@ -20,9 +20,9 @@ from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
 from livepde.cases.schema import SensitivitySpec
-from livepde.cases.units import convert
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.streams import Twin
+from livepde.units import convert
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 

@@ -82,8 +82,8 @@ def export(
 
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
-    from livepde.cases.units import convert
     from livepde.dates import dated
+    from livepde.units import convert
 
     unit = str(data["time"].attrs.get("units", ""))
     try:

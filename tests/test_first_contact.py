@@ -1,0 +1,264 @@
+"""What a user of pandas and xarray types first, without our documentation."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import livepde as lp
+from livepde.models import heat
+
+TRUE = 0.07  # diffusivity of the rod
+NOISE = 0.05  # of its sensors, K
+START = "2025-03-01 12:00"
+
+
+@cache
+def rod() -> lp.Model:
+    """Return a rod with one measured end."""
+    ends = {"left": lp.Channel("T_left"), "right": 0.0}
+    return heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05), ends)
+
+
+def identifier(**options) -> lp.Identifier:
+    sensors = lp.Points({"T_30": 0.3, "T_60": 0.6}, noise=NOISE, unit="degC")
+    return lp.Identifier(rod(), sensors, u0=0.0, **options)
+
+
+@cache
+def measured() -> pd.DataFrame:
+    """Return what a logger has written: seconds, and a column that is no channel."""
+    t = 0.125 * np.arange(24)  # exact in dates, too
+
+    def ends(when: float) -> dict[str, float]:
+        return {"T_left": 20.0 * np.sin(when)}
+
+    control = lp.Advance(lp.Alexander2(), 0.02)
+    q = rod().initial_parameter({"alpha": TRUE})
+    run = lp.simulate(rod(), q, 0.0, t.tolist(), control, ends)
+    values = np.array([(rod().state_block.at_vertices @ u)[[6, 12]] for _, u in run])
+    values += NOISE * np.random.default_rng(0).standard_normal(values.shape)
+    columns = {"T_left": 20.0 * np.sin(t), "T_30": values[:, 0], "T_60": values[:, 1]}
+    return pd.DataFrame({**columns, "battery_V": 3.3}, index=pd.Index(t, name="time"))
+
+
+def dated(**index) -> pd.DataFrame:
+    """Return the same table with dates as its index."""
+    dates = pd.date_range(START, periods=len(measured()), freq="125ms", **index)
+    return measured().set_axis(dates)
+
+
+@cache
+def known() -> lp.Result:
+    """Return the run of the samples as tuples, which no reader has touched."""
+    rows = measured()[["T_left", "T_30", "T_60"]].to_dict("index")
+    return identifier().run(rows.items())
+
+
+def same(result: lp.Result, rtol: float = 1e-12) -> bool:
+    """Return whether a run has found what the run of tuples has found."""
+    found, expected = (one.last.parameters["alpha"] for one in (result, known()))
+    return len(result) == len(known()) and np.allclose(found, expected, rtol=rtol)
+
+
+# --- data in -------------------------------------------------------------------------------------
+
+
+def test_the_default_law_finds_the_truth():
+    assert known().last["alpha"].interval()[0] < TRUE < known().last["alpha"].interval()[1]
+
+
+def test_a_table():
+    assert same(identifier().run(measured()))
+
+
+@pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
+def test_a_table_of_dates(zone):
+    who = identifier()
+    assert same(who.run(dated(tz=zone)))
+    assert pd.Timestamp(who.origin, tz="UTC") == pd.Timestamp(START, tz=zone or "UTC")
+
+
+def test_a_date_of_another_unit_of_time():
+    ends = {"left": lp.Channel("T_left"), "right": 0.0}
+    mesh, prior = lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05)
+
+    def conduction(q, u, v, x):
+        return q.alpha * lp.dot(lp.grad(u), lp.grad(v))
+
+    state = lp.Field(mesh, lp.linear(mesh), dirichlet=ends)
+    hours = lp.Model(state, {"alpha": prior}, A=conduction, time_unit="h")
+    sensors = lp.Points({"T_30": 0.3, "T_60": 0.6}, noise=NOISE)
+    table = measured().set_axis(pd.date_range(START, periods=len(measured()), freq="450s"))
+    assert same(lp.Identifier(hours, sensors, u0=0.0).run(table))
+    unitless = lp.Identifier(lp.Model(state, {"alpha": prior}, A=conduction), sensors, u0=0.0)
+    with pytest.raises(lp.errors.ConfigurationError, match=r"dates, and the model has no unit"):
+        unitless.run(table)
+    with pytest.raises(lp.errors.ConfigurationError, match=r"date, and the model has no unit"):
+        unitless.step(table.index[0], table.iloc[0])
+
+
+def test_durations_and_units_of_time():
+    durations = measured().set_axis(pd.to_timedelta(measured().index, unit="s"))
+    assert same(identifier().run(durations))
+    minutes = measured().set_axis(measured().index / 60.0)
+    assert same(identifier().run(minutes, time_unit="min"))
+
+
+def test_a_column_of_times_and_other_names():
+    table = measured().reset_index(names="time_s").rename(columns={"T_30": "TS_3_2_1"})
+    assert same(identifier().run(table, columns={"T_30": "TS_3_2_1"}))
+    table = table.rename(columns={"time_s": "when", "TS_3_2_1": "T_30"})
+    assert same(identifier().run(table, time="when"))
+    with pytest.raises(lp.errors.SampleError, match="the index only counts the rows"):
+        identifier().run(table)
+    with pytest.raises(lp.errors.SampleError, match=r"'time_1' and 'time_2' may be the column"):
+        identifier().run(table.assign(time_1=0.0, time_2=0.0))
+
+
+def test_units_of_columns():
+    table = measured().assign(T_30=1.8 * measured()["T_30"] + 32.0)
+    assert same(identifier().run(table, units={"T_30": "degF"}), rtol=1e-9)
+    with pytest.raises(lp.errors.ConfigurationError, match="units: the model has no unit for 'T_l"):
+        identifier().run(table, units={"T_left": "degF"})
+
+
+def test_a_column_that_is_no_channel_is_ignored_unless_strict():
+    with pytest.raises(lp.errors.SampleError, match="column 'battery_V' is no channel"):
+        identifier().run(measured(), strict=True)
+    assert same(identifier().run(measured().drop(columns="battery_V"), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda table: table.rename(columns={"T_30": "T30"}), "no column 'T_30'; did you mean"),
+        (lambda table: table.assign(T_30="warm"), "column 'T_30' does not hold numbers only"),
+        (lambda table: table.iloc[::-1], "the time is earlier than the one before"),
+        (lambda table: table.iloc[:0], "holds no samples"),
+        (lambda table: table[["T_30", "T_30", "T_60", "T_left"]], "two columns are called 'T_30'"),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_one_sentence(wrong, message):
+    who = identifier()
+    with pytest.raises(lp.errors.DataError, match=message):
+        who.run(wrong(measured()))
+    assert same(who.run(measured()))  # nothing was changed
+
+
+def test_options_of_a_table_that_do_not_fit():
+    with pytest.raises(lp.errors.ConfigurationError, match="columns: there is no channel 'T_3'"):
+        identifier().run(measured(), columns={"T_3": "T_30"})
+    with pytest.raises(lp.errors.ConfigurationError, match="strict describes a table or a file"):
+        identifier().run([], strict=True)
+    with pytest.raises(TypeError, match="colums"):
+        identifier().run(measured(), colums={})
+
+
+def test_missing_values_of_pandas():
+    table = measured().copy()
+    table.iloc[5, 1] = np.nan
+    nullable = table.convert_dtypes()
+    assert str(nullable["T_30"].dtype) == "Float64"
+    found, expected = (identifier().run(one).last.parameters for one in (nullable, table))
+    assert found == expected
+    assert found != known().last.parameters
+
+
+def test_noise_of_readings():
+    table = measured().assign(**{"noise of T_30": 10.0 * NOISE})
+    found = identifier().run(table).last
+    pairs = {
+        **measured()[["T_left", "T_60"]],
+        "T_30": [(x, 10 * NOISE) for x in measured()["T_30"]],
+    }
+    rows = pd.DataFrame({name: list(values) for name, values in pairs.items()})
+    rows = zip(measured().index, rows.to_dict("records"), strict=True)
+    assert found.parameters == identifier().run(rows).last.parameters
+
+
+def test_an_xarray_dataset_with_units():
+    data = xr.Dataset.from_dataframe(measured())
+    assert same(identifier().run(data))
+    data = data.assign(T_30=1.8 * data["T_30"] + 32.0)
+    data["T_30"].attrs["units"] = "degF"
+    data = data.assign_coords(time=data["time"] / 60.0)
+    data["time"].attrs["units"] = "min"
+    assert same(identifier().run(data), rtol=1e-9)
+    assert same(identifier().run(xr.Dataset.from_dataframe(dated().rename_axis("t"))))
+    with pytest.raises(lp.errors.SampleError, match="no column 'T_30'"):
+        identifier().run(data.drop_vars("T_30"))
+    with pytest.raises(lp.errors.SampleError, match=r"the dimensions \['depth', 'time'\]"):
+        identifier().run(data.assign(T_30=data["T_30"].expand_dims("depth")))
+
+
+def test_files(tmp_path):
+    measured().to_csv(tmp_path / "numbers.csv")
+    dated().to_csv(tmp_path / "dates.csv")
+    measured().to_csv(tmp_path / "german.csv", sep=";", decimal=",")
+    measured().reset_index().to_json(tmp_path / "rows.jsonl", orient="records", lines=True)
+    for name, rtol in {"numbers.csv": 1e-12, "dates.csv": 1e-12, "german.csv": 1e-12}.items():
+        assert same(identifier().run(tmp_path / name), rtol), name
+    assert same(identifier().run(str(tmp_path / "rows.jsonl")), 1e-6)
+    with pytest.raises(lp.errors.DataError, match=r"no file .*number.csv'; did you mean"):
+        identifier().run(tmp_path / "number.csv")
+    with pytest.raises(lp.errors.SampleError, match="'battery_V' is no channel"):
+        identifier().run(tmp_path / "rows.jsonl", strict=True)
+
+
+def test_parquet(tmp_path):
+    pytest.importorskip("pyarrow")
+    measured().to_parquet(tmp_path / "numbers.parquet")
+    dated().to_parquet(tmp_path / "dates.parquet")
+    assert same(identifier().run(tmp_path / "numbers.parquet"))
+    assert same(identifier().run(tmp_path / "dates.parquet"))
+    (tmp_path / "wrong.parquet").write_text("no")
+    with pytest.raises(lp.errors.DataError, match="cannot be read as a Parquet file"):
+        identifier().run(tmp_path / "wrong.parquet")
+
+
+def test_rows_one_by_one():
+    channels = dated().drop(columns="battery_V")
+    who, other = identifier(), identifier()
+    for time, row in channels.iterrows():
+        found = who.step(time, row)
+        assert found.parameters == other.step(time.to_datetime64(), row.to_dict()).parameters
+    assert who.origin == pd.Timestamp(START)
+    later = pd.date_range(channels.index[-1] + pd.Timedelta("125ms"), periods=2, freq="125ms")
+    ahead = [who.forecast(times, {"T_left": 1.0})["T_30"] for times in (later, [3.0, 3.125])]
+    assert np.array_equal(*ahead)
+
+
+def test_the_next_table_continues_the_dates():
+    who, whole = identifier(), identifier().run(dated()).to_xarray()
+    first, second = who.run(dated().iloc[:15]), who.run(dated().iloc[15:])
+    times = np.concatenate([one.to_xarray()["time"] for one in (first, second)])
+    assert np.allclose(times, whole["time"], atol=1e-6)
+    assert second.to_xarray().attrs["origin"] == whole.attrs["origin"] == "2025-03-01 12:00:00"
+    with pytest.raises(lp.errors.TimeOrderError):
+        who.run(dated())
+    numbers = identifier()
+    numbers.run(measured())
+    with pytest.raises(lp.errors.SampleError, match="those of the samples before are numbers"):
+        numbers.run(dated())
+
+
+def test_a_checkpoint_keeps_the_origin(tmp_path):
+    who, other = identifier(), identifier()
+    who.run(dated().iloc[:15])
+    who.save(tmp_path / "state")
+    other.load(tmp_path / "state")
+    rest = dated().iloc[15:]
+    assert other.run(rest).last.parameters == who.run(rest).last.parameters
+    assert other.origin == who.origin
+
+
+def test_a_smoothed_table_has_its_dates():
+    smoothed = identifier().run(dated()).smoothed()
+    assert smoothed.attrs["origin"] == "2025-03-01 12:00:00"
+    again = identifier().smoothed(dated())
+    xr.testing.assert_allclose(again["alpha"], smoothed["alpha"])
