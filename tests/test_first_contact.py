@@ -21,7 +21,8 @@ START = "2025-03-01 12:00"
 def rod() -> lp.Model:
     """Return a rod with one measured end."""
     ends = {"left": lp.Channel("T_left"), "right": 0.0}
-    return heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05), ends)
+    alpha = lp.Scalar(lp.LogNormal(0.1, std=0.05), unit="m^2/s")
+    return heat(lp.interval(0.0, 1.0, 20), alpha, ends)
 
 
 def identifier(**options) -> lp.Identifier:
@@ -262,3 +263,166 @@ def test_a_smoothed_table_has_its_dates():
     assert smoothed.attrs["origin"] == "2025-03-01 12:00:00"
     again = identifier().smoothed(dated())
     xr.testing.assert_allclose(again["alpha"], smoothed["alpha"])
+
+
+# --- results out ---------------------------------------------------------------------------------
+
+
+@cache
+def found() -> lp.Result:
+    """Return the run of a table of dates."""
+    return identifier(withheld=lp.Points({"T_60 again": 0.6})).run(
+        dated().assign(**{"T_60 again": dated()["T_60"]})
+    )
+
+
+@cache
+def two() -> lp.Result:
+    """Return a run with a number under a transform, one without, and a field."""
+    mesh = lp.interval(0.0, 1.0, 20)
+    state = lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T_left"), "right": 0.0})
+    source = lp.Field(mesh, lp.linear(mesh), inner="H1", prior=lp.Normal(0.0, std=1.0))
+    model = lp.Model(
+        state,
+        {"k": lp.LogNormal(0.1, std=0.05), "r": lp.Normal(0.0, std=0.5), "s": source},
+        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.r * u * v - q.s * v,
+        time_unit="s",
+    )
+    sensors = lp.Points({"T_30": 0.3, "T_60": 0.6}, noise=NOISE)
+    return lp.Identifier(model, sensors, lp.SensitivityLaw(modes=3), u0=0.0).run(measured())
+
+
+def test_a_summary_is_a_table():
+    summary = found().summary()
+    row, alpha = summary.loc["alpha"], found().last["alpha"]
+    assert (row["low"], row["high"]) == pytest.approx(alpha.interval())
+    assert row["low"] < TRUE < row["high"]
+    assert row["unit"] == "m^2/s"
+    assert row["level"] == found().verdict.level
+    assert list(two().summary().index) == ["k", "r"]
+    errors = two().verdict.errors
+    assert two().summary().loc["k", "model_high"] == pytest.approx(errors["k"].high)
+    assert two().summary().attrs["misfit"] == errors.misfit
+
+
+def test_the_summary_is_what_a_run_prints():
+    from livepde.runs import tables
+
+    printed, summary = tables(two().dataset())[0], two().summary()
+    for row, label in zip(printed.rows, ["k", "r"], strict=True):
+        low, high = map(float, row[3].split(" to "))
+        assert np.allclose((low, high), summary.loc[label, ["low", "high"]].tolist(), rtol=0.05)
+
+
+def test_numbers_over_time_as_a_table():
+    table = found().to_dataframe()
+    assert table.index.equals(dated().index.rename("time").as_unit(table.index.unit))
+    assert table["alpha"].iloc[-1] == found().last["alpha"].median
+    assert (table["alpha_low"] < table["alpha_high"]).all()
+    assert set(table["status"]) == {"ok"}
+    assert np.allclose(table["withheld_error:T_60 again"], found().residuals["T_60 again"])
+    assert (identifier().run(measured()).to_dataframe().index == measured().index).all()
+
+
+def test_an_xarray_dataset_has_dates_and_a_dimension_of_parameters():
+    data = two().to_xarray()
+    for label in ("k", "r"):
+        ends = data["estimates"].sel(parameter=label).isel(time=-1)
+        assert ends.sel(statistic="value") == two().last[label].median
+        low_high = ends.sel(statistic=["low", "high"])
+        assert np.allclose(low_high, two().last[label].interval(), rtol=1e-5)
+        assert f"{label}_low" in data
+    assert data["s_low"].dims == data["s"].dims
+    dates = found().to_xarray()["date"]
+    assert (dates.values == dated().index.values).all()
+    assert found().to_xarray()["parameter_unit"].item() == "m^2/s"
+    assert all(data.sizes.values())
+
+
+@pytest.mark.parametrize("engine", ["scipy", "h5netcdf", "netcdf4"])
+def test_the_dataset_is_written_and_read_again(engine, tmp_path):
+    pytest.importorskip({"netcdf4": "netCDF4"}.get(engine, engine))
+    data = found().to_xarray()
+    data.to_netcdf(tmp_path / "run.nc", engine=engine)
+    with xr.open_dataset(tmp_path / "run.nc", engine=engine) as read:
+        assert np.allclose(read["estimates"], data["estimates"])
+        assert (read["date"].values == data["date"].values).all()
+
+
+def test_covariance_by_name():
+    covariance, correlation = two().covariance(), two().correlation()
+    for label in ("k", "r"):
+        assert np.sqrt(covariance.loc[label, label]) == pytest.approx(two().last[label].deviation)
+        assert correlation.loc[label, label] == pytest.approx(1.0)
+    known = two().to_xarray()["correlation"].values
+    assert np.allclose(correlation, known)
+    assert abs(correlation.loc["k", "r"]) > 0.1
+
+
+def test_draws_have_the_moments_of_the_estimate():
+    drawn, last = two().sample(4000, seed=1), two().last
+    k, r = np.log(drawn["k"]), drawn["r"]
+    assert float(k.std()) == pytest.approx(last["k"].deviation / last["k"].median, rel=0.05)
+    assert float(r.mean()) == pytest.approx(last["r"].mean, abs=0.1 * last["r"].std)
+    expected = two().correlation().loc["k", "r"]
+    assert np.corrcoef(k, r)[0, 1] == pytest.approx(expected, abs=0.05)
+    data = two().to_xarray().isel(snapshot=-1)
+    for name in ("s", "u"):
+        known = data[f"{name}_std"].values > 1e-6
+        spread = drawn[name].std("draw").values[known]
+        assert np.allclose(spread, data[f"{name}_std"].values[known], rtol=0.06), name
+    assert two().sample(3, seed=1).identical(two().sample(3, seed=1))
+
+
+def test_draws_lie_within_bounds():
+    mesh = lp.interval(0.0, 1.0, 20)
+    model = heat(mesh, lp.LogitNormal(0.1, bounds=(0.0, 0.2), std=0.05), {"right": 0.0})
+    who = lp.Identifier(model, lp.Points({"T": 0.5}, noise=1.0), u0=1.0)
+    drawn = who.run([(0.1, [1.0])]).sample(500, seed=0)["alpha"]
+    assert float(drawn.min()) > 0.0
+    assert float(drawn.max()) < 0.2
+    assert float(drawn.std()) > 0.02
+
+
+def test_measured_predicted_and_residuals():
+    result = found()
+    assert np.allclose(result.measured["T_30"], dated()["T_30"])
+    assert np.allclose(result.predicted + result.residuals, result.measured)
+    assert (result.residuals["T_30"] == result.to_dataframe()["innovation:T_30"]).all()
+    assert list(result.measured) == ["T_30", "T_60", "T_60 again"]
+
+
+def test_results_and_estimates_are_pickled():
+    import pickle
+
+    result = pickle.loads(pickle.dumps(found()))
+    assert result.measured.equals(found().measured)
+    assert result.summary().equals(found().summary())
+    assert result.covariance().equals(found().covariance())
+    estimate = pickle.loads(pickle.dumps(found().last))
+    assert estimate.parameters == found().last.parameters
+    with pytest.raises(lp.errors.ConfigurationError, match="this result was pickled"):
+        result.sample(1)
+
+
+def test_a_law_without_covariance_has_no_draws():
+    model = heat(lp.interval(0.0, 1.0, 8), lp.Normal(0.1, std=0.05), {"right": 0.0})
+    whole = lp.Identifier(model, lp.Full(noise=0.1), lp.GradientLaw(), u0=1.0)
+    result = whole.run([(0.1, np.ones(8))])
+    for of in (result.covariance, lambda: result.sample(1)):
+        with pytest.raises(lp.errors.LawError, match="no covariance: use SensitivityLaw"):
+            of()
+    assert np.isnan(result.summary().loc["alpha", "low"])
+    empty = whole.run([])
+    with pytest.raises(lp.errors.ConfigurationError, match="holds no samples"):
+        empty.covariance()
+    assert len(empty.summary()) == len(empty.to_dataframe()) == 0
+
+
+def test_inference_data_for_arviz():
+    tree = found().to_inference_data(50)
+    assert tree["posterior"]["alpha"].sizes == {"chain": 1, "draw": 50}
+    assert tree["prior"]["alpha"].std() > 3.0 * tree["posterior"]["alpha"].std()
+    assert np.allclose(tree["observed_data"]["T_30"], dated()["T_30"])
+    arviz = pytest.importorskip("arviz_base")
+    assert arviz.extract(tree)["alpha"].sizes["sample"] == 50

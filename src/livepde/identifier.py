@@ -776,6 +776,7 @@ class Identifier:
         )
         begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
+        result.readings = partial(self._channels.readings, taken)
         for item in _watched(stream, progress, total):
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)

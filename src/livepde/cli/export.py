@@ -36,7 +36,8 @@ def export(
     targets: Annotated[
         list[Path],
         argument(
-            "Files to write: .nc, .zarr, .csv, .xdmf, .vtu, .vtk or .html.", metavar="TARGET..."
+            "Files to write: .nc, .zarr, .csv, .parquet, .xdmf, .vtu, .vtk or .html.",
+            metavar="TARGET...",
         ),
     ],
     at: Annotated[
