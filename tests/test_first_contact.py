@@ -426,3 +426,83 @@ def test_inference_data_for_arviz():
     assert np.allclose(tree["observed_data"]["T_30"], dated()["T_30"])
     arviz = pytest.importorskip("arviz_base")
     assert arviz.extract(tree)["alpha"].sizes["sample"] == 50
+
+
+# --- objects that show themselves ----------------------------------------------------------------
+
+
+def test_a_model_shows_its_equation_priors_and_mesh():
+    shown = repr(two().model)
+    for line in (
+        "equation: integral of u' * v + q.k * lp.dot(lp.grad(u), lp.grad(v)) + q.r * u * v"
+        " - q.s * v = 0",
+        "state u: ElementLineP1, 21 coefficients, Dirichlet values left = channel T_left, right",
+        "unknown k: LogNormal(0.1, std=0.05)\n",
+        "unknown s: field, ElementLineP1, Normal(0, std=1)\n",
+        "mesh: 20 cells, x from 0 to 1\n",
+    ):
+        assert line in shown
+    assert "unknown alpha: LogNormal(0.1, std=0.05) m^2/s" in repr(rod())
+
+
+def conduction(q, u, v, x):
+    """Return the form of conduction, in one expression."""
+    return q.k * lp.dot(lp.grad(u), lp.grad(v))
+
+
+def loss(u, v, x):
+    ambient = 1.0
+    return (u - ambient) * v
+
+
+def test_terms_of_a_model_are_shown_as_they_are_written():
+    mesh = lp.interval(0.0, 1.0, 8, regions={"core": lambda x: x[0] < 0.5})
+    model = lp.Model(
+        lp.Field(mesh, lp.linear(mesh)),
+        {"k": lp.LogitNormal(0.3, bounds=(0.0, 1.0), std=0.1)},
+        A=conduction,
+        B=[loss, lp.On("left", lambda u, v, x: 2.0 * u * v)],
+        f=[lambda x, t: x[0] * t, 1.0],
+        M=lambda u, v, x: 3.0 * u * v,
+    )
+    assert (
+        "equation: integral of M(u', v) + q.k * lp.dot(lp.grad(u), lp.grad(v)) + loss(...) + "
+        "2.0 * u * v on 'left' = integral of (x[0] * t + 1.0) * v"
+    ) in repr(model)
+    assert "mass M(u, v): 3.0 * u * v" in repr(model)
+    assert "unknown k: LogitNormal(0.3, std=0.1, bounds=(0.0, 1.0))" in repr(model)
+    layers = lp.Piecewise({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] >= 0.5}, lp.Normal(1, 1))
+    model = lp.Model(lp.Field(mesh, lp.linear(mesh)), {"k": layers}, A=conduction)
+    assert "unknown k: Normal(1, std=1) for each of k[a], k[b]" in repr(model)
+
+
+def test_an_identifier_shows_law_sensors_and_time():
+    who = identifier(withheld=lp.Points({"W": 0.5}))
+    shown = repr(who)
+    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "withheld: W\n", "time: 0 s"):
+        assert line in shown
+    who = identifier()
+    who.run(dated())
+    assert repr(who).startswith("Identifier after 24 samples")
+    assert repr(who).endswith("time: 2.875 s since 2025-03-01 12:00:00 UTC")
+
+
+def test_estimates_and_results_show_their_numbers():
+    estimate = repr(two().last)
+    assert estimate.startswith("Estimate at t = 2.875\n")
+    assert f"k: {two().last['k']}" in estimate
+    assert "s: field, coefficients" in estimate
+    shown = repr(found())
+    assert shown.startswith("Result of 24 samples until t = 2.875 s\n")
+    assert f"alpha: {found().last['alpha']} m^2/s" in shown
+    assert f"verdict: {found().verdict.level}" in shown
+    assert repr(identifier().run([])) == "Result of 0 samples"
+
+
+def test_a_notebook_shows_tables():
+    for one in (two().model, identifier(), two().last, two()):
+        shown = one._repr_html_()
+        title, *lines = repr(one).splitlines()
+        assert shown.startswith(f"<b>{title}</b><table>")
+        assert shown.count("<tr>") == len(lines)
+    assert "u&#x27; * v" in two().model._repr_html_()

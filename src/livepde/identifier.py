@@ -50,6 +50,7 @@ from livepde.observation import Observation, Observed
 from livepde.records import Layout
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, is_tabular, number, numbers, sample_of
+from livepde.showing import Shown, listed, options_of
 from livepde.stepping import Advance, Between, End, Held, Interval, Scheme
 from livepde.units import conversion
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
@@ -65,7 +66,7 @@ READING = {"time", "time_unit", "columns", "units", "strict"}  # options of `run
 MOST_SUBSTEPS = 1_000_000  # between two samples: a clock that is wrong must not hold a run up
 
 
-class Identifier:
+class Identifier(Shown):
     """Identifies parameter and state of a model, sample by sample.
 
     Parameters
@@ -196,6 +197,20 @@ class Identifier:
         # then.
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        _, model = self.model._shown()
+        rows = {name: text for name, text in model.items() if name.startswith("unknown ")}
+        rows = {"equation": model["equation"], **rows, "law": options_of(self.law)}
+        for kind, sensors in (("sensors", self.observed), ("withheld", self.withheld)):
+            if sensors is not None:
+                rows[kind] = listed(sensors.names)
+        if self.inputs:
+            rows["inputs"] = listed(self.inputs)
+        rows["time"] = f"{self._t:g} {self.model.time_unit}".rstrip()
+        if self.origin is not None:
+            rows["time"] += f" since {self.origin} UTC"
+        return f"Identifier after {self._samples} samples", rows
 
     def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
         parts = self.law, self.problem, self.withheld

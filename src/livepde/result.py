@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -39,6 +39,7 @@ from livepde.records import (
     refused_readings,
     used_errors,
 )
+from livepde.showing import Shown, listed
 from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
@@ -63,8 +64,8 @@ FIRST_ORDER = "to first order: that of the latent value, times the slope of the 
 Kept = TypeVar("Kept")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Estimate(Shown):
     """The estimate of parameter and state after one sample.
 
     Attributes
@@ -172,6 +173,21 @@ class Estimate:
             "space": self.space.described,
         }
         return {k: v for k, v in vars(self).items() if k != "_read"} | own
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        rows = {}
+        for label in self.space.labels:
+            unit = unknown_of(self.space, label).unit
+            rows[label] = f"{self[label]} {unit}".rstrip()
+        for name in self.space.fields:
+            values, std = self[name].median, self[name].deviation
+            rows[name] = f"field, coefficients {values.min():.4g} to {values.max():.4g}"
+            if np.isfinite(std).all():
+                rows[name] += f", mean std. dev. {std.mean():.2g}"
+        rows["status"] = self.status.code
+        if self.held:
+            rows["held inputs"] = listed(self.held)
+        return f"Estimate at t = {self.t:g}", rows
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
@@ -331,7 +347,7 @@ def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
             yield flat(label, left)
 
 
-class Result:
+class Result(Shown):
     """Estimates of a run, as they are added.
 
     Scalars, innovations and status are kept for every sample; fields, evaluated at the vertices of
@@ -378,6 +394,14 @@ class Result:
 
     def __len__(self) -> int:
         return self._count
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        title = f"Result of {len(self)} samples"
+        if self.last is None:
+            return title, {}
+        _, rows = self.last._shown()
+        until = f"{title} until t = {self.last.t:g} {self.layout.time_unit}".rstrip()
+        return until, {**rows, "verdict": self.verdict.level}
 
     @property
     def verdict(self) -> Verdict:
