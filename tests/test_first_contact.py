@@ -506,3 +506,80 @@ def test_a_notebook_shows_tables():
         assert shown.startswith(f"<b>{title}</b><table>")
         assert shown.count("<tr>") == len(lines)
     assert "u&#x27; * v" in two().model._repr_html_()
+
+
+# --- figures by name -----------------------------------------------------------------------------
+
+
+def test_measured_against_predicted():
+    plt = pytest.importorskip("matplotlib.figure")
+    ax = plt.Figure().subplots()
+    assert found().plot.measured_and_predicted(ax=ax) is ax
+    points, line = ax.lines[:2]
+    assert np.allclose(points.get_ydata(), dated()["T_30"])
+    assert np.allclose(line.get_ydata(), found().predicted["T_30"])
+    assert line.get_label() == "T_30"
+    ax = found().plot.measured_and_predicted(sensors=["T_60"])
+    assert len(ax.lines) == 2
+    with pytest.raises(lp.errors.ConfigurationError, match="no sensor 'T_3'; there are"):
+        found().plot.measured_and_predicted(sensors=["T_3"])
+
+
+def test_sensors_of_several_units_have_a_figure_for_each():
+    pytest.importorskip("matplotlib")
+    cold = lp.Points({"T_60": 0.6}, noise=NOISE, unit="K")
+    warm = lp.Points({"T_30": 0.3}, noise=NOISE, unit="degC")
+    result = lp.Identifier(rod(), lp.Combined([cold, warm]), u0=0.0).run(measured())
+    with pytest.raises(lp.errors.ConfigurationError, match=r"several units, .*sensors=\['T_60'\]"):
+        result.plot.measured_and_predicted()
+    assert "K" in result.plot.measured_and_predicted(sensors=["T_60"]).get_ylabel()
+
+
+def test_estimates_with_their_band():
+    pytest.importorskip("matplotlib")
+    ax = found().plot.estimates()
+    assert np.allclose(ax.lines[0].get_ydata(), found().to_dataframe()["alpha"])
+    assert len(ax.collections) == 1
+    with pytest.raises(lp.errors.ConfigurationError, match=r"name one of .* \['k', 'r'\]"):
+        two().plot.estimates()
+    with pytest.raises(lp.errors.ConfigurationError, match="no number 's'"):
+        two().plot.estimates("s")
+    assert "r" in two().plot.estimates("r").get_ylabel()
+
+
+def test_residuals():
+    pytest.importorskip("matplotlib")
+    ax = found().plot.residuals()
+    assert any(np.array_equal(x.get_ydata(), found().residuals["T_30"]) for x in ax.lines)
+    ax = found().plot.residuals(withheld=True)
+    assert any(np.array_equal(x.get_ydata(), found().residuals["T_60 again"]) for x in ax.lines)
+    with pytest.raises(lp.errors.ConfigurationError, match="no withheld sensors"):
+        two().plot.residuals(withheld=True)
+
+
+def test_corner():
+    pytest.importorskip("matplotlib")
+    axes = two().plot.corner(n=300)
+    assert axes.shape == (2, 2)
+    assert not axes[0, 1].get_visible()
+    drawn = two().sample(300, 0)
+    assert np.array_equal(axes[1, 0].lines[0].get_xydata().T, [drawn["k"], drawn["r"]])
+    assert two().plot.corner(["r"], axes=axes[:1, :1]).shape == (1, 1)
+    assert found().plot.corner(n=9)[0, 0].get_xlabel() == "alpha [m²/s]"
+    with pytest.raises(lp.errors.ConfigurationError, match="no number 's'"):
+        two().plot.corner(["s"])
+
+
+def test_fields():
+    pytest.importorskip("matplotlib")
+    last = two().to_xarray()["s"].values[-1]
+    assert any(np.array_equal(x.get_ydata(), last) for x in two().plot.field("s").lines)
+    assert len(two().plot.field("u").lines)
+    with pytest.raises(lp.errors.ConfigurationError, match="no field 'k'"):
+        two().plot.field("k")
+    with pytest.raises(lp.errors.ConfigurationError, match="no map of the standard deviation"):
+        two().plot.field("s", std=True)
+    plate = heat(lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4)), lp.LogNormal(0.1, std=0.05))
+    who = lp.Identifier(plate, lp.Points({"T": (0.5, 0.5)}, noise=0.1), u0=lambda x: x[0])
+    maps = [who.run([(0.1, [0.5])]).plot.field("u"), who.run([(0.2, [0.5])]).plot.field("u", std=1)]
+    assert [ax.get_title().startswith("standard deviation") for ax in maps] == [False, True]

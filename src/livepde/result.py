@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from livepde.plots import RunPlots
+
 __all__ = [
     "Estimate",
     "Marginal",
@@ -571,7 +573,10 @@ class Result(Shown):
 
         last, model = self._last("sample"), self.model
         q, u = draws(last.belief, last.space, n, seed)
-        numbers = {label: ("draw", q[:, k]) for label, k in last.space.labels.items()}
+        numbers = {
+            label: ("draw", q[:, k], {"units": unknown_of(last.space, label).unit})
+            for label, k in last.space.labels.items()
+        }
         fields: dict[str, Any] = {}
         order = vertex_order(model)
         for space, values in ((model.parameter_space, q), (model.state_space, u)):
@@ -745,11 +750,15 @@ class Result(Shown):
         """
         return summary(self.dataset())
 
-    def plot(self, **options: Any) -> Any:
-        """Draw the run and return the figure; needs the extra `plots`."""
-        from livepde import plots
+    @property
+    def plot(self) -> RunPlots:
+        """Figures by name, `plot.estimates("alpha", ax=ax)`; `plot()` draws all of the run.
 
-        return plots.overview(self.dataset(), **options)
+        They need the extra `plots`.
+        """
+        from livepde.plots import RunPlots
+
+        return RunPlots(self)
 
 
 def _number(value: float) -> float | None:
