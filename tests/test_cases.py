@@ -1340,7 +1340,7 @@ def test_decimal_commas_are_not_cut(rod):
 
 def test_units_of_many_cases_are_those_of_pint():
     """The table that spares its registry says what it would say."""
-    from livepde.cases import units
+    from livepde import units
 
     registry = units._registry()
     for (given, unit), (factor, offset) in units.USUAL.items():
