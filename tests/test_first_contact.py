@@ -583,3 +583,88 @@ def test_fields():
     who = lp.Identifier(plate, lp.Points({"T": (0.5, 0.5)}, noise=0.1), u0=lambda x: x[0])
     maps = [who.run([(0.1, [0.5])]).plot.field("u"), who.run([(0.2, [0.5])]).plot.field("u", std=1)]
     assert [ax.get_title().startswith("standard deviation") for ax in maps] == [False, True]
+
+
+# --- mistakes in forms, sensors and initial states -----------------------------------------------
+
+
+def test_forms_that_are_not_linear_in_v_are_refused():
+    mesh = lp.interval(0.0, 1.0, 8)
+    state, k = lp.Field(mesh, lp.linear(mesh)), {"k": lp.LogNormal(1.0, std=0.1)}
+
+    def ok(q, u, v, x):
+        return q.k * lp.dot(lp.grad(u), lp.grad(v))
+
+    for wrong, why in (
+        (lambda q, u, v, x: q.k * u, "Form A.* has a part without v: every part needs v"),
+        (lambda q, u, v, x: q.k * u * v - q.k, "Form A.* has a part without v"),
+        (lambda q, u, v, x: q.k * u * v * v, "Form A.* is not linear in v"),
+        ([ok, lambda q, u, v, x: q.k * u], r"Form A\(q, u, v, x\), term 2 has a part without v"),
+    ):
+        with pytest.raises(lp.errors.ModelError, match=why):
+            lp.Model(state, k, A=wrong)
+    for part, wrong, why in (
+        ("B", lambda u, v, x: u, "Form B.* has a part without v"),
+        ("B", lp.On("left", lambda u, v, x: u - 1.0), "Form B.* has a part without v"),
+        ("M", lambda u, v, x: u * u * v, r"Form M\(u, v, x\) is not linear in u"),
+        ("initial", lambda q, v, x: q.k, "Form initial.* has a part without v"),
+    ):
+        with pytest.raises(lp.errors.ModelError, match=why):
+            lp.Model(state, k, A=ok, **{part: wrong})
+    roots = lp.Model(state, k, A=lambda q, u, v, x: q.k * np.sqrt(u) * v)  # NaN where probed
+    assert not roots.affine
+
+
+def test_a_diffusion_of_the_wrong_sign_is_said():
+    mesh = lp.interval(0.0, 1.0, 8)
+    state = lp.Field(mesh, lp.linear(mesh))
+
+    def growing(q, u, v, x):
+        return -q.k * lp.dot(lp.grad(u), lp.grad(v))
+
+    def depends(q, u, v, x):
+        return -q.k * (1.0 + u**2) * lp.dot(lp.grad(u), lp.grad(v))
+
+    for A in (growing, depends):
+        with pytest.warns(UserWarning, match="the diffusion of the model is negative"):
+            lp.Model(state, {"k": lp.LogNormal(1.0, std=0.1)}, A=A)
+
+    def stabilised(u, v, x):
+        return 2.0 * lp.dot(lp.grad(u), lp.grad(v))
+
+    lp.Model(state, {"k": lp.LogNormal(1.0, std=0.1)}, A=growing, B=stabilised)  # no warning
+    lp.Model(state, {"k": lp.Normal(-1.0, std=0.1)}, A=growing)
+    lp.Model(state, {"k": lp.Normal(0.0, std=0.1)}, A=growing)
+
+
+def system() -> lp.Model:
+    mesh = lp.interval(0.0, 1.0, 8)
+    parts = {name: lp.Field(mesh, lp.linear(mesh)) for name in ("c", "d")}
+    return lp.Model(parts, {"k": lp.Normal(1.0, 0.1)}, A=lambda q, u, v, x: q.k * u.c * v.d)
+
+
+def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
+    sensors = lp.Points({"C": 0.5}, of="c", noise=0.1)
+    assert (lp.Identifier(system(), sensors, u0=20.0).u0 == 20.0).all()
+    both = lp.Identifier(system(), sensors, u0={"c": 1.0, "d": lambda x: 2.0 + 0.0 * x[0]})
+    assert np.allclose(both.u0, [1.0] * 9 + [2.0] * 9)
+    with pytest.raises(lp.errors.ConfigurationError, match=r"u0 has no value for \['d'\]"):
+        lp.Identifier(system(), sensors, u0={"c": 1.0})
+
+
+def test_points_on_a_vector_field():
+    from skfem import ElementQuad1, ElementVector
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+    state = lp.Field(mesh, ElementVector(ElementQuad1()))
+    model = lp.Model(state, {"k": lp.Normal(0.0, 0.1)}, A=lambda q, u, v, x: q.k * lp.dot(u, v))
+    start = lambda x: np.array([x[0], 3.0 * x[1]])  # noqa: E731
+    for options, expected in (
+        ({"component": 0}, [0.25]),
+        ({"component": 1, "of": "u"}, [1.5]),
+    ):
+        sensors = lp.Points({"a": (0.25, 0.5)}, noise=0.1, **options)
+        who = lp.Identifier(model, sensors, u0=start)
+        assert np.allclose(who.forecast([0.0])["a"], expected), options
+    with pytest.raises(lp.errors.ObservationError, match="name the measured one, as component = 0"):
+        lp.Identifier(model, lp.Points({"a": (0.25, 0.5)}, noise=0.1), u0=start)

@@ -80,6 +80,7 @@ class Identifier(Shown):
         sensors and the priors of the unknowns.
     q0, u0
         Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
+        A number as u0 is the value of all components of the state; a mapping names each of them.
         q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
         Without a sample at t0, boundary channels begin with the values that u0 has on their
         boundaries. A u0 that is left out, or varies along such a boundary, states none.
@@ -1027,6 +1028,12 @@ def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any])
     for name, given in uncertain.items():
         if given and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
+    components = model.state_space.fields
+    if isinstance(u0, Mapping) and (missing := [name for name in components if name not in u0]):
+        raise ConfigurationError(
+            f"u0 has no value for {missing}: give one for each component of the state, "
+            f"{list(components)}; one number is that of all of them."
+        )
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."

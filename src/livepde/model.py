@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -132,8 +133,13 @@ class Model(Shown):
     Raises
     ------
     ModelError
-        A form cannot be evaluated, has the wrong number of components; the mass depends on time;
-        or a name stands for something else in a run's dataset.
+        A form cannot be evaluated, has the wrong number of components, or is not linear in v; the
+        mass depends on time; or a name stands for something else in a run's dataset.
+
+    Warns
+    -----
+    UserWarning
+        The diffusion is negative at the prior mean.
     """
 
     def __init__(
@@ -184,6 +190,7 @@ class Model(Shown):
             self.form_initial = compose(
                 self._form("initial", initial, pair, parameter="q"), self.latent
             )
+        self._check_diffusion()
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
 
@@ -356,6 +363,23 @@ class Model(Shown):
                     f"parameter '{name}': only zero boundary values are possible; write a known "
                     "boundary part of q into B."
                 )
+
+    def _check_diffusion(self) -> None:
+        """Warn of a diffusion that is negative everywhere at the prior mean: u_t = -k u_xx."""
+        q = self.parameter_space.prior
+        for u in (0.1, 1.0, 10.0):  # of a diffusivity that depends on u
+            parts = self.physical_A.diffusion(u, q=q), self.form_B.diffusion(u)
+            if parts[0] is None or parts[1] is None:
+                return
+            factors = parts[0] + parts[1]
+            if not (factors < 0.0).any() or not (factors <= 0.0).all():
+                return
+        warnings.warn(
+            "the diffusion of the model is negative at the prior mean, which is ill-posed: small "
+            "disturbances grow without bound. In the weak form of u_t = k u_xx the term is "
+            "+ k * dot(grad(u), grad(v)): change its sign in A or B.",
+            stacklevel=3,
+        )
 
     def _check_names(self) -> None:
         """Refuse names that a run's dataset could not tell apart."""
