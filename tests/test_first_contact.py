@@ -66,6 +66,46 @@ def same(result: lp.Result, rtol: float = 1e-12) -> bool:
     return len(result) == len(known()) and np.allclose(found, expected, rtol=rtol)
 
 
+LINES = """
+sensors = lp.Points({"T_30": 0.3, "T_60": 0.6}, noise=0.05, unit="degC")
+identifier = lp.Identifier(model, sensors, u0=0.0)
+df = pd.read_csv("rod.csv", parse_dates=["time"]).set_index("time")
+result = identifier.run(df)
+result = lp.Identifier(model, sensors, u0=0.0).run("rod.csv")
+result = lp.Identifier(model, sensors, u0=0.0).run(df.to_xarray())
+result = lp.Identifier(model, sensors, u0=0.0).run(df.reset_index())
+result = lp.Identifier(model, sensors, u0=0.0).run(df.tz_localize("Europe/Berlin"))
+result = lp.Identifier(model, sensors, u0=0.0).run(df.drop(columns="battery_V").iterrows())
+online = lp.Identifier(model, sensors, u0=0.0)
+estimates = [online.step(t, row) for t, row in df.drop(columns="battery_V").iterrows()]
+print(model, online, estimates[-1], result)
+print(result.summary().loc["alpha", ["value", "low", "high"]])
+print(result.to_dataframe()["alpha"].resample("1s").last())
+print(result.to_xarray()["estimates"].sel(parameter="alpha", statistic="std").max())
+print(result.covariance(), result.correlation(), result.log_evidence)
+print(result.residuals.describe(), result.predicted["T_30"].max())
+print(result.sample(100)["alpha"].quantile([0.05, 0.95]))
+print(pickle.loads(pickle.dumps(result.last)))
+forecast = online.forecast(df.index[-1:] + pd.Timedelta("1s"), {"T_left": 5.0})["T_30"]
+ax = result.plot.estimates("alpha")
+ax.figure.savefig("alpha.png")
+"""
+
+
+def test_the_lines_that_a_user_of_pandas_types(here, capsys):
+    import pickle
+
+    pytest.importorskip("matplotlib")
+    dated().rename_axis("time").to_csv("rod.csv")
+    names = {"lp": lp, "pd": pd, "pickle": pickle, "model": rod()}
+    for line in LINES.strip().splitlines():
+        exec(line, names)
+        if line.startswith("result = "):
+            assert same(names["result"]), line
+    assert names["estimates"][-1].t == dated().index.size * 0.125 - 0.125
+    assert capsys.readouterr().out.count("alpha") > 5
+
+
 # --- data in -------------------------------------------------------------------------------------
 
 
