@@ -24,7 +24,10 @@ FAST := -m "not (slow or long or study or process or broker or browser or pages)
 # With other versions: the fast ones, and those of what brokers are spoken to with.
 OTHERS := -m "not (slow or long or study or process or browser or pages)"
 # Beside the oldest one of pyproject.toml: Pythons that they run on, where found.
-VERSIONS := 3.12 3.13
+VERSIONS := 3.12 3.13 3.14
+# Extras that the tests need, and those of all work here.
+EXTRAS := live,mesh,fleet,fmu
+ALL_EXTRAS := $(EXTRAS),control
 UV := UV_PYTHON_DOWNLOADS=never $(BIN)/uv
 PYENV := $(or $(PYENV_ROOT),$(HOME)/.pyenv)/versions
 
@@ -34,6 +37,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests run in as many processes as there are cores: threads of BLAS beside them cost a fifth.
 export OMP_NUM_THREADS ?= 1
 
+comma := ,
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .PHONY: help demo test test-fast test-system test-long test-threads test-all coverage mpi lowest versions package check format docs bench experiment lock clean
@@ -74,7 +78,7 @@ mpi:  ## Run the tests on several ranks, with Debian's PETSc in an environment o
 
 lowest: $(READY)  ## Run the fast tests with the lowest versions of all dependencies
 	@$(UV) venv --quiet --clear --python 3.11 .venv-lowest
-	@$(UV) pip install --quiet --python .venv-lowest --resolution lowest-direct -e ".[test]"
+	@$(UV) pip install --quiet --python .venv-lowest --resolution lowest-direct -e ".[$(EXTRAS)]" --group test
 	@# What they import in turn is new, and warns them.
 	@.venv-lowest/bin/$(PYTEST) --quiet -W ignore::DeprecationWarning $(OTHERS)
 
@@ -87,7 +91,7 @@ versions: $(READY)  ## Run the same on every other Python that is found, with co
 	  fi; \
 	  echo "Python $$version: $$("$$python" $(VERSION))"; \
 	  $(UV) venv --quiet --clear --python "$$python" .venv-$$version && \
-	  $(UV) pip install --quiet --python .venv-$$version --constraint constraints.txt -e ".[test]" && \
+	  $(UV) pip install --quiet --python .venv-$$version --constraint constraints.txt -e ".[$(EXTRAS)]" --group test && \
 	  .venv-$$version/bin/$(PYTEST) --quiet $(OTHERS) || exit 1; \
 	done
 
@@ -118,7 +122,8 @@ experiment: $(READY)  ## Run a study, as NAME="degenerate --quick"; without NAME
 	@$(BIN)/python -m experiments $(NAME)
 
 lock: $(READY)  ## Renew constraints.txt from pyproject.toml with the newest versions
-	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --extra dev --no-header --no-annotate \
+	@$(UV) pip compile --quiet --upgrade --python-version 3.11 --group dev $(patsubst %,--extra %,$(subst $(comma), ,$(ALL_EXTRAS))) \
+	  --no-header --no-annotate \
 	  --output-file constraints.txt pyproject.toml
 	@echo "Renewed constraints.txt: read the difference, then run 'make check test versions'."
 
@@ -142,5 +147,7 @@ $(READY): pyproject.toml constraints.txt
 	  $(PYTHON) -m venv --clear $(VENV) || \
 	    { echo "Python's venv module does not work here; on Debian and Ubuntu: apt-get install python3-venv."; exit 1; }; \
 	fi
-	@$(PIP) install -c constraints.txt -e ".[dev]"
+	@# The first pip that knows groups is younger than Python 3.11 and 3.12.
+	@$(PIP) install "pip>=25.1"
+	@$(PIP) install -c constraints.txt -e ".[$(ALL_EXTRAS)]" --group dev
 	@touch $@

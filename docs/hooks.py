@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import livepde
-from livepde.cases.schema import CaseSpec
+from livepde.cases.json_schema import case_schema
 
 Schema = Mapping[str, Any]
 
@@ -71,7 +71,7 @@ def members(room: str) -> str:
 
 def keys_of_a_case() -> str:
     """Return what each table of a case file may hold, from the models that validate it."""
-    schema = CaseSpec.model_json_schema(by_alias=True)
+    schema = case_schema()
     return "\n".join(_section("", schema, schema["$defs"]))
 
 
@@ -81,9 +81,9 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
     kind = model["properties"].get("kind", {}).get("const")
     if kind:
         title += f", `kind = {json.dumps(kind)}`"
-    about, meanings = _documented(model["description"])
-    columns = ["key", "value", "default", *(["meaning"] if meanings else [])]
-    yield f"## {title}\n\n{about}\n\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
+    columns = ["key", "value", "default", "meaning"]
+    yield f"## {title}\n\n{model['description']}\n"
+    yield f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
     needed = model.get("required", ())
     inner: list[tuple[str, str]] = []
     for key, value in model["properties"].items():
@@ -93,23 +93,12 @@ def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
             "" if default in ("null", "[]", '""') or "default" not in value else f"`{default}`"
         )
         words = f"a table: name = {BOUND}" if key == "expect" else _alternatives(value)
-        cells = [f"`{key}`", words, "required" if key in needed else default]
-        yield f"| {' | '.join([*cells, *([meanings[key]] if meanings else [])])} |"
+        cells = [f"`{key}`", words, "required" if key in needed else default, value["description"]]
+        yield f"| {' | '.join(cells)} |"
         inner += _tables(name, value)
     yield ""
     for where, found in inner:
         yield from _section(where, models[found], models)
-
-
-def _documented(text: str) -> tuple[str, dict[str, str]]:
-    """Return the summary of a docstring, and parameter -> its meaning.
-
-    Options of a law are documented where they are declared, and only there.
-    """
-    summary = text.partition("\n\n")[0].replace("\n", " ")
-    listed = re.search(r"^Parameters\n-+\n(.*?)(?:\n\n|\Z)", text, flags=re.DOTALL | re.MULTILINE)
-    items = re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed[1] if listed else "", flags=re.MULTILINE)
-    return summary, {name: " ".join(meaning.split()) for name, meaning in items}
 
 
 def _alternatives(value: Schema) -> str:

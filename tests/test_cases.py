@@ -20,9 +20,9 @@ from livepde.cases.new_case import write_template
 from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
 from livepde.cases.schema import SensitivitySpec
-from livepde.cases.units import convert
 from livepde.runs import checks_of, drive, measures, tables
 from livepde.streams import Twin
+from livepde.units import convert
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
 
@@ -1340,7 +1340,7 @@ def test_decimal_commas_are_not_cut(rod):
 
 def test_units_of_many_cases_are_those_of_pint():
     """The table that spares its registry says what it would say."""
-    from livepde.cases import units
+    from livepde import units
 
     registry = units._registry()
     for (given, unit), (factor, offset) in units.USUAL.items():

@@ -25,7 +25,6 @@ from benchmarks import fmu
 from benchmarks.__main__ import app as benchmarks
 from benchmarks.fmu import compare_fmu, running
 from livepde.cases import load
-from livepde.cases.units import in_si
 from livepde.cli import app
 from livepde.exchange import (
     OnlineRegressor,
@@ -36,6 +35,7 @@ from livepde.exchange.component import Component
 from livepde.exchange.recipe import recipe_of
 from livepde.exchange.unit_process import REFUSED, WAITING, of_code
 from livepde.models import heat
+from livepde.units import in_si
 
 fmpy = pytest.importorskip("fmpy")
 validation = pytest.importorskip("fmpy.validation")

@@ -288,6 +288,11 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
     assert np.array_equal(found["withheld_error:b, inside [degC]"], data["withheld_error"][:, 0])
     assert found["status"].tolist() == ["ok"] * SAMPLES
     assert len(found) == SAMPLES
+    pytest.importorskip("pyarrow")
+    export(rod, tmp_path / "rod.parquet")
+    columns = pd.read_parquet(tmp_path / "rod.parquet")
+    assert list(columns) == list(found)
+    assert np.array_equal(columns["loss [s-1]"], data["loss"])
 
 
 @pytest.mark.slow

@@ -202,7 +202,7 @@ ENGINES = {
     "superlu": (None, lambda pattern: SuperLUSolver(pattern, symmetric=True)),
     "cholmod": ("sksparse.cholmod", CholmodSolver),
     "pardiso": ("pypardiso", lambda pattern: PardisoSolver(pattern, symmetric=True)),
-    "multigrid": (None, MultigridSolver),
+    "multigrid": ("pyamg", MultigridSolver),
 }
 
 

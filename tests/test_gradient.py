@@ -378,7 +378,8 @@ def test_stabilising_term_decays_q():
 
 @pytest.mark.slow
 def test_nu_damps_the_unobserved_part():
-    model = reaction(line(12), ElementLineP1(), B=lambda u, v, x: -0.5 * laplace(u, v, x))
+    with pytest.warns(UserWarning, match="negative at the prior mean, which is ill-posed"):
+        model = reaction(line(12), ElementLineP1(), B=lambda u, v, x: -0.5 * laplace(u, v, x))
     sensors = lp.Subdomain(lambda x: x[0] > 0.5)
     sizes = []
     for nu in (0.0, 5.0):

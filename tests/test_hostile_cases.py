@@ -12,10 +12,10 @@ import livepde as lp
 from benchmarks.faults.hostile import HOSTILE, hostile_case
 from livepde import cases
 from livepde.cases.case_content import CELLS
-from livepde.cases.units import check_unit, conversion, in_si
 from livepde.streams.clock import Clock, number_of
 from livepde.streams.csvfile import read_csv
 from livepde.streams.table import Column
+from livepde.units import check_unit, conversion, in_si
 
 
 @pytest.mark.slow

@@ -262,11 +262,14 @@ def test_engine_is_chosen_by_the_band():
 @pytest.mark.parametrize(
     ("modules", "symmetric", "expected"),
     [
-        ("", True, ["SuperLU", "SuperLU", "multigrid"]),
+        ("", True, ["SuperLU", "SuperLU", "SuperLU"]),
         ("", False, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("pyamg", True, ["SuperLU", "SuperLU", "multigrid"]),
+        ("pyamg", False, ["SuperLU", "SuperLU", "SuperLU"]),
         ("pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
         ("pypardiso", False, ["SuperLU", "Pardiso", "Pardiso"]),
         ("pypardiso sksparse", True, ["SuperLU", "CHOLMOD", "CHOLMOD"]),
+        ("pyamg pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
     ],
 )
 def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
@@ -282,7 +285,7 @@ def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
         assert chosen.solver.name.startswith(name)
         assert str(band) in chosen.reason
         rough = choose(pattern, symmetric=symmetric, approximate=True).solver
-        expects_cycle = symmetric and band > 500
+        expects_cycle = symmetric and band > 500 and "pyamg" in modules
         assert isinstance(rough, MultigridSolver) == (expects_cycle or name == "multigrid")
 
 

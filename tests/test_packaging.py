@@ -73,6 +73,26 @@ def test_every_python_that_is_promised_is_tried():
     assert promised == [oldest, *tried.split()]
 
 
+def test_work_on_livepde_is_no_extra_of_the_wheel():
+    """Who installs livepde is offered nothing that tests, builds or compares it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras, groups = project["project"]["optional-dependencies"], project["dependency-groups"]
+    assert not set(extras) & {"dev", "test", "docs", "bench", "peers"}
+    assert set(groups) == {"dev", "test", "docs", "bench", "peers"}
+    makefile = (ROOT / "Makefile").read_text()
+    (named,) = re.findall(r"^EXTRAS := (.*)$", makefile, re.MULTILINE)
+    assert set(named.split(",")) <= set(extras)
+    assert '-e ".[$(ALL_EXTRAS)]" --group dev' in makefile
+
+
+def test_the_core_needs_no_compiler():
+    """Solvers with compiled parts that lack wheels for some machines are extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {re.split(r"[<>=; ]", line)[0] for line in project["dependencies"]}
+    assert not needed & {"pyamg", "pypardiso", "scikit-sparse", "pyyaml", "PyYAML"}
+    assert any(line.startswith("pyamg") for line in project["optional-dependencies"]["solvers"])
+
+
 # --- how to cite -----------------------------------------------------------------------------
 
 

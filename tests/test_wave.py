@@ -83,7 +83,7 @@ def test_speed_and_damping_from_two_points():
     )
     # The truth has the steps of the samples, too.
     law = lp.SensitivityLaw(shadows=lp.laws.Shadows(parts=1))
-    ident = lp.Identifier(model, sensors, law, u0={"w": pluck}, scheme=Alexander2())
+    ident = lp.Identifier(model, sensors, law, u0={"w": pluck, "p": 0.0}, scheme=Alexander2())
     (c2, c2_std), (d, d_std) = ident.run(twin).last.parameters.values()
     assert c2 == pytest.approx(1.0, abs=0.01)
     assert d == pytest.approx(0.5, abs=0.05)
@@ -107,7 +107,7 @@ def test_the_speed_as_a_field():
         noise=AbsoluteNoise(0.005),
     )
     law = lp.SensitivityLaw(modes=8)
-    ident = lp.Identifier(model, sensors, law, u0={"w": pluck}, scheme=Alexander2())
+    ident = lp.Identifier(model, sensors, law, u0={"w": pluck, "p": 0.0}, scheme=Alexander2())
     result = ident.run(twin)
     assert twin.error(result.last.q) < 0.25 * twin.baseline()
     assert twin.error(result.last.q) < 0.05

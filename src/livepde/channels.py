@@ -18,6 +18,7 @@ from livepde.linalg import Array
 from livepde.observation import Observed
 from livepde.samples import (
     Readings,
+    Sample,
     check_noise,
     labelled,
     noise_channel,
@@ -119,6 +120,12 @@ class Channels:
             measured, noise = readings(z, self.observed)
             withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
         return measured, noise, withheld, named | self._named(inputs) if inputs else named
+
+    def readings(self, samples: Sequence[Sample]) -> Array:
+        """Return the readings of assimilated and withheld sensors, shape (samples, sensors)."""
+        rows = [self.parse(sample.z, sample.inputs or {}) for sample in samples]
+        shape = len(samples), self.observed.size + len(self.hidden)
+        return np.reshape([[*measured, *hidden] for measured, _, hidden, _ in rows], shape)
 
     def _by_name(
         self, z: Mapping[str, Any], inputs: Mapping[str, float]

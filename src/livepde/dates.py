@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,13 +10,51 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["SECONDS", "dated", "instants", "since", "when", "with_epoch", "without_epoch"]
+__all__ = [
+    "SECONDS",
+    "dated",
+    "instants",
+    "origin_at",
+    "since",
+    "since_1970",
+    "stamp_of",
+    "when",
+    "with_epoch",
+    "without_epoch",
+]
 
 CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
 TIMES = ("time", "snapshot")  # coordinates of a dataset that are times
 OWN = "units_of_run"  # attribute of a time with an epoch: its unit as the run has it
 
+SECOND = np.timedelta64(1, "s")
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "day": 86400.0}
+
+
+def origin_at(stamp: float) -> datetime:
+    """Return the date of seconds since 1970 as origins are kept: in UTC, without a zone."""
+    return datetime.fromtimestamp(stamp, UTC).replace(tzinfo=None)
+
+
+def since_1970(origin: datetime) -> float:
+    """Return the seconds since 1970 of a date in UTC without a zone, as of `origin_at`."""
+    return origin.replace(tzinfo=UTC).timestamp()
+
+
+def stamp_of(time: Any) -> float | None:
+    """Return the seconds since 1970 of a date, None of anything else; without a zone it is UTC.
+
+    >>> stamp_of(np.datetime64("1970-01-02")), stamp_of(3.0)
+    (86400.0, None)
+    """
+    if isinstance(time, np.datetime64):
+        return None if np.isnat(time) else float((time - np.datetime64(0, "s")) / SECOND)
+    if not isinstance(time, datetime):
+        return None
+    try:
+        return (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    except ValueError:  # pandas' NaT is a date
+        return None
 
 
 def dated(data: xr.Dataset) -> tuple[datetime, float] | None:

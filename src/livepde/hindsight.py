@@ -83,7 +83,7 @@ class Hindsight:
         """Return smoothed beliefs, given in reverse time order, as a dataset of the run."""
         records = list(self._records(result, problem, beliefs))
         data = result.layout.dataset(reversed(records))
-        return data.drop_vars("steps").drop_dims(["sensor", "withheld"])
+        return data.drop_vars("steps").drop_dims(["sensor", "withheld"], errors="ignore")
 
     def _records(
         self, result: Result, problem: Problem, beliefs: Iterable[Belief]

@@ -7,15 +7,17 @@ import math
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
+from datetime import datetime
 from functools import cache, partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
 from livepde.channels import Channels
+from livepde.dates import origin_at, since_1970, stamp_of
 from livepde.errors import (
     ConfigurationError,
     LawError,
@@ -35,6 +37,7 @@ from livepde.laws import (
     Law,
     Problem,
     Report,
+    SensitivityLaw,
     Status,
     numerical,
     stepped,
@@ -44,9 +47,12 @@ from livepde.laws.step_ledger import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
+from livepde.records import Layout
 from livepde.result import Estimate, Result
-from livepde.samples import Readings, Sample, check_noise, number, numbers, sample_of
+from livepde.samples import Readings, Sample, check_noise, is_tabular, number, numbers, sample_of
+from livepde.showing import Shown, listed, options_of
 from livepde.stepping import Advance, Between, End, Held, Interval, Scheme
+from livepde.units import conversion
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
 if TYPE_CHECKING:
@@ -56,9 +62,10 @@ __all__ = ["Identifier", "Sample"]
 
 FORMAT = 12  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
+READING = {"time", "time_unit", "columns", "units", "strict"}  # options of `run` for tables
 
 
-class Identifier:
+class Identifier(Shown):
     """Identifies parameter and state of a model, sample by sample.
 
     Parameters
@@ -68,9 +75,11 @@ class Identifier:
     observation
         Observation by the assimilated sensors.
     law
-        Update law of the estimates.
+        Update law of the estimates; default `SensitivityLaw()`, which uses the noise of the
+        sensors and the priors of the unknowns.
     q0, u0
         Initial values: numbers, functions of x, coefficients, or for several unknowns a mapping.
+        A number as u0 is the value of all components of the state; a mapping names each of them.
         q0 defaults to the prior mean, u0 to the initial state of the model (`initial`), else zero.
         Without a sample at t0, boundary channels begin with the values that u0 has on their
         boundaries. A u0 that is left out, or varies along such a boundary, states none.
@@ -121,7 +130,7 @@ class Identifier:
         self,
         model: Model,
         observation: Observation,
-        law: AnyLaw,
+        law: AnyLaw | None = None,
         *,
         q0: Any = None,
         u0: Any = None,
@@ -137,6 +146,7 @@ class Identifier:
         u0_from: Mapping[str, Any] | None = None,
         u0_errors: Iterable[Any] = (),
     ) -> None:
+        law = SensitivityLaw() if law is None else law
         _check_parts(model, observation, law)
         if not dt_max > 0:
             raise ConfigurationError(f"dt_max must be positive; got {dt_max}.")
@@ -174,6 +184,7 @@ class Identifier:
         self._stated = model.boundary_readings(u0)  # at t0
         self._state: Any = None
         self._t = float(t0)
+        self._origin = math.nan  # seconds from 1970 to t = 0, where times are dates
         self._z = np.full(self.observed.size, np.nan)
         self._inputs: Inputs = Inputs({})
         self._known = self._inputs  # the same, or what holds since the sample of a failed step
@@ -186,6 +197,20 @@ class Identifier:
         # then.
         if not self.inputs:
             self._begin(self._inputs)
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        _, model = self.model._shown()
+        rows = {name: text for name, text in model.items() if name.startswith("unknown ")}
+        rows = {"equation": model["equation"], **rows, "law": options_of(self.law)}
+        for kind, sensors in (("sensors", self.observed), ("withheld", self.withheld)):
+            if sensors is not None:
+                rows[kind] = listed(sensors.names)
+        if self.inputs:
+            rows["inputs"] = listed(self.inputs)
+        rows["time"] = f"{self._t:g} {self.model.time_unit}".rstrip()
+        if self.origin is not None:
+            rows["time"] += f" since {self.origin} UTC"
+        return f"Identifier after {self._samples} samples", rows
 
     def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
         parts = self.law, self.problem, self.withheld
@@ -300,6 +325,11 @@ class Identifier:
         return self._t
 
     @property
+    def origin(self) -> datetime | None:
+        """The date of t = 0 in UTC, once a sample with a date was taken; the first is at t0."""
+        return None if math.isnan(self._origin) else origin_at(self._origin)
+
+    @property
     def channels(self) -> tuple[str, ...]:
         """Every channel a sample may name."""
         return self._channels.names
@@ -316,11 +346,19 @@ class Identifier:
 
     def step(
         self,
-        t: float,
+        t: float | datetime | np.datetime64,
         z: Readings,
         inputs: Mapping[str, float] | None = None,
     ) -> Estimate:
-        """Take one sample and return the estimate at its time; parameters as of a `Sample`.
+        """Take one sample and return the estimate at its time.
+
+        Parameters
+        ----------
+        t
+            Time in the unit of the model, or a date; the first date is at t0.
+        z, inputs
+            As of a `Sample`: an array in the order of the sensors, a mapping or a row of a pandas
+            table by names.
 
         A step that fails numerically changes nothing and says so in `status`; the next sample
         tries again from the last good state. One with the status "departed" takes the sample and
@@ -340,9 +378,10 @@ class Identifier:
         return self._taken(t, z, inputs)[0]
 
     def _taken(
-        self, t: float, z: Readings, inputs: Mapping[str, float] | None
+        self, t: Any, z: Readings, inputs: Mapping[str, float] | None
     ) -> tuple[Estimate, Interval]:
         """Take one sample; return the estimate, and the interval that the law was given."""
+        t, origin = self._counted(t)
         t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         if noise is not None:
@@ -362,6 +401,7 @@ class Identifier:
         parts = self.law, self._work, self.problem
         self._state, report = stepped(*parts, self._state, interval)
         self._samples += 1
+        self._origin = origin
         stretched = self.problem.control.stretches(t - self._t)
         self._steps = self._steps.add(report.status.code, stretched)
         if report.status.taken:
@@ -387,6 +427,29 @@ class Identifier:
     def _last(self) -> End:
         """The last accepted sample, where the next interval begins."""
         return End(t=self._t, inputs=self._inputs, z=self._z)
+
+    def _counted(self, t: Any) -> tuple[Any, float]:
+        """Return a time in the unit of the model, and the origin from which a date counts."""
+        if type(t) is float or (stamp := stamp_of(t)) is None:
+            return t, self._origin
+        return self._since(stamp)
+
+    def _since(self, stamp: float) -> tuple[float, float]:
+        """Return the time of a date in seconds since 1970, and the origin from which it counts."""
+        unit = self.model.time_unit
+        if not unit:
+            raise ConfigurationError(
+                "the time is a date, and the model has no unit of time: name it, as in "
+                'Model(..., time_unit="s").'
+            )
+        second = conversion("s", unit, "time_unit").factor
+        if not self._samples:
+            return self._t, stamp - self._t / second
+        if math.isnan(self._origin):
+            raise SampleError(
+                "the time is a date, and those of the samples before are numbers: give numbers."
+            )
+        return (stamp - self._origin) * second, self._origin
 
     def _time_of_next(self, t: float) -> float:
         """Return the time of the next sample, checked; only the first may be at the start."""
@@ -438,7 +501,7 @@ class Identifier:
     @property
     def place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
-        ledgers = self._withheld, self._gaps, self._steps
+        ledgers = self._withheld, self._gaps, self._steps, self._origin
         inputs = self._inputs, self._known
         return self._state, self._t, self._z, inputs, self._samples, ledgers
 
@@ -446,7 +509,7 @@ class Identifier:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, inputs, self._samples, ledgers = place
         self._inputs, self._known = inputs
-        self._withheld, self._gaps, self._steps = ledgers
+        self._withheld, self._gaps, self._steps, self._origin = ledgers
 
     def check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -614,8 +677,8 @@ class Identifier:
         Parameters
         ----------
         times
-            Later than the last sample and increasing; the first may be the time of this sample, for
-            the readings at present.
+            Later than the last sample and increasing, numbers or dates; the first may be the time
+            of this sample, for the readings at present.
         inputs
             Channel -> its value, or one for each time. A missing value (left out, NaN) is the last
             one held; the position of a moving sensor only at the time of the last sample.
@@ -638,7 +701,9 @@ class Identifier:
         >>> rod.forecast([1.0, 2.0])["middle"].round(6)
         array([20., 20.])
         """
-        t = np.atleast_1d(numbers(times, "forecast: times"))
+        if np.iterable(times) and stamp_of(next(iter(times), None)) is not None:
+            times = [self._counted(time)[0] for time in times]
+        t = np.atleast_1d(numbers(self._counted(times)[0], "forecast: times"))
         if t.ndim != 1 or not np.isfinite(t).all():
             raise SampleError(f"forecast: times must be finite numbers; got {times!r}.")
         if not len(t) or t[0] < self._t or np.any(np.diff(t) <= 0.0):
@@ -662,19 +727,22 @@ class Identifier:
 
     def run(
         self,
-        stream: Iterable[Any],
+        stream: Any,
         *,
         on_estimate: Callable[[Estimate], object] | None = None,
         progress: bool = False,
         total: int | None = None,
         fields_every: int = 1,
+        **reading: Any,
     ) -> Result:
-        """Take every sample of a stream and collect the estimates.
+        """Take every sample of a table, a file or a stream, and collect the estimates.
 
         Parameters
         ----------
         stream
-            (t, z), (t, z, inputs), or `Sample` items.
+            A pandas table or an xarray dataset with a column for each channel; the name of a file
+            (`.csv`, `.jsonl`, `.parquet`); or an iterable of (t, z), (t, z, inputs) or `Sample`.
+            Times are numbers or dates; the first date is at t0. Dates without a zone are in UTC.
         on_estimate
             Called with each estimate before the next sample is asked for: a controller, say. Its
             return value is ignored; an exception ends the run.
@@ -684,15 +752,50 @@ class Identifier:
             Number of samples, for the time left; default len(stream) if it has one.
         fields_every
             Keep the fields of every so many samples (scalars and innovations of all).
+        **reading
+            How a table or a file is read, by the names below.
+        time
+            Column of the times. Default: the index of a table, the coordinate of a dataset, or
+            the one column that is called time, date or the like.
+        time_unit
+            Unit of times that are numbers; default that of the model.
+        columns
+            Channel -> name of its column, where they differ: {"T_10": "TS_3_2_1"}.
+        units
+            Sensor -> unit of its column, where that is not the unit of the sensor.
+        strict
+            Refuse columns that are no channel; by default they are ignored.
+
+        Raises
+        ------
+        DataError
+            A channel without a column; text or infinity in one; times that do not increase.
+        ConfigurationError
+            Options that do not fit; dates for a model without `time_unit`.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
+        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
+        >>> table = pd.DataFrame({"middle": [20.0, 20.1]}, index=[1.0, 2.0])
+        >>> len(rod.run(table))
+        2
         """
+        stream = self._samples_of(stream, reading)
         result = Result(
             self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
         )
         begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
+        result.readings = partial(self._channels.readings, taken)
         for item in _watched(stream, progress, total):
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
+            if not len(result):
+                result.layout = self._dated(result.layout)
             result.add(estimate)
             taken.append(Sample(t=sample.t, z=copy.copy(sample.z), inputs=copy.copy(sample.inputs)))
             if on_estimate is not None:
@@ -701,12 +804,51 @@ class Identifier:
             result.settle(self.settled(result.last))
         return result
 
+    def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
+        """Return a stream as it is, and the samples of a table with times of the model."""
+        if unknown := sorted(reading.keys() - READING):
+            raise TypeError(f"run() got an unexpected keyword argument '{unknown[0]}'")
+        if not is_tabular(data):
+            if reading:
+                raise ConfigurationError(
+                    f"run: {next(iter(reading))} describes a table or a file; got "
+                    f"{type(data).__name__}."
+                )
+            return cast("Iterable[Any]", data)
+        from livepde.streams.given import Reading
+
+        optional = [name for name in self.inputs if name in self.optional_inputs]
+        needed = [name for name in self.channels if name not in optional]
+        units = {
+            name: unit
+            for sensors in self._channels.sensors
+            for name, unit in zip(sensors.names, sensors.units, strict=True)
+        }
+        how = Reading(
+            channels=needed,
+            optional=[*optional, *self._channels.noise],
+            unit=self.model.time_unit,
+            sensor_units=units,
+            **reading,
+        )
+        table = how.table(data)
+        if table.origin is None:
+            return table
+        t0, self._origin = self._since(since_1970(table.origin))
+        return replace(table, t=table.t + t0)
+
+    def _dated(self, layout: Layout) -> Layout:
+        """Return the layout of a run with the date of t = 0, if times are dates."""
+        if self.origin is None:
+            return layout
+        return replace(layout, attrs={**layout.attrs, "origin": self.origin.isoformat(sep=" ")})
+
     @property
     def unsmoothed(self) -> str:
         """Why the law smooths nothing; empty if it does."""
         return self.law.unsmoothed(self._work)
 
-    def smoothed(self, stream: Iterable[Any], *, fields_every: int = 1) -> xr.Dataset:
+    def smoothed(self, stream: Any, *, fields_every: int = 1) -> xr.Dataset:
         """Return the smoothed unknowns and state at each sample of a run, given all of them.
 
         A fixed-interval smoother: see `livepde.laws.smoother`. All samples are taken by a copy of
@@ -737,6 +879,7 @@ class Identifier:
             )
         if why := self.unsmoothed:
             raise LawError(f"smoothed: {why}; use SensitivityLaw.")
+        stream = self._samples_of(stream, {})
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
         for item in stream:
             sample = sample_of(item)
@@ -747,6 +890,7 @@ class Identifier:
         result = Result(
             self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
         )
+        result.layout = who._dated(result.layout)
         data = run.fixed_interval(fields_every)
         beliefs = data and self.law.smoothed(self._work, before, who._state, data)
         return run.dataset(result, self.problem, beliefs or ())
@@ -784,6 +928,7 @@ class Identifier:
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
             "steps": self._steps.counts,
+            "origin": self._origin,
             "unstated": self._gaps.unstated,
             **self.fingerprint.leaves,
         }
@@ -826,6 +971,7 @@ class Identifier:
         state = None
         try:
             t, samples = float(leaves["t"]), int(leaves["samples"])
+            origin = float(leaves["origin"])
             z = checkpoint.rebuild(self._z, leaves, "z")
             withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
             gaps = InputLedger(
@@ -846,7 +992,7 @@ class Identifier:
                 f"{where} does not fit this identifier ({error}): build it with the law's options "
                 "as they were when it was saved."
             ) from error
-        self._t, self._samples, self._z = t, samples, z
+        self._t, self._samples, self._z, self._origin = t, samples, z, origin
         self._inputs, self._known = inputs, known
         self._state, self._withheld, self._gaps, self._steps = state, withheld, gaps, steps
         if state is None and not self.inputs:
@@ -871,6 +1017,12 @@ def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any])
     for name, given in uncertain.items():
         if given and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
+    components = model.state_space.fields
+    if isinstance(u0, Mapping) and (missing := [name for name in components if name not in u0]):
+        raise ConfigurationError(
+            f"u0 has no value for {missing}: give one for each component of the state, "
+            f"{list(components)}; one number is that of all of them."
+        )
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -38,6 +39,7 @@ from livepde.fem import (
 from livepde.linalg import Array, IntArray
 from livepde.operators import DualOperator
 from livepde.records import Layout, name_clashes
+from livepde.showing import Shown, expression, listed
 from livepde.spaces import BorderedSpace, HilbertSpace, product
 
 __all__ = ["Model", "Source", "h1_form", "mass_form"]
@@ -81,7 +83,7 @@ def _no_term(u: Any, v: Any, x: Any) -> Any:
     return 0.0 * x[0]
 
 
-class Model:
+class Model(Shown):
     """A time-dependent PDE with unknown parameters, M u' + B(t, u) + A(t, u) q = F(t) in X*.
 
     The paper's abstract equation (main) with C(q, u) = A(u) q + B(u) (Assumption ass:equation),
@@ -131,8 +133,13 @@ class Model:
     Raises
     ------
     ModelError
-        A form cannot be evaluated, has the wrong number of components; the mass depends on time;
-        or a name stands for something else in a run's dataset.
+        A form cannot be evaluated, has the wrong number of components, or is not linear in v; the
+        mass depends on time; or a name stands for something else in a run's dataset.
+
+    Warns
+    -----
+    UserWarning
+        The diffusion is negative at the prior mean.
     """
 
     def __init__(
@@ -183,8 +190,34 @@ class Model:
             self.form_initial = compose(
                 self._form("initial", initial, pair, parameter="q"), self.latent
             )
+        self._check_diffusion()
         if not self.form_M.constant:
             raise ModelError("M may not depend on time or inputs: move the change into B or f.")
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        rows = {}
+        for name, block in self.state_space.fields.items():
+            kind = type(block.field.element).__name__
+            rows[f"state {name}"] = f"{kind}, {block.size} coefficients"
+            if block.field.dirichlet:
+                rows[f"state {name}"] += f", Dirichlet values {_boundaries(block.field.dirichlet)}"
+        rows["equation"] = _equation(self._parts)
+        for name, what in {"M": "mass M(u, v)", "initial": "initial state"}.items():
+            if self._parts[name] is not None:
+                rows[what] = " + ".join(_terms(self._parts[name]))
+        for name, unknown in self.parameter_space.unknowns.items():
+            of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
+            many = [label for label in self.parameter_space.labels if label.startswith(f"{name}[")]
+            named = f" for each of {listed(many)}" if many else ""
+            prior = f"{of}{_prior(unknown.prior)} {unknown.unit}".rstrip()
+            rows[f"unknown {name}"] = prior + named
+        if self.inputs:
+            rows["inputs"] = listed(self.inputs)
+        ends = zip("xyz", self.mesh.p.min(axis=1), self.mesh.p.max(axis=1), strict=False)
+        extent = ", ".join(f"{axis} from {low:g} to {high:g}" for axis, low, high in ends)
+        rows["mesh"] = f"{self.mesh.nelements} cells, {extent} {self.length_unit}".rstrip()
+        rows["unit of time"] = self.time_unit or "not stated"
+        return f"Model with {self.X.dim} state coefficients, {self.Q.dim} of unknowns", rows
 
     def __copy__(self) -> Model:
         return self  # it never changes
@@ -330,6 +363,23 @@ class Model:
                     f"parameter '{name}': only zero boundary values are possible; write a known "
                     "boundary part of q into B."
                 )
+
+    def _check_diffusion(self) -> None:
+        """Warn of a diffusion that is negative everywhere at the prior mean: u_t = -k u_xx."""
+        q = self.parameter_space.prior
+        for u in (0.1, 1.0, 10.0):  # of a diffusivity that depends on u
+            parts = self.physical_A.diffusion(u, q=q), self.form_B.diffusion(u)
+            if parts[0] is None or parts[1] is None:
+                return
+            factors = parts[0] + parts[1]
+            if not (factors < 0.0).any() or not (factors <= 0.0).all():
+                return
+        warnings.warn(
+            "the diffusion of the model is negative at the prior mean, which is ill-posed: small "
+            "disturbances grow without bound. In the weak form of u_t = k u_xx the term is "
+            "+ k * dot(grad(u), grad(v)): change its sign in A or B.",
+            stacklevel=3,
+        )
 
     def _check_names(self) -> None:
         """Refuse names that a run's dataset could not tell apart."""
@@ -570,6 +620,53 @@ class Model:
         if np.any(q < lower) or np.any(q > upper):
             raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
         return q
+
+
+def _terms(given: Any) -> list[str]:
+    """Return the terms of a form as text."""
+    terms = given if isinstance(given, Sequence) else [given]
+    return [
+        f"{_terms(one.form)[0]} on {one.name!r}" if isinstance(one, On) else expression(one)
+        for one in terms
+        if one is not _no_term
+    ]
+
+
+def _equation(parts: Mapping[str, Any]) -> str:
+    """Return the weak form of the process as text."""
+    mass = "u' * v" if parts["M"] is None else "M(u', v)"
+    left = " + ".join([mass, *_terms(parts["A"]), *_terms(parts["B"])])
+    given = parts["f"]
+    sources = [
+        str(one) if isinstance(one, int | float | Mapping) else _terms(one)[0]
+        for one in (given if isinstance(given, Sequence) else [given])
+        if one != 0.0
+    ]
+    right = f"integral of ({' + '.join(sources)}) * v" if sources else "0"
+    return f"integral of {left} = {right}"
+
+
+def _prior(prior: Any) -> str:
+    """Return a prior as text, with bounds where they are not those of its kind."""
+    bounds = (
+        "" if prior.bounds == getattr(type(prior), "bounds", None) else f", bounds={prior.bounds}"
+    )
+    return f"{type(prior).__name__}({prior.centre:g}, std={prior.std:g}{bounds})"
+
+
+def _boundaries(dirichlet: Any) -> str:
+    """Return Dirichlet values as text."""
+    if not isinstance(dirichlet, Mapping):
+        return str(dirichlet)
+    values = {
+        name: f"channel {value.name}"
+        if isinstance(value, Channel)
+        else expression(value)
+        if callable(value)
+        else f"{value}"
+        for name, value in dirichlet.items()
+    }
+    return ", ".join(f"{name} = {value}" for name, value in values.items())
 
 
 def _rebuilt(state: Any, parameter: Any, parts: dict[str, Any]) -> Model:

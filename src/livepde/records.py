@@ -25,11 +25,14 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DATE",
+    "ESTIMATES",
     "FIELD_ENDS",
     "NOTE",
     "NUMBER_ENDS",
+    "PARAMETER",
     "SMOOTHED",
     "STATE_ENDS",
+    "STATISTIC",
     "STATUS_CODES",
     "Layout",
     "Record",
@@ -48,6 +51,8 @@ STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 NOTE = "note_"  # prefix of a note whose own name is taken
 SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a run
 DATE = "date"  # column of an exported table, beside the variables of the dataset
+# The numbers among the unknowns on axes of their own, in `Result.to_xarray`.
+ESTIMATES, PARAMETER, STATISTIC = "estimates", "parameter", "statistic"
 # Variables beside an unknown or a component of the state: suffix of their names -> meaning.
 STATE_ENDS = {"_std": "the standard deviation"}
 INTERVAL_ENDS = {"_low": "the lower end of the interval", "_high": "the upper end of the interval"}
@@ -467,7 +472,7 @@ class Layout:
             "time": ("time", times, {"units": self.time_unit}),
             "snapshot": ("snapshot", snapshots),
             "sensor": ("sensor", list(self.sensors)),
-            "withheld": ("withheld", list(withheld)),
+            **({"withheld": ("withheld", list(withheld))} if withheld else {}),
             **{axis: ("vertex", np.array(x), unit) for axis, x in self.coordinates.items()},
             **self._places("sensor", self.sensors),
             **self._places("withheld", withheld),
@@ -533,7 +538,7 @@ class Layout:
             )
         )
         data, coords, _ = blank._contents(rows, None)
-        found = {DATE}
+        found = {DATE, ESTIMATES, PARAMETER, STATISTIC}
         for name, (dimensions, *_) in {**data, **coords}.items():
             found |= {name, *([dimensions] if isinstance(dimensions, str) else dimensions)}
         return found
@@ -565,7 +570,7 @@ class Layout:
         unit = {"units": self.sensor_unit}
         innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
-        if self.withheld is not None:
+        if self.withheld:
             errors = np.reshape(rows.withheld_error, (len(rows), len(self.withheld)))
             data["withheld_error"] = (("time", "withheld"), errors, unit)
         return data

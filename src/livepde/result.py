@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -13,6 +13,16 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
+from livepde.frames import (
+    covariance_of,
+    draws,
+    estimates,
+    frame,
+    over_time,
+    prior_draws,
+    times,
+    with_estimates,
+)
 from livepde.laws import Belief, Fit, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
@@ -29,10 +39,14 @@ from livepde.records import (
     refused_readings,
     used_errors,
 )
+from livepde.showing import Shown, listed
 from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
 
 if TYPE_CHECKING:
+    import pandas as pd
     import xarray as xr
+
+    from livepde.plots import RunPlots
 
 __all__ = [
     "Estimate",
@@ -52,8 +66,8 @@ FIRST_ORDER = "to first order: that of the latent value, times the slope of the 
 Kept = TypeVar("Kept")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class Estimate(Shown):
     """The estimate of parameter and state after one sample.
 
     Attributes
@@ -161,6 +175,21 @@ class Estimate:
             "space": self.space.described,
         }
         return {k: v for k, v in vars(self).items() if k != "_read"} | own
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        rows = {}
+        for label in self.space.labels:
+            unit = unknown_of(self.space, label).unit
+            rows[label] = f"{self[label]} {unit}".rstrip()
+        for name in self.space.fields:
+            values, std = self[name].median, self[name].deviation
+            rows[name] = f"field, coefficients {values.min():.4g} to {values.max():.4g}"
+            if np.isfinite(std).all():
+                rows[name] += f", mean std. dev. {std.mean():.2g}"
+        rows["status"] = self.status.code
+        if self.held:
+            rows["held inputs"] = listed(self.held)
+        return f"Estimate at t = {self.t:g}", rows
 
     @cached_property
     def diagnostics(self) -> Diagnostics[float]:
@@ -320,7 +349,7 @@ def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
             yield flat(label, left)
 
 
-class Result:
+class Result(Shown):
     """Estimates of a run, as they are added.
 
     Scalars, innovations and status are kept for every sample; fields, evaluated at the vertices of
@@ -357,6 +386,7 @@ class Result:
         self._settled: Belief | None = None
         self._ended = False  # a last fit was asked for
         self.smoother: Callable[[], xr.Dataset] | None = None
+        self.readings: Callable[[], Array] | None = None  # of all samples, (samples, sensors)
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
@@ -366,6 +396,14 @@ class Result:
 
     def __len__(self) -> int:
         return self._count
+
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        title = f"Result of {len(self)} samples"
+        if self.last is None:
+            return title, {}
+        _, rows = self.last._shown()
+        until = f"{title} until t = {self.last.t:g} {self.layout.time_unit}".rstrip()
+        return until, {**rows, "verdict": self.verdict.level}
 
     @property
     def verdict(self) -> Verdict:
@@ -459,8 +497,171 @@ class Result:
         return found
 
     def to_xarray(self) -> xr.Dataset:
-        """Return a dataset with dimensions time, snapshot, vertex, sensor, withheld.
+        """Return a dataset of the run over time: numbers, fields, errors of the sensors.
 
+        It is that of `dataset`, and has besides: `date` over `time`, if times are dates; the ends
+        `_low` and `_high` of the 95 % interval of each unknown, whatever its prior; and
+        `estimates` over (`time`, `parameter`, `statistic`), with the value, std, low and high of
+        each number: `data.estimates.sel(parameter="alpha", statistic="high")`.
+        """
+        return with_estimates(self.dataset())
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the numbers over time as a pandas table, one row for each sample.
+
+        The index has dates if the samples have. Columns are, for an unknown `alpha`: `alpha`,
+        `alpha_std`, `alpha_low` and `alpha_high`; for a sensor `T_1` `innovation:T_1`, or
+        `withheld_error:T_1` if it is withheld; and `status`.
+        """
+        return frame(self.dataset())
+
+    def summary(self) -> pd.DataFrame:
+        """Return the last estimates as a pandas table, one row for each unknown number.
+
+        Columns: `value` and `std`; `low` and `high`, the 95 % interval if the model is exact;
+        `model_low` and `model_high`, the one that allows for errors of the model, and `effect`,
+        by how much these may move the value, relative to it (NaN where the run cannot judge it);
+        `unit`; and `level`, that of the verdict on the whole run. The attribute `misfit` is the
+        root mean square of the residuals over the noise.
+        """
+        return estimates(self.dataset())
+
+    def covariance(self) -> pd.DataFrame:
+        """Return the covariance of the last numbers among the unknowns, by name.
+
+        Under a transform it is that to first order, as are the standard deviations.
+
+        Raises
+        ------
+        LawError
+            A law without a covariance.
+        """
+        last = self._last("covariance")
+        return covariance_of(last.belief, last.space)
+
+    def correlation(self) -> pd.DataFrame:
+        """Return the correlation of the last numbers among the unknowns, by name."""
+        found = self.covariance()
+        size = np.sqrt(np.diag(found))
+        return found.div(size, axis=0).div(size, axis=1)
+
+    def sample(self, n: int, seed: int | np.random.Generator | None = None) -> xr.Dataset:
+        """Return draws from the last estimate: numbers, unknown fields and the state.
+
+        Parameters
+        ----------
+        n
+            Number of draws.
+        seed
+            Of the random numbers, or their generator.
+
+        Returns
+        -------
+        draws
+            Numbers over `draw`, fields and state over (`draw`, `vertex`). They are jointly normal
+            in latent values, and unknowns lie within their bounds; modes that the law leaves out
+            are drawn as well.
+
+        Raises
+        ------
+        LawError
+            A law without a covariance.
+        ConfigurationError
+            There is no estimate yet; the result was pickled.
+        """
+        import xarray as xr
+
+        last, model = self._last("sample"), self.model
+        q, u = draws(last.belief, last.space, n, seed)
+        numbers = {
+            label: ("draw", q[:, k], {"units": unknown_of(last.space, label).unit})
+            for label, k in last.space.labels.items()
+        }
+        fields: dict[str, Any] = {}
+        order = vertex_order(model)
+        for space, values in ((model.parameter_space, q), (model.state_space, u)):
+            for name, block in space.fields.items():
+                at_vertices = block.at_vertices @ values[:, space.part(name)].T
+                names = block.variables(name)
+                parts = at_vertices.reshape(len(names), -1, n)
+                fields |= {
+                    key: (("draw", "vertex"), part[order].T)
+                    for key, part in zip(names, parts, strict=True)
+                }
+        axes = {axis: ("vertex", np.array(x)) for axis, x in self.layout.coordinates.items()}
+        return xr.Dataset({**numbers, **fields}, axes)
+
+    def to_inference_data(self, n: int = 1000, seed: int | None = 0) -> xr.DataTree:
+        """Return what ArviZ (from 1.0 on) plots and compares: an xarray DataTree.
+
+        Its groups are `posterior`, the draws of `sample`; `prior`, draws of the numbers among the
+        unknowns; and `observed_data`, the readings, if they are known (see `measured`).
+
+        Parameters
+        ----------
+        n, seed
+            As for `sample`.
+        """
+        import xarray as xr
+
+        drawn = self.sample(n, seed).assign_coords(draw=np.arange(n))
+        before = {
+            label: ("draw", values)
+            for label, values in prior_draws(self._last("prior").space, n, seed).items()
+        }
+        groups = {"posterior": drawn, "prior": xr.Dataset(before, {"draw": np.arange(n)})}
+        chains = {name: group.expand_dims(chain=[0]) for name, group in groups.items()}
+        if self.readings is not None:
+            frame = self.measured
+            chains["observed_data"] = xr.Dataset({name: frame[name] for name in frame})
+        return xr.DataTree.from_dict(chains)
+
+    @property
+    def measured(self) -> pd.DataFrame:
+        """Readings of the assimilated and then of the withheld sensors, one row for each sample.
+
+        Raises
+        ------
+        ConfigurationError
+            Estimates that were added one by one.
+        """
+        import pandas as pd
+
+        if self.readings is None:
+            raise ConfigurationError(
+                "the samples of this result are not known; use the result of Identifier.run."
+            )
+        residuals = self.residuals
+        return pd.DataFrame(self.readings(), residuals.index, residuals.columns)
+
+    @property
+    def predicted(self) -> pd.DataFrame:
+        """Readings as the model predicted them, one row for each sample.
+
+        Of assimilated sensors before their reading was used, of withheld ones after the update;
+        NaN where there is no reading. Raises as `measured`.
+        """
+        return self.measured - self.residuals
+
+    @property
+    def residuals(self) -> pd.DataFrame:
+        """Measured minus predicted readings of all sensors, one row for each sample."""
+        import pandas as pd
+
+        data = self.dataset()
+        columns = over_time(data, "innovation", "sensor")
+        return pd.DataFrame(columns | over_time(data, "withheld_error", "withheld"), times(data))
+
+    def _last(self, what: str) -> Estimate:
+        """Return the last estimate."""
+        if self.last is None:
+            raise ConfigurationError(f"{what}: the run holds no samples yet.")
+        return self.last
+
+    def dataset(self) -> xr.Dataset:
+        """Return the dataset that a run directory holds.
+
+        Its dimensions are time, snapshot, vertex, sensor and withheld.
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
@@ -502,7 +703,14 @@ class Result:
     def __getstate__(self) -> dict[str, Any]:
         """Return what was found, without the model, whose functions may not be pickled."""
         records, fields = self._finished()
-        own = {"records": records, "_last_fields": fields, "_complete": True, "smoother": None}
+        own: dict[str, Any] = {
+            "records": records,
+            "_last_fields": fields,
+            "_complete": True,
+            "smoother": None,
+        }
+        if self.readings is not None:
+            own["readings"] = partial(kept, self.readings())
         left = ("model", "observed", "withheld", "_readout", "_settled")
         return {k: v for k, v in vars(self).items() if k not in left} | own
 
@@ -540,13 +748,17 @@ class Result:
 
         Rows are scalar unknowns (value, std) and channels (rmse, count).
         """
-        return summary(self.to_xarray())
+        return summary(self.dataset())
 
-    def plot(self, **options: Any) -> Any:
-        """Draw the run and return the figure; needs the extra `plots`."""
-        from livepde import plots
+    @property
+    def plot(self) -> RunPlots:
+        """Figures by name, `plot.estimates("alpha", ax=ax)`; `plot()` draws all of the run.
 
-        return plots.overview(self.to_xarray(), **options)
+        They need the extra `plots`.
+        """
+        from livepde.plots import RunPlots
+
+        return RunPlots(self)
 
 
 def _number(value: float) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -20,6 +21,9 @@ __all__ = [
     "Sample",
     "by_name",
     "check_noise",
+    "is_dataset",
+    "is_frame",
+    "is_tabular",
     "labelled",
     "noise_channel",
     "number",
@@ -63,9 +67,28 @@ def sample_of(item: Any) -> Sample:
         if len(item) == 2 or last is None or isinstance(last, Mapping):
             return Sample(t=item[0], z=item[1], inputs=last if len(item) == 3 else None)
     raise SampleError(
-        f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}; a pandas "
-        "table whose index are the times and whose columns are channels gives them by .iterrows()."
+        f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}. Give a pandas "
+        "table as a whole, as in run(table)."
     )
+
+
+def is_frame(data: Any) -> bool:
+    """Return whether data are a pandas table."""
+    return all(hasattr(data, name) for name in ("columns", "index", "iterrows"))
+
+
+def is_dataset(data: Any) -> bool:
+    """Return whether data are an xarray dataset."""
+    return hasattr(data, "data_vars")
+
+
+def is_tabular(data: Any) -> bool:
+    """Return whether data are a table, a dataset or the name of a file, and no stream of samples.
+
+    >>> is_tabular("rod.csv"), is_tabular([(0.0, 20.0)])
+    (True, False)
+    """
+    return isinstance(data, str | os.PathLike) or is_frame(data) or is_dataset(data)
 
 
 def noise_channel(name: str) -> str:

@@ -21,7 +21,6 @@ from livepde.cases.schema import (
     GradientSpec,
     TikhonovSpec,
 )
-from livepde.cases.units import conversion
 from livepde.errors import CaseError, MissingInputError, SpaceError
 from livepde.fem import (
     MeanReverting,
@@ -50,6 +49,7 @@ from livepde.observation.placed import POSITION, shift_names
 from livepde.samples import by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
+from livepde.units import conversion
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,7 +13,6 @@ import numpy as np
 
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
-from livepde.cases.units import LARGEST, SMALLEST, conversion, convert
 from livepde.errors import CaseError, SpaceError
 from livepde.fem import (
     grid,
@@ -24,6 +23,7 @@ from livepde.fem import (
 )
 from livepde.linalg import Array
 from livepde.models import Equation, Option
+from livepde.units import LARGEST, SMALLEST, conversion, convert
 
 __all__ = ["CaseContent", "inside", "off_nodes", "sides_of", "subdomain"]
 

@@ -19,7 +19,7 @@ import numpy as np
 from livepde.cases.case_content import CaseContent
 from livepde.cases.equations import check_options, load_code, own_code
 from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec
-from livepde.cases.units import conversion
+from livepde.dates import since_1970
 from livepde.linalg import Mask
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
@@ -31,7 +31,6 @@ from livepde.streams import (
     read_json_lines,
     tabulated,
 )
-from livepde.streams.clock import since_1970
 from livepde.streams.csvfile import header_of
 from livepde.streams.first_rows import wild_first_rows
 from livepde.streams.gaps import fill_table
@@ -39,6 +38,7 @@ from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
+from livepde.units import conversion
 
 __all__ = [
     "START",

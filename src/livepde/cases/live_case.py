@@ -28,12 +28,12 @@ from livepde.cases.data import (
     suspect_start,
     wild_start,
 )
+from livepde.dates import since_1970
 from livepde.errors import ConfigurationError, DataError
 from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
-from livepde.streams.clock import since_1970
 from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather

@@ -15,20 +15,19 @@ from statistics import mode
 import numpy as np
 
 from livepde.cases.read import BLANK
-from livepde.cases.units import conversion
 from livepde.errors import CaseError, SampleError
 from livepde.linalg import Array
 from livepde.streams import Clock, Column, DataTable, read_csv
-from livepde.streams.clock import date_formats, number_of
+from livepde.streams.clock import CALLED_TIME, date_formats, number_of
 from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES, MISSING
+from livepde.units import conversion
 
 __all__ = ["IN_BRACKETS", "Measured", "measured", "unit_in"]
 
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")
-CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
 ROW_NUMBER = re.compile(r"(id|idx|index|n|no|nr|num|number|row|rec|record|sample|#)\.?", re.I)
 VALUES = {"number", "date"}  # kinds of cells that a header does not have
 

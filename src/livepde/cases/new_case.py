@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from livepde.cases.json_schema import SCHEMA_FILE, case_schema
 from livepde.cases.measured import IN_BRACKETS, Measured, measured, unit_in
 from livepde.cases.read import BLANK, beside, toml_line
 from livepde.cases.schema import DataSpec
@@ -40,6 +42,7 @@ NUMBERED = re.compile(r"(.*?)(\d+)")  # u_17
 PLACES = "places.csv"  # the table of positions that is written beside the case
 FAMILY = 8  # so many numbered columns become one line of [channels]
 HEAD = """\
+#:schema ./livepde.schema.json
 # A case of livepde: which process, what is unknown, which channel is what.
 #   livepde check {case}     what is in here, and what its sensors can tell
 #   livepde run {case}       identify; writes a run directory
@@ -53,6 +56,7 @@ ENDS = """\
 TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
 NOISE = 0.05
 CASE = """\
+#:schema ./livepde.schema.json
 # A case of livepde: which process, what is unknown, which channel is what.
 #   livepde check {0}     what is in here, and what its sensors can tell
 #   livepde run {0}       identify; writes a run directory
@@ -510,11 +514,12 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:
-    """Write files that are not there yet, or none."""
+    """Write files that are not there yet, or none; and the schema of cases, which they name."""
     check_free(folder, files)
+    schema = json.dumps(case_schema(), indent=1, ensure_ascii=False) + "\n"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for name, text in files.items():
+        for name, text in {**files, SCHEMA_FILE: schema}.items():
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise RunError(f"{folder}: cannot be written: {error.strerror or error}.") from error

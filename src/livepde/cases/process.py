@@ -14,7 +14,6 @@ from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, UnknownSpec
-from livepde.cases.units import conversion
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
 from livepde.fem import (
     Channel,
@@ -38,6 +37,7 @@ from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_condit
 from livepde.models.boundary_conditions import Amount, Multiple
 from livepde.observation.flux_plates import in_cells
 from livepde.runs.thermal_resistance import LAYERS, SURFACES
+from livepde.units import conversion
 
 __all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes", "wall_attributes"]
 

@@ -17,8 +17,8 @@ import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from livepde.cases.schema import CaseSpec
-from livepde.cases.units import LARGEST
 from livepde.errors import CaseError
+from livepde.units import LARGEST
 
 __all__ = [
     "BLANK",

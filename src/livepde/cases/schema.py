@@ -15,10 +15,13 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    GetJsonSchemaHandler,
     StrictBool,
     Tag,
+    WithJsonSchema,
     model_validator,
 )
+from pydantic_core import CoreSchema
 
 from livepde.fem import Scalar
 from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shadows
@@ -52,6 +55,36 @@ def _quantity(value: Any) -> Any:
         message = 'expected a number, or text with a unit as "20 h"'
         raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
     return value if isinstance(value, str) else float(value)
+
+
+class Also:
+    """Short forms that a validator accepts as well, for the JSON schema.
+
+    Parameters
+    ----------
+    schemas
+        Their JSON schemas.
+    """
+
+    def __init__(self, *schemas: dict[str, Any]) -> None:
+        self.schemas = schemas
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """Return what pydantic asks annotations for."""
+        return {"anyOf": [handler(core_schema), *self.schemas]}
+
+
+TEXT, NUMBER = ({"type": kind} for kind in ("string", "number"))
+LIST = {"type": "array", "items": {"anyOf": [NUMBER, TEXT]}}
+BOUNDS: dict[str, Any] = {
+    "anyOf": [
+        {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2},
+        {"type": "string", "pattern": r"^\s*(<=|>=)\s*[-+0-9.eE]+\s*$"},
+        {"type": "object"},  # TOML reads alpha.error = ... as a table
+    ]
+}
 
 
 def _short(key: str) -> BeforeValidator:
@@ -144,7 +177,9 @@ Name: TypeAlias = Annotated[str, Field(min_length=1)]
 Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 TimeFormat: TypeAlias = Annotated[str, AfterValidator(_time_format)]
 Expected: TypeAlias = Annotated[
-    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_limits)]], BeforeValidator(_flat)
+    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_limits)]],
+    BeforeValidator(_flat),
+    WithJsonSchema({"type": "object", "additionalProperties": BOUNDS}),
 ]
 
 
@@ -250,7 +285,7 @@ class FileSpec(Spec):
     time_format: TimeFormat | None = None
 
 
-File: TypeAlias = Annotated[FileSpec, _short("file")]
+File: TypeAlias = Annotated[FileSpec, _short("file"), Also(TEXT)]
 
 
 class DataSpec(Spec):
@@ -361,7 +396,7 @@ class RegionSpec(PriorSpec):
     over: Pair | Box | Name
 
 
-Region: TypeAlias = Annotated[RegionSpec, _short("over")]
+Region: TypeAlias = Annotated[RegionSpec, _short("over"), Also(LIST, TEXT)]
 
 
 class UnknownSpec(PriorSpec):
@@ -543,7 +578,7 @@ class ChannelSpec(Spec):
 class SensitivitySpec(Spec):
     """The law for sparse, noisy sensors."""
 
-    kind: Literal["sensitivity"]
+    kind: Literal["sensitivity"] = "sensitivity"
     noise: Quantity | None = None
     modes: PositiveInt | Literal["auto"] = "auto"
     rank: PositiveInt | None = SensitivityLaw.rank
@@ -665,7 +700,7 @@ class BoundarySpec(Spec):
         return self
 
 
-Boundary: TypeAlias = Annotated[BoundarySpec, _short("value")]
+Boundary: TypeAlias = Annotated[BoundarySpec, _short("value"), Also(NUMBER, TEXT)]
 
 
 class SourceSpec(Spec):
@@ -689,10 +724,21 @@ def _has_from(value: Any) -> str:
     return "whole" if whole else "components"
 
 
+Components: TypeAlias = Annotated[
+    dict[Name, Quantity],
+    WithJsonSchema(
+        {
+            "type": "object",
+            "additionalProperties": {"anyOf": [NUMBER, TEXT]},
+            "not": {"required": ["from"]},
+        }
+    ),
+]
 Initial: TypeAlias = Annotated[
-    Annotated[InitialSpec, Tag("whole")] | Annotated[dict[Name, Quantity], Tag("components")],
+    Annotated[InitialSpec, Tag("whole")] | Annotated[Components, Tag("components")],
     Discriminator(_has_from),
     _short("from"),
+    Also(NUMBER, TEXT),
 ]
 
 
@@ -711,7 +757,7 @@ class CaseSpec(Spec):
     intake: IntakeSpec = Field(default_factory=IntakeSpec)
     unknowns: dict[Identifier, UnknownSpec] = Field(min_length=1)
     channels: dict[Name, ChannelSpec] = Field(min_length=1)
-    law: Law = SensitivitySpec(kind="sensitivity")
+    law: Law = SensitivitySpec()
     steps: StepsSpec = Field(default_factory=StepsSpec)
     output: OutputSpec = Field(default_factory=OutputSpec)
     reference: dict[Name, Quantity] = Field(default_factory=dict)

@@ -36,7 +36,8 @@ def export(
     targets: Annotated[
         list[Path],
         argument(
-            "Files to write: .nc, .zarr, .csv, .xdmf, .vtu, .vtk or .html.", metavar="TARGET..."
+            "Files to write: .nc, .zarr, .csv, .parquet, .xdmf, .vtu, .vtk or .html.",
+            metavar="TARGET...",
         ),
     ],
     at: Annotated[
@@ -82,8 +83,8 @@ def export(
 
 def _moment(text: str, data: Dataset) -> float:
     """Return a time of the command line in the run's unit."""
-    from livepde.cases.units import convert
     from livepde.dates import dated
+    from livepde.units import convert
 
     unit = str(data["time"].attrs.get("units", ""))
     try:

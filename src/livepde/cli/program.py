@@ -20,6 +20,7 @@ from livepde.cli.fleet_command import fleet
 from livepde.cli.printing import BAD_INPUT, terminal
 from livepde.cli.report import report
 from livepde.cli.run import run
+from livepde.cli.schema import schema
 from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
 from livepde.library_messages import tame_libraries
@@ -48,6 +49,7 @@ COMMANDS = (
     export,
     fmu,
     equations,
+    schema,
     reproduce,
     citation,
 )

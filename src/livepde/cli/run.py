@@ -310,7 +310,7 @@ def concluded(
     loaded = prepared.case
     notes: list[str] = []
     nothing: list[Any] = []
-    ended = attempted("The estimate of the end", driven.result.to_xarray, None, notes)
+    ended = attempted("The estimate of the end", driven.result.dataset, None, notes)
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)

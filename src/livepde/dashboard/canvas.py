@@ -15,11 +15,10 @@ import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dates import dated
+from livepde.dates import dated, since_1970
 from livepde.linalg import Array
 from livepde.plots import PALETTE, labelled, time_scale
 from livepde.runs import jumps
-from livepde.streams.clock import since_1970
 
 __all__ = [
     "CONFIG",

@@ -14,10 +14,10 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from livepde import __version__
-from livepde.cases.units import in_si
 from livepde.exchange.component import Component
 from livepde.exchange.recipe import opened
 from livepde.exchange.unit_process import PERIOD, STATUS, OutputVariable, UnitProcess
+from livepde.units import in_si
 
 __all__ = ["FOLDER", "IdentifierSlave"]
 

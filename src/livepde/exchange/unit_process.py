@@ -11,7 +11,6 @@ from datetime import datetime
 import numpy as np
 
 from livepde.cases import Case
-from livepde.cases.units import conversion
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
@@ -22,6 +21,7 @@ from livepde.result import Estimate, Result, unknown_of, vertex_order
 from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value
+from livepde.units import conversion
 
 __all__ = [
     "PERIOD",

@@ -192,6 +192,9 @@ class Form(FormMatrices):
         self._moving: list[bool] = []  # terms that read time or inputs, and the nonlinear argument
         self.uses: frozenset[str] = self._probe()
         self.parameter = parameter
+        for slot in self.spaces:
+            if slot not in (nonlinear, parameter):
+                self._check_linear(slot)
         self.linear_in_parameter = parameter is None or self._linear(parameter)
         curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
         self._curved = frozenset(key for key in curved if key is not None)
@@ -257,6 +260,82 @@ class Form(FormMatrices):
                 "or a component index missing?"
             )
         return place.used
+
+    def _check_linear(self, slot: str) -> None:
+        """Refuse a term that is not linear in an argument, such as one without the test function.
+
+        Raises
+        ------
+        ModelError
+            Naming the term, if there are several.
+        """
+        rng = np.random.default_rng(3)
+        for number, whole in enumerate(self.terms):
+            for term in whole.samples():
+                values = {
+                    key: rng.standard_normal((local.components, *local.shape))
+                    for key, local in term.spaces.items()
+                }
+                place, one = Moment(0.3, self._inputs), values[slot]
+
+                def at(
+                    v: Array,
+                    term: _Term = term,
+                    values: dict[str, Array] = values,
+                    place: Moment = place,
+                ) -> Array:
+                    return np.asarray(term.evaluate({**values, slot: v}, place)[0])
+
+                other = rng.standard_normal(one.shape)
+                with np.errstate(all="ignore"):  # roots and logarithms of random numbers
+                    parts = at(one), at(other), at(one + other)
+                    size = np.abs(parts[0]) + np.abs(parts[1]) + np.abs(parts[2])
+                    wrong = np.abs(parts[2] - parts[0] - parts[1]) > 1e-9 * size  # not of NaN
+                    if not wrong.any():
+                        continue
+                    lacks = np.abs(at(np.zeros_like(one)))[wrong].any()
+                which = f", term {number + 1}" if len(self.terms) > 1 else ""
+                why = f"has a part without {slot}" if lacks else f"is not linear in {slot}"
+                raise ModelError(
+                    f"Form {self.name}({', '.join(self.spaces)}, x){which} {why}: every part needs "
+                    f"{slot} or a derivative of it as one factor, as in `u * v`."
+                )
+
+    def diffusion(self, u: float, **coefficients: Array) -> Array | None:
+        """Return the factors of u_k v_k in each coordinate k, at points of all elements.
+
+        Of the terms on the whole mesh, where the state has the value u and a gradient of length
+        one. None if the state has several components or second derivatives.
+
+        Parameters
+        ----------
+        coefficients
+            Of the arguments beside u and v.
+        """
+        moment, total = Moment(0.3, self._inputs), np.zeros(1)
+        for whole in (term for term in self.terms if term.measure.name is None):
+            factors: list[Array] = []
+            for term in whole.samples():
+                local = term.spaces["u"]
+                if [name for part in local.locals for name, _ in part.parts] != ["value", "grad"]:
+                    return None
+                given = {key: term.spaces[key].values(x) for key, x in coefficients.items()}
+                level = local.zeros()
+                level[~local.derivatives] = u
+                for k in np.flatnonzero(local.derivatives):
+                    unit = local.zeros()
+                    unit[k] = 1.0
+                    with np.errstate(all="ignore"):  # a root of u, say
+                        steep, flat = (
+                            term.evaluate(
+                                {key: {**given, "u": at, "v": unit}[key] for key in self.spaces},
+                                moment,
+                            )[0]
+                            for at in (level + unit, level)
+                        )
+                        factors.append(np.broadcast_to(steep - flat, local.shape).ravel())
+            total = total + np.concatenate(factors)
+        return total
 
     @property
     def constant(self) -> bool:

@@ -11,8 +11,9 @@ this size in any dimension:
     to 2500   5 000 000     120 000       CHOLMOD or Pardiso if installed, else multigrid
     beyond                                multigrid
 
-Multigrid serves symmetric positive definite matrices only; others are factorised at any size, by
-Pardiso if it is installed.
+Multigrid serves symmetric positive definite matrices only, if PyAMG is installed; others are
+factorised at any size, by Pardiso if it is installed. SuperLU, which needs no package, factorises
+all matrices; it is slow and needs much memory at large sizes.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
         return Choice(superlu, f"{wide}, at most {SMALL}")
     # One V-cycle is enough for an approximate inverse, so multigrid pays for smaller matrices.
     most = WIDEST_SUPERLU if approximate else WIDEST_FACTOR
-    if symmetric and band > most:
+    multigrid = symmetric and _installed("pyamg")
+    if multigrid and band > most:
         return Choice(MultigridSolver(pattern), f"{wide}, more than {most}")
     if symmetric and _installed("sksparse"):
         return Choice(CholmodSolver(pattern), f"{wide}; scikit-sparse is installed")
@@ -81,7 +83,7 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
         return Choice(PardisoSolver(pattern, symmetric), f"{wide}; pypardiso is installed")
     if band <= WIDEST_SUPERLU:
         return Choice(superlu, f"{wide}, at most {WIDEST_SUPERLU}")
-    if symmetric:
+    if multigrid:
         return Choice(
             MultigridSolver(pattern),
             f"{wide}, more than {WIDEST_SUPERLU}; neither scikit-sparse nor pypardiso is installed",

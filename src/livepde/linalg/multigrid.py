@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.errors import LinearAlgebraError
+from livepde.errors import LinearAlgebraError, optional
 from livepde.linalg.krylov import conjugate_gradients
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.protocol import Factor
@@ -58,7 +58,8 @@ class MultigridSolver:
 
     def factorise(self, data: Array) -> MultigridFactor:
         """Build the hierarchy; raises `LinearAlgebraError` for a non-finite or zero diagonal."""
-        from pyamg import ruge_stuben_solver
+        with optional("solvers", "Multigrid needs PyAMG"):
+            from pyamg import ruge_stuben_solver
 
         if not np.isfinite(data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")

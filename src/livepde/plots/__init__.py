@@ -16,22 +16,37 @@ from livepde.plots.dataset import (
     sensor_places,
     time_scale,
 )
-from livepde.plots.run_figure import curves, overview
+from livepde.plots.run_figure import (
+    RunPlots,
+    corner,
+    curves,
+    estimates,
+    field,
+    measured_and_predicted,
+    overview,
+    residuals,
+)
 from livepde.plots.style import GREY, PALETTE, figure
 
 __all__ = [
     "GREY",
     "NORMAL_95",
     "PALETTE",
+    "RunPlots",
+    "corner",
     "curves",
     "ensemble",
+    "estimates",
+    "field",
     "figure",
     "history",
     "interval_95",
     "labelled",
     "loops",
+    "measured_and_predicted",
     "overview",
     "profiles",
+    "residuals",
     "scored_from",
     "sensor_places",
     "time_scale",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from livepde.plots.dataset import (
     time_text,
     time_values,
 )
-from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, time_axis
+from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, panel, time_axis
 from livepde.records import refused_readings, used_errors
 
 if TYPE_CHECKING:
@@ -32,7 +32,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["curves", "overview"]
+__all__ = [
+    "RunPlots",
+    "corner",
+    "curves",
+    "estimates",
+    "field",
+    "measured_and_predicted",
+    "overview",
+    "residuals",
+]
 
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
 RESIDUALS = (  # variable, its dimension, title of its panel
@@ -67,9 +76,9 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     rows = math.ceil(len(panels) / columns)
     drawn = empty(rows, columns, title)
     grid = drawn.add_gridspec(rows, columns)
-    for k, panel in enumerate(panels):
+    for k, draw in enumerate(panels):
         alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
-        panel(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
+        draw(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
     return drawn
 
 
@@ -87,29 +96,234 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
         Title above all panels.
     """
     figure_class()
-    errors = [data[name].transpose("time", of).values for name, of, _ in RESIDUALS if name in data]
-    times = data["time"].values
-    rows = np.searchsorted(times, t).clip(max=len(times) - 1)
-    known = times[rows] == t
-    expected = measured[known] - np.concatenate(errors, axis=1)[rows[known]]
-    names = [str(name) for _, of, _ in RESIDUALS if of in data for name in data[of].values]
+    names = _sensor_names(data)
     units = _units_of(data, names)
     each = list(dict.fromkeys(units.values()))
     drawn = empty(len(each), 1, title)
     grid = drawn.add_gridspec(len(each), 1)
     for k, unit in enumerate(each):
-        ax = drawn.add_subplot(grid[k, 0])
-        shown = [i for i, name in enumerate(names) if units[name] == unit]
-        for n, i in enumerate(shown[:MOST_LINES]):
-            colour = PALETTE[n % len(PALETTE)]
-            at = time_values(data, t)
-            ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
-            ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, label=names[i])
-        time_axis(ax, data)
-        ax.set_ylabel(labelled("", unit).strip())
-        ax.set_title("measured (points) and expected one step ahead (lines)")
-        finish(ax)
+        shown = [name for name in names if units[name] == unit]
+        measured_and_predicted(data, t, measured, sensors=shown, ax=drawn.add_subplot(grid[k, 0]))
     return drawn
+
+
+def measured_and_predicted(
+    data: xr.Dataset,
+    t: Array,
+    measured: Array,
+    *,
+    sensors: Sequence[str] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw readings of sensors with one unit, and what the model predicted of them.
+
+    Parameters
+    ----------
+    data, t, measured
+        As for `curves`.
+    sensors
+        Names of the sensors, of which the first seven are drawn; default all.
+    ax
+        Where to draw; default a new figure.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such sensor, or the sensors have several units.
+    """
+    ax, names = panel(ax), _sensor_names(data)
+    shown = names if sensors is None else list(sensors)
+    if unknown := [name for name in shown if name not in names]:
+        raise ConfigurationError(f"there is no sensor '{unknown[0]}'; there are {names}.")
+    units = _units_of(data, names)
+    several = list(dict.fromkeys(units[name] for name in shown))
+    if len(several) > 1:
+        raise ConfigurationError(
+            f"the sensors have several units, {several}: draw those of one unit, as in sensors="
+            f"{[name for name in shown if units[name] == several[0]]}."
+        )
+    errors = [data[name].transpose("time", of).values for name, of, _ in RESIDUALS if name in data]
+    times = data["time"].values
+    rows = np.searchsorted(times, t).clip(max=len(times) - 1)
+    known = times[rows] == t
+    expected = measured[known] - np.concatenate(errors, axis=1)[rows[known]]
+    at = time_values(data, t)
+    for n, name in enumerate(shown[:MOST_LINES]):
+        i, colour = names.index(name), PALETTE[n % len(PALETTE)]
+        ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
+        ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, label=name)
+    time_axis(ax, data)
+    ax.set_ylabel(labelled("", "".join(several)).strip())
+    ax.set_title("measured (points) and expected one step ahead (lines)")
+    return finish(ax)
+
+
+def estimates(data: xr.Dataset, name: str | None = None, *, ax: Axes | None = None) -> Axes:
+    """Draw an unknown number over time with its 95 % band, and all its regions.
+
+    Parameters
+    ----------
+    data
+        Dataset as returned by `Result.to_xarray()`.
+    name
+        The unknown; it may be left out if there is only one.
+    ax
+        Where to draw; default a new figure.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such unknown number, or several and no name is given.
+    """
+    known = groups(data)
+    if name is None and len(known) == 1:
+        (name,) = known
+    if name is None or name not in known:
+        what = "name one of the unknown numbers" if name is None else f"there is no number '{name}'"
+        raise ConfigurationError(f"plots: {what}: {list(known)}.")
+    return _scalar_panel(data, name, known[name], panel(ax))
+
+
+def residuals(data: xr.Dataset, *, withheld: bool = False, ax: Axes | None = None) -> Axes:
+    """Draw measured minus predicted readings of the assimilated sensors.
+
+    Parameters
+    ----------
+    data
+        Dataset as returned by `Result.to_xarray()`.
+    withheld
+        Draw those of the withheld sensors instead.
+    ax
+        Where to draw; default a new figure.
+
+    Raises
+    ------
+    ConfigurationError
+        The run has no withheld sensors.
+    """
+    variable, dimension, what = RESIDUALS[withheld]
+    if variable not in data:
+        raise ConfigurationError("plots: the run has no withheld sensors.")
+    return _residual_panel(data, variable, dimension, what, panel(ax))
+
+
+def field(data: xr.Dataset, name: str, *, std: bool = False, ax: Axes | None = None) -> Axes:
+    """Draw an unknown field or the state: its last values on a plane, else over time.
+
+    Parameters
+    ----------
+    data
+        Dataset as returned by `Result.to_xarray()`.
+    name
+        The field.
+    std
+        Draw its standard deviation, on a plane, with the places of the sensors.
+    ax
+        Where to draw; default a new figure.
+
+    Raises
+    ------
+    ConfigurationError
+        There is no such field, or no map of a standard deviation.
+    """
+    known = [*field_names(data), *str(data.attrs.get("state", "")).split()]
+    if name not in known:
+        raise ConfigurationError(f"plots: there is no field '{name}'; there are {known}.")
+    panels = _field_panels(data, name, 5)
+    if std and len(panels) < 2:
+        raise ConfigurationError(
+            f"plots: no map of the standard deviation of '{name}': leave out std."
+        )
+    return panels[std](panel(ax))
+
+
+def corner(draws: xr.Dataset, names: Sequence[str] | None = None, *, axes: Any = None) -> Any:
+    """Draw the numbers among draws against each other, with their histograms on the diagonal.
+
+    Parameters
+    ----------
+    draws
+        Dataset as returned by `Result.sample()`.
+    names
+        Numbers to draw; default all.
+    axes
+        Matrix of axes to draw on, shape (numbers, numbers); default those of a new figure.
+
+    Returns
+    -------
+    axes
+        The matrix of axes; those above the diagonal are hidden.
+    """
+    numbers = [str(name) for name in draws.data_vars if draws[name].dims == ("draw",)]
+    shown = numbers if names is None else list(names)
+    if unknown := [name for name in shown if name not in numbers]:
+        raise ConfigurationError(f"plots: there is no number '{unknown[0]}'; there are {numbers}.")
+    if not shown:
+        raise ConfigurationError("plots: there is no unknown number to draw.")
+    size = len(shown)
+    if axes is None:
+        axes = empty(size, size, "").subplots(size, size, squeeze=False)
+    for i, of in enumerate(shown):
+        for k, against in enumerate(shown):
+            ax: Axes = axes[i][k]
+            if k > i:
+                ax.set_visible(False)
+            elif k == i:
+                ax.hist(draws[of].values, bins=40, color=PALETTE[0], alpha=0.7)
+            else:
+                x, y = draws[against].values, draws[of].values
+                ax.plot(x, y, ".", color=PALETTE[0], markersize=2, alpha=0.3)
+            if i == size - 1:
+                ax.set_xlabel(labelled(against, str(draws[against].attrs.get("units", ""))))
+            if k == 0 and i:
+                ax.set_ylabel(labelled(of, str(draws[of].attrs.get("units", ""))))
+    return axes
+
+
+class RunPlots:
+    """Figures of a result by name: `result.plot.estimates("alpha")`.
+
+    Each draws on `ax`, or on a new figure, and returns the axes. A call, `result.plot()`, draws
+    all of a run and returns the figure.
+    """
+
+    def __init__(self, result: Any) -> None:
+        self._result = result
+
+    def __call__(self, **options: Any) -> Figure:
+        """Draw all of the run: see `livepde.plots.overview`."""
+        return overview(self._result.dataset(), **options)
+
+    def measured_and_predicted(
+        self, *, sensors: Sequence[str] | None = None, ax: Axes | None = None
+    ) -> Axes:
+        """Draw the readings of sensors with one unit, and what the model predicted of them."""
+        data, measured = self._result.dataset(), self._result.measured
+        t = data["time"].values
+        return measured_and_predicted(data, t, measured.to_numpy(), sensors=sensors, ax=ax)
+
+    def estimates(self, name: str | None = None, *, ax: Axes | None = None) -> Axes:
+        """Draw an unknown number over time with its 95 % band."""
+        return estimates(self._result.dataset(), name, ax=ax)
+
+    def residuals(self, *, withheld: bool = False, ax: Axes | None = None) -> Axes:
+        """Draw measured minus predicted readings."""
+        return residuals(self._result.dataset(), withheld=withheld, ax=ax)
+
+    def field(self, name: str, *, std: bool = False, ax: Axes | None = None) -> Axes:
+        """Draw an unknown field or the state."""
+        return field(self._result.dataset(), name, std=std, ax=ax)
+
+    def corner(
+        self, names: Sequence[str] | None = None, *, n: int = 2000, seed: int = 0, axes: Any = None
+    ) -> Any:
+        """Draw `n` draws of the numbers against each other; returns the matrix of axes."""
+        return corner(self._result.sample(n, seed), names, axes=axes)
+
+
+def _sensor_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the assimilated and then of the withheld sensors."""
+    return [str(name) for _, of, _ in RESIDUALS if of in data for name in data[of].values]
 
 
 def _units_of(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:

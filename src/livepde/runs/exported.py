@@ -1,4 +1,4 @@
-"""A run in the formats of other programs: netCDF, Zarr, CSV, XDMF and VTK.
+"""A run in the formats of other programs: netCDF, Zarr, CSV, Parquet, XDMF and VTK.
 
 A run's dataset has the names and units of the model. An exported one follows the CF conventions
 (units that UDUNITS reads, times with their date, ancillary variables) and UGRID for the mesh.
@@ -140,7 +140,17 @@ def _zarr(run: Run, path: Path, at: float | None) -> None:
 
 
 def _csv(run: Run, path: Path, at: float | None) -> None:
-    """Write all variables over time as CSV, one row for each sample, with units in the header."""
+    """Write all variables over time as CSV."""
+    _over_time(run).to_csv(path, index=False)
+
+
+def _parquet(run: Run, path: Path, at: float | None) -> None:
+    """Write all variables over time as Parquet."""
+    _over_time(run).to_parquet(path, index=False)
+
+
+def _over_time(run: Run) -> pd.DataFrame:
+    """Return all variables over time, one row for each sample, with units in the names."""
     data = bounded(run.dataset)
     times = data["time"].values
     columns: dict[str, Any] = {}
@@ -157,10 +167,10 @@ def _csv(run: Run, path: Path, at: float | None) -> None:
             columns[name] = np.array(STATUS_CODES)[variable.values]
         elif variable.dims == ("time",):
             columns[f"{name}{end}"] = variable.values
-        elif variable.dims[:1] == ("time",):
+        elif variable.dims[:1] == ("time",) and variable.ndim == 2:
             for k, label in enumerate(variable[variable.dims[1]].values):
                 columns[f"{name}:{label}{end}"] = variable.values[:, k]
-    pd.DataFrame(columns).to_csv(path, index=False)
+    return pd.DataFrame(columns)
 
 
 def _series(run: Run, path: Path, at: float | None) -> None:
@@ -220,9 +230,16 @@ FORMATS: dict[str, Writer] = {
     ".nc": _netcdf,
     ".zarr": _zarr,
     ".csv": _csv,
+    ".parquet": _parquet,
     ".xdmf": _series,
     ".vtu": _vtk,
     ".vtk": _vtk,
 }
-NEEDS = {".zarr": ["zarr"], ".xdmf": ["meshio", "h5py"], ".vtu": ["meshio"], ".vtk": ["meshio"]}
+NEEDS = {
+    ".parquet": ["pyarrow"],
+    ".zarr": ["zarr"],
+    ".xdmf": ["meshio", "h5py"],
+    ".vtu": ["meshio"],
+    ".vtk": ["meshio"],
+}
 AT_ONE_TIME = (".vtu", ".vtk")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +11,10 @@ import numpy as np
 
 from livepde.dates import when
 from livepde.diagnostics.identifiability import TRADED, InformationGain
+from livepde.frames import estimates, model_errors, relative_error
 from livepde.plots.dataset import (
     NORMAL_95,
     field_names,
-    interval_95,
     modes_told,
     note,
     prior_left,
@@ -25,7 +24,6 @@ from livepde.records import refused_readings, used_errors
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 from livepde.runs.thermal_resistance import resistance
-from livepde.verdict import ModelErrors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -182,35 +180,11 @@ def jumps(data: xr.Dataset) -> list[Jump]:
     return found
 
 
-def _interval(data: xr.Dataset, label: str) -> str:
-    """Return the last 95 % interval as text, to the second digit of the standard deviation."""
-    std = float(data[f"{label}_std"][-1])
-    if not math.isfinite(std):
+def _interval(low: float, high: float, std: float) -> str:
+    """Return an interval as text, to the second digit of the standard deviation; "–" without."""
+    if not math.isfinite(std) or math.isnan(low):
         return "–"
-    low, high = (digits(float(end[-1]), std)[0] for end in interval_95(data, label))
-    return f"{low} to {high}"
-
-
-def _errors(data: xr.Dataset) -> ModelErrors | None:
-    """Return misfit and effects that the verdict of a run has stated; None without."""
-    stored = data.attrs.get("verdict")
-    return ModelErrors.from_dict(json.loads(stored).get("errors")) if stored else None
-
-
-def _allowed(errors: ModelErrors, data: xr.Dataset, label: str) -> str:
-    """Return the interval that allows for errors of the model as text."""
-    known = {one.label: one for one in errors.unknowns}.get(label)
-    if known is None:
-        return "–"
-    std = float(data[f"{label}_std"][-1])
-    low, high = (digits(end, std)[0] for end in (known.low, known.high))
-    return f"{low} to {high}"
-
-
-def _error(data: xr.Dataset, label: str) -> float:
-    """Return the relative error of the last estimate to the reference, NaN without one."""
-    reference = float(data[label].attrs.get("reference", math.nan))
-    return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
+    return f"{digits(low, std)[0]} to {digits(high, std)[0]}"
 
 
 def _deviations(data: xr.Dataset, label: str) -> float:
@@ -235,7 +209,7 @@ def measures(data: xr.Dataset) -> dict[str, float]:
         found[label] = float(data[label][-1])
         found[f"{label}.std"] = float(data[f"{label}_std"][-1])
         if "reference" in data[label].attrs:
-            found[f"{label}.error"] = _error(data, label)
+            found[f"{label}.error"] = relative_error(data, label)
             found[f"{label}.deviations"] = _deviations(data, label)
     found |= _channel_measures(data)
     ratios = note(data, "innovation_ratio")
@@ -290,25 +264,23 @@ def tables(data: xr.Dataset) -> list[Table]:
 
 def _estimates(data: xr.Dataset, labels: Sequence[str]) -> Table:
     """Return the table of the last estimates, with references where any is given."""
-    compared = any("reference" in data[label].attrs for label in labels)
-    errors = _errors(data)
+    errors, known = model_errors(data), estimates(data)
     differ = errors is not None and errors.differ
     rows: list[tuple[Any, ...]] = []
-    for label in labels:
-        attrs, std = data[label].attrs, float(data[f"{label}_std"][-1])
-        value, deviation = digits(float(data[label][-1]), std)
-        allowed = [_allowed(errors, data, label)] if errors is not None and differ else []
-        spread = [] if differ else [deviation]
-        cells = (value, *allowed, *spread, _interval(data, label))
-        rows.append((label, *cells, attrs.get("units", "")))
-        if compared:
-            reference = shown(float(attrs.get("reference", math.nan)), ".5g")
-            rows[-1] += (reference, shown(100 * _error(data, label), ".2g", " %"))
-    # The wider interval comes first. The plain one tells the standard deviation, too.
-    more = ["with model errors"] if differ else ["± std. dev."]
-    columns = ("unknown", "value", *more, "95 %", "unit")
+    for label, row in known.iterrows():
+        value, deviation = digits(row["value"], row["std"])
+        plain, allowed = (
+            _interval(row[f"{kind}low"], row[f"{kind}high"], row["std"]) for kind in ("", "model_")
+        )
+        # The wider interval comes first. The plain one tells the standard deviation, too.
+        cells = (value, allowed if differ else deviation, plain)
+        rows.append((label, *cells, row["unit"]))
+        if "reference" in row:
+            error = shown(100 * row["error"], ".2g", " %")
+            rows[-1] += (shown(row["reference"], ".5g"), error)
+    columns = ("unknown", "value", "with model errors" if differ else "± std. dev.", "95 %", "unit")
     title = f"Estimates{_first_order(data, labels)}"
-    if not compared:
+    if "reference" not in known:
         return Table(title, columns, rows)
     source = str(data.attrs.get("reference_source", ""))
     title = f"{title}; reference: {source}" if source else title
@@ -362,7 +334,7 @@ def _channels(data: xr.Dataset) -> Table:
     """Return the table of one-step errors of each channel, with the readings that were refused."""
     channels = _grouped(channel_errors(data))
     refuses = any(item.refused for item in channels.values())
-    errors = _errors(data)
+    errors = model_errors(data)
     fits = {} if errors is None else errors.sensors
     fitted = [name for name in channels if name in fits]
     units = {

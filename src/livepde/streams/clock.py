@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from livepde.errors import SampleError
 from livepde.linalg import Array
 
 __all__ = [
+    "CALLED_TIME",
     "COMMA",
     "NO_POINT",
     "POINT",
@@ -25,13 +27,12 @@ __all__ = [
     "has_decimal_comma",
     "is_naive",
     "number_of",
-    "origin_at",
     "read_times",
-    "since_1970",
     "with_second_passes",
 ]
 
 Instant: TypeAlias = float | str | date | datetime
+CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
 COMMA = "if that is a decimal comma, say decimal = ','."
 NO_POINT = "with decimal = ',' a point is none of decimals."
 FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
@@ -284,16 +285,6 @@ def guessed_format(text: str) -> str:
         warnings.simplefilter("ignore")  # it says which comes first, day or month: so do we
         # With points the day comes first, as in 01.04.2025.
         return guess_datetime_format(text.strip(), dayfirst="." in text[:5]) or ""
-
-
-def origin_at(stamp: float) -> datetime:
-    """Return the date of seconds since 1970 as origins are kept: in UTC, without a zone."""
-    return datetime.fromtimestamp(stamp, UTC).replace(tzinfo=None)
-
-
-def since_1970(origin: datetime) -> float:
-    """Return the seconds since 1970 of a date in UTC without a zone, as of `origin_at`."""
-    return origin.replace(tzinfo=UTC).timestamp()
 
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:

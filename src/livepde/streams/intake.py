@@ -15,10 +15,11 @@ from datetime import datetime
 from itertools import chain, pairwise
 from typing import Any, Literal, Protocol, TypeAlias
 
+from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError, SampleError
 from livepde.stepping import Between
 from livepde.streams.channel_times import FAR, ChannelTimes, present, usual_of
-from livepde.streams.clock import Clock, is_naive, origin_at, since_1970
+from livepde.streams.clock import Clock, is_naive
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError
 from livepde.linalg import Array
 from livepde.stepping import Between
-from livepde.streams.clock import origin_at, since_1970
 from livepde.streams.table import DataTable
 
 __all__ = ["join_tables", "not_late"]

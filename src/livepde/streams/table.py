@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from livepde.dates import origin_at
 from livepde.errors import DataError, SampleError, TimeOrderError
-from livepde.identifier import Sample
 from livepde.linalg import Array, IntArray, Mask
+from livepde.samples import Sample
 from livepde.stepping import Between
 from livepde.streams.clock import (
     COMMA,
@@ -26,7 +27,6 @@ from livepde.streams.clock import (
     has_decimal_comma,
     is_naive,
     number_of,
-    origin_at,
     read_times,
     with_second_passes,
 )

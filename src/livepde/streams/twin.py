@@ -17,11 +17,11 @@ import scipy.sparse as sp
 
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
-from livepde.identifier import Sample
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.result import Estimate
+from livepde.samples import Sample
 from livepde.stepping import Advance, Alexander2, Scheme, StepFailed, simulate
 
 __all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Truth", "Twin"]

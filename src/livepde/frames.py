@@ -1,0 +1,195 @@
+"""Results of a run as tables of pandas, as a dataset with axes, and as draws."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from livepde.dates import instants
+from livepde.errors import LawError
+from livepde.fem import FunctionSpace
+from livepde.laws import Belief
+from livepde.linalg import Array
+from livepde.records import DATE, ESTIMATES, PARAMETER, STATISTIC, STATUS_CODES
+from livepde.verdict import ModelErrors
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+__all__ = [
+    "covariance_of",
+    "draws",
+    "estimates",
+    "frame",
+    "model_errors",
+    "over_time",
+    "prior_draws",
+    "relative_error",
+    "times",
+    "with_estimates",
+]
+
+STATISTICS = ("value", "std", "low", "high")
+ERRORS = (("innovation", "sensor"), ("withheld_error", "withheld"))
+
+
+def model_errors(data: xr.Dataset) -> ModelErrors | None:
+    """Return misfit and effects that the verdict of a run has stated; None without."""
+    stored = data.attrs.get("verdict")
+    return ModelErrors.from_dict(json.loads(stored).get("errors")) if stored else None
+
+
+def relative_error(data: xr.Dataset, label: str) -> float:
+    """Return the relative error of the last estimate to the reference, NaN without one."""
+    reference = float(data[label].attrs.get("reference", math.nan))
+    return abs(float(data[label][-1]) - reference) / abs(reference) if reference else math.nan
+
+
+def estimates(data: xr.Dataset) -> pd.DataFrame:
+    """Return the last estimates of the numbers of a run, one row for each: see `Result.summary`."""
+    import pandas as pd
+
+    from livepde.plots.dataset import interval_95, scalars  # with the figures, which load later
+
+    errors = model_errors(data)
+    verdict = json.loads(data.attrs["verdict"]) if "verdict" in data.attrs else {}
+    allowed = {} if errors is None else {one.label: one for one in errors.unknowns}
+    labels, rows = scalars(data) if data.sizes["time"] else [], []
+    for label in labels:
+        ends = interval_95(data, label)
+        values = (data[label][-1], data[f"{label}_std"][-1], *(end[-1] for end in ends))
+        row: dict[str, Any] = dict(zip(STATISTICS, map(float, values), strict=True))
+        one = allowed.get(label)
+        row["model_low"] = math.nan if one is None else one.low
+        row["model_high"] = math.nan if one is None else one.high
+        row["effect"] = math.nan if one is None else one.effect
+        row |= {"unit": data[label].attrs.get("units", ""), "level": verdict.get("level", "")}
+        if any("reference" in data[name].attrs for name in labels):
+            row["reference"] = float(data[label].attrs.get("reference", math.nan))
+            row["error"] = relative_error(data, label)
+        rows.append(row)
+    columns = [*STATISTICS, "model_low", "model_high", "effect", "unit", "level"]
+    found = pd.DataFrame(rows, pd.Index(labels, name="unknown"), None if rows else columns)
+    if errors is not None:
+        found.attrs["misfit"] = errors.misfit
+    return found
+
+
+def times(data: xr.Dataset) -> pd.Index[Any]:
+    """Return the times of a run for an index: dates where it has them."""
+    import pandas as pd
+
+    dates = instants(data, data["time"].values)
+    index: pd.Index[Any] = pd.Index(data["time"].values if dates is None else dates, name="time")
+    return index
+
+
+def frame(data: xr.Dataset) -> pd.DataFrame:
+    """Return numbers over time, one row for each sample: see `Result.to_dataframe`."""
+    import pandas as pd
+
+    from livepde.plots.dataset import interval_95, scalars
+
+    columns: dict[str, Array] = {}
+    for label in scalars(data):
+        low, high = interval_95(data, label)
+        columns |= {label: data[label].values, f"{label}_std": data[f"{label}_std"].values}
+        columns |= {f"{label}_low": low, f"{label}_high": high}
+    for variable, dimension in ERRORS:
+        for name, values in over_time(data, variable, dimension).items():
+            columns[f"{variable}:{name}"] = values
+    columns["status"] = np.array(STATUS_CODES)[data["status"].values]
+    return pd.DataFrame(columns, times(data))
+
+
+def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Array]:
+    """Return the values of each channel of a variable; none if the run has no such variable."""
+    if variable not in data:
+        return {}
+    columns = data[variable].transpose(dimension, "time").values
+    return dict(zip(map(str, data[dimension].values), columns, strict=True))
+
+
+def with_estimates(data: xr.Dataset) -> xr.Dataset:
+    """Return the dataset of a run with dates, and with its numbers on axes of their own."""
+    from livepde.plots.dataset import field_names, interval_95, scalars
+
+    found: dict[str, Any] = {}
+    labels = scalars(data)
+    for name in [*labels, *field_names(data)]:
+        if f"{name}_std" in data and f"{name}_low" not in data:
+            sides = zip(("low", "high"), interval_95(data, name), strict=True)
+            about = data[f"{name}_std"]
+            found |= {f"{name}_{side}": (about.dims, x, about.attrs) for side, x in sides}
+    data = data.assign(found)
+    dates = instants(data, data["time"].values)
+    if dates is not None:
+        data = data.assign_coords({DATE: ("time", dates.tz_localize(None))})
+    if not labels:
+        return data
+    ends = ("", "_std", "_low", "_high")  # as STATISTICS
+    columns = [[data[f"{label}{end}"].values for end in ends] for label in labels]
+    values = np.array(columns).transpose(2, 0, 1)
+    units = [str(data[label].attrs.get("units", "")) for label in labels]
+    return data.assign({ESTIMATES: (("time", PARAMETER, STATISTIC), values)}).assign_coords(
+        {
+            PARAMETER: (PARAMETER, labels),
+            STATISTIC: (STATISTIC, list(STATISTICS)),
+            f"{PARAMETER}_unit": (PARAMETER, units),
+        }
+    )
+
+
+def covariance_of(belief: Belief, space: FunctionSpace) -> pd.DataFrame:
+    """Return the covariance of the numbers among the unknowns, by label."""
+    import pandas as pd
+
+    rows = list(space.labels.values())
+    factor = _factor(belief)[rows]
+    rest = np.zeros(len(rows)) if belief.rest is None else belief.rest[rows]
+    names = pd.Index(list(space.labels), name="unknown")
+    return pd.DataFrame(factor @ factor.T + np.diag(rest**2), names, names)
+
+
+def draws(
+    belief: Belief, space: FunctionSpace, n: int, seed: int | np.random.Generator | None
+) -> tuple[Array, Array]:
+    """Return draws of the coefficients of parameter and state, shapes (n, m) and (n, state).
+
+    Jointly normal in latent values, with what the law leaves out; the state to first order.
+    """
+    factor, rng = _factor(belief), np.random.default_rng(seed)
+    xi = rng.standard_normal((n, factor.shape[1]))
+    shift = xi @ factor.T
+    if belief.rest is not None:
+        shift += belief.rest * rng.standard_normal(shift.shape)
+    q = np.empty_like(shift)
+    for name, unknown in space.unknowns.items():
+        part = space.part(name)
+        moved = unknown.prior.transform.shifted(belief.q[part], shift[:, part], 1.0)
+        q[:, part] = np.clip(moved, *unknown.prior.bounds)
+    u_factor = belief.u_factor
+    return q, belief.u + (0.0 if u_factor is None else xi @ u_factor.T)
+
+
+def prior_draws(
+    space: FunctionSpace, n: int, seed: int | np.random.Generator | None
+) -> dict[str, Array]:
+    """Return draws of the numbers among the unknowns from their priors, each of shape (n,)."""
+    rng, found = np.random.default_rng(seed), {}
+    for label in space.labels:
+        prior = space.unknown_of(label).prior
+        latent = prior.latent_mean + prior.latent_std * rng.standard_normal(n)
+        found[label] = np.clip(prior.transform.value(latent), *prior.bounds)
+    return found
+
+
+def _factor(belief: Belief) -> Array:
+    """Return the square root of the covariance of the unknowns."""
+    if belief.q_factor is None:
+        raise LawError("this law has no covariance: use SensitivityLaw.")
+    return belief.q_factor

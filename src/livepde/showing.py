@@ -1,0 +1,110 @@
+"""Objects as text for a terminal, and as HTML for a notebook."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import html
+import inspect
+import textwrap
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+__all__ = ["Shown", "expression", "listed", "options_of"]
+
+MOST = 8  # names in a line
+LONG = 200  # characters of an expression
+
+
+class Shown(ABC):
+    """An object whose `repr`, and whose HTML in a notebook, is a title with named rows."""
+
+    @abstractmethod
+    def _shown(self) -> tuple[str, Mapping[str, str]]:
+        """Return the title, and name -> text of each row."""
+
+    def __repr__(self) -> str:
+        """Return the title, and a line for each row."""
+        title, rows = self._shown()
+        return "\n".join([title, *(f"  {name}: {text}" for name, text in rows.items())])
+
+    def _repr_html_(self) -> str:
+        """Return the same as a table, which notebooks show."""
+        title, rows = self._shown()
+        cells = "".join(
+            f'<tr><th style="text-align:left">{html.escape(name)}</th>'
+            f'<td style="text-align:left">{html.escape(text)}</td></tr>'
+            for name, text in rows.items()
+        )
+        return f"<b>{html.escape(title)}</b><table>{cells}</table>"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Return names in one line, the first ones of many.
+
+    >>> listed("ab"), listed("abcdefghij")
+    ('a, b', 'a, b, c, d, e, f, g, h, ... (10)')
+    """
+    every = list(names)
+    more = f", ... ({len(every)})" if len(every) > MOST else ""
+    return ", ".join(every[:MOST]) + more
+
+
+def options_of(value: Any) -> str:
+    """Return a frozen configuration with those of its options that are not the defaults."""
+    said = []
+    for field in dataclasses.fields(value) if dataclasses.is_dataclass(value) else ():
+        usual = field.default
+        if field.default_factory is not dataclasses.MISSING:
+            usual = field.default_factory()
+        given = getattr(value, field.name)
+        if field.init and repr(given) != repr(usual):
+            said.append(f"{field.name}={given!r}")
+    return f"{type(value).__name__}({', '.join(said)})"
+
+
+def expression(function: Callable[..., Any]) -> str:
+    """Return what a function returns, as its source has it; else the name of the function.
+
+    >>> expression(len)
+    'len(...)'
+    """
+    name = f"{getattr(function, '__name__', type(function).__name__)}(...)"
+    code = getattr(function, "__code__", None)
+    if code is None:
+        return name
+    try:
+        source = textwrap.dedent(inspect.getsource(function))
+        found = list(_returned(source, list(code.co_varnames[: code.co_argcount])))
+    except (OSError, SyntaxError, TypeError):
+        return name
+    # Several functions with the same arguments in one statement cannot be told apart.
+    return found[0] if len(found) == 1 and len(found[0]) <= LONG else name
+
+
+def _returned(source: str, arguments: list[str]) -> Iterator[str]:
+    """Iterate over what the functions with these arguments in a piece of source return."""
+    for node in ast.walk(_parsed(source)):
+        if not isinstance(node, ast.Lambda | ast.FunctionDef):
+            continue
+        if [one.arg for one in node.args.args] != arguments:
+            continue
+        if isinstance(node, ast.Lambda):
+            yield ast.unparse(node.body)
+        elif isinstance(node.body[-1], ast.Return) and node.body[-1].value is not None:
+            whole = len([one for one in node.body if not _is_text(one)]) == 1
+            yield ast.unparse(node.body[-1].value) if whole else f"{node.name}(...)"
+
+
+def _is_text(node: ast.stmt) -> bool:
+    """Return whether a statement is a docstring."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+
+
+def _parsed(source: str) -> ast.AST:
+    """Return the syntax of a piece of source, which may be the arguments of a call."""
+    try:
+        return ast.parse(source)
+    except SyntaxError:  # a line of a call, such as `A=lambda ...,`
+        return ast.parse(f"_({source.rstrip().rstrip(',)')})")

@@ -1,0 +1,329 @@
+"""Measurements as users have them, for `Identifier.run`: a table, a dataset, or a file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from livepde.errors import ConfigurationError, DataError, SampleError, optional
+from livepde.linalg import Array
+from livepde.samples import is_dataset, is_frame, noise_channel
+from livepde.streams.clock import CALLED_TIME, Clock
+from livepde.streams.csvfile import how_written, read_csv
+from livepde.streams.parquet import read_parquet
+from livepde.streams.table import (
+    JSON_LINES,
+    Column,
+    DataTable,
+    check_columns,
+    decimal_marks,
+    hint,
+    no_file,
+    read_json_lines,
+    tabulated,
+)
+from livepde.units import conversion
+
+__all__ = ["Reading"]
+
+INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
+TEMPERATURE = re.compile(r"T\b")  # not a time, though `CALLED_TIME` has no regard for capitals
+
+
+def _is_time(name: str) -> bool:
+    """Return whether a column has the name of times."""
+    return bool(CALLED_TIME.match(name)) and not TEMPERATURE.match(name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How the channels of an identifier are read from a table.
+
+    Attributes
+    ----------
+    channels
+        Channels that need a column.
+    optional
+        Channels that are read if there is such a column: noise of readings, places.
+    unit
+        The model's unit of time; empty if it has none.
+    sensor_units
+        Sensor -> unit of its readings in the model.
+    time
+        The column of times. Default: the index of a table, the coordinate of a dataset, else the
+        one column that is called time, t, date or the like.
+    time_unit
+        Unit of times that are numbers, default that of the model.
+    columns
+        Channel -> its column, if that has another name.
+    units
+        Sensor -> unit of its column, default that of the model.
+    strict
+        Whether a column that is no channel is an error; else it is ignored.
+    """
+
+    channels: Sequence[str]
+    optional: Sequence[str]
+    unit: str
+    sensor_units: Mapping[str, str]
+    time: str | None = None
+    time_unit: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    strict: bool = False
+
+    def table(self, data: Any) -> DataTable:
+        """Return the samples.
+
+        Raises
+        ------
+        DataError
+            A column that is missing, unknown or holds text; times that do not increase; a file
+            that cannot be read.
+        ConfigurationError
+            Options that do not fit the identifier; dates for a model without a unit of time.
+        """
+        self._check()
+        if is_dataset(data):
+            table = self._dataset(data)
+        elif is_frame(data):
+            table = self._frame(data)
+        else:
+            table = self._file(Path(data))
+        if table.origin is not None:
+            self._need_unit("the times are dates")
+        return table
+
+    def _check(self) -> None:
+        """Refuse options that name no channel, and units of times that the model cannot have."""
+        known = [*self.channels, *self.optional]
+        for option, given in (("columns", self.columns), ("units", self.units)):
+            for name in given:
+                if name not in known:
+                    raise ConfigurationError(
+                        f"{option}: there is no channel '{name}'{hint(name, known)}"
+                    )
+        for name in self.units:
+            if not self.sensor_units.get(name):
+                raise ConfigurationError(
+                    f"units: the model has no unit for '{name}': name it where the sensors are "
+                    'defined, as in Points(..., unit="degC").'
+                )
+        if self.time_unit is not None:
+            self._need_unit("time_unit is given")
+
+    def _need_unit(self, why: str) -> None:
+        if not self.unit:
+            raise ConfigurationError(
+                f"{why}, and the model has no unit of time: name it, as in "
+                'Model(..., time_unit="s").'
+            )
+
+    def _clock(self, time: str, unit: str | None, **written: Any) -> Clock:
+        """Return how times are read; `unit`: of times that are numbers, if it is known."""
+        if not self.unit:
+            return Clock(time, **written)
+        factor, second = (
+            conversion(given, self.unit, "time_unit").factor for given in (unit or self.unit, "s")
+        )
+        return Clock(time, factor, second=second, **written)
+
+    def _columns(
+        self,
+        where: str,
+        time: str,
+        names: Sequence[str],
+        units: Mapping[str, str],
+        decimal: str = ".",
+    ) -> dict[str, Column]:
+        """Return the column of each channel that has one, all checked.
+
+        Parameters
+        ----------
+        names
+            Columns of the data.
+        units
+            Column -> its unit, of data that state one.
+        """
+        found = {}
+        for name in (*self.channels, *self.optional):
+            column = self.columns.get(name, name)
+            if column not in names:
+                if name in self.optional and name not in self.columns:
+                    continue
+                raise SampleError(
+                    f"{where}: there is no column '{column}'{hint(column, list(names))} If it has "
+                    f"another name, give columns={{'{name}': ...}}."
+                )
+            unit, own = self.units.get(name, units.get(column, "")), self.sensor_units.get(name)
+            rule = conversion(unit or own, own, f"units of '{name}'") if own else None
+            found[name] = Column((column,), decimal=decimal)
+            if rule is not None:
+                found[name] = replace(found[name], factor=rule.factor, offset=rule.offset)
+        for name in self.channels:  # of a reading that has its own
+            if (noise := noise_channel(name)) in found:
+                found[noise] = Column(found[noise].names, decimal=decimal, noise_of=name)
+        used = {time, *(column.names[0] for column in found.values())}
+        if self.strict and (more := [name for name in names if name not in used]):
+            raise SampleError(
+                f"{where}: column '{more[0]}' is no channel of this identifier, which has "
+                f"{list(self.channels)}: drop it, or leave out strict."
+            )
+        return found
+
+    def _time(self, where: str, names: Sequence[str]) -> str:
+        """Return the column of times."""
+        if self.time is not None:
+            check_columns(where, [self.time], list(names))
+            return self.time
+        taken = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
+        free = [name for name in names if name not in taken]
+        called = list(filter(_is_time, free))
+        if len(called) == 1:
+            return called[0]
+        if not called and INDEX in free:
+            return INDEX
+        if not called and names and names[0] == "":  # an index that pandas has written
+            return ""
+        what = f"{' and '.join(map(repr, called))} may be the column" if called else "no column is"
+        raise SampleError(
+            f"{where}: {what} {'of times' if called else 'called time'}; name it, as in "
+            f"time={(called or free or ['t'])[0]!r}."
+        )
+
+    def _frame(self, data: Any) -> DataTable:
+        """Return the samples of a pandas table."""
+        names = [str(name) for name in data.columns]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise SampleError(f"data: two columns are called '{twice[0]}'; rename one.")
+        series = {name: data.iloc[:, k] for k, name in enumerate(names)}
+        if self._uses_index(data.index, names):
+            return self._tabulated("index", data.index, series, {})
+        time = self._time("data", names)
+        return self._tabulated(time, series[time], series, {})
+
+    def _uses_index(self, index: Any, names: Sequence[str]) -> bool:
+        """Return whether the index of a pandas table has its times; it may only count the rows."""
+        if self.time is not None:
+            return False
+        counts = hasattr(index, "step") and index.name is None  # a RangeIndex
+        if not counts:
+            return True
+        if any(map(_is_time, names)):
+            return False
+        if self.time_unit is None:
+            raise SampleError(
+                "data: the index only counts the rows, and no column is called time: set the "
+                "times as index, name their column with time=, or give time_unit if one row is "
+                "one unit of time."
+            )
+        return True
+
+    def _dataset(self, data: Any) -> DataTable:
+        """Return the samples of an xarray dataset, whose variables may state their units."""
+        wanted = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
+        dims = {dim for name in data.data_vars if name in wanted for dim in data[name].dims}
+        if len(dims) > 1:
+            raise SampleError(
+                f"data: the channels have the dimensions {sorted(map(str, dims))}; expected one, "
+                "that of time: select along the others first."
+            )
+        names = [name for name in data.data_vars if set(data[name].dims) == dims]
+        series = {str(name): data[name].to_series() for name in names}
+        units = {str(name): str(data[name].attrs.get("units", "")) for name in names}
+        if not dims:
+            self._columns("data", "", list(map(str, data.data_vars)), {})  # names what is missing
+        time = self.time or str(*dims)
+        if time not in data.coords:
+            raise SampleError(f"data: there is no coordinate '{time}' with the times: assign it.")
+        units[time] = str(data[time].attrs.get("units", ""))
+        return self._tabulated(time, data[time].to_series(), series, units)
+
+    def _tabulated(
+        self, time: str, times: Any, series: Mapping[str, Any], units: Mapping[str, str]
+    ) -> DataTable:
+        """Return the samples in columns of pandas."""
+        unit = self.time_unit or units.get(time)
+        if times.dtype.kind == "m":
+            self._need_unit("the times are durations")
+            times, unit = np.asarray(times) / np.timedelta64(1, "s"), "s"
+        columns = self._columns("data", time, list(series), units)
+        needed = decimal_marks(columns)
+        values = {name: _numbers(name, series[name]) for name in needed}
+        return tabulated(times, values, columns, self._clock(time, unit), where="data")
+
+    def _file(self, path: Path) -> DataTable:
+        """Return the samples of a file, whose ending tells its format."""
+        where = str(path)
+        if path.suffix in JSON_LINES:
+            names = _first_keys(path)
+            time = self._time(where, names)
+            return read_json_lines(
+                path, self._columns(where, time, names, {}), self._clock(time, self.time_unit)
+            )
+        if path.suffix == ".parquet":
+            names = _parquet_names(path)
+            time = self._time(where, names)
+            return read_parquet(
+                path, self._columns(where, time, names, {}), self._clock(time, self.time_unit)
+            )
+        written = how_written(path)
+        time = self._time(where, written.header)
+        if len(written.time_formats) > 1:
+            raise SampleError(
+                f"{where}: the order of day, month and year in '{time}' cannot be known: read the "
+                "table with pandas.read_csv and a date_format, and give the table."
+            )
+        columns = self._columns(where, time, written.header, {}, written.decimal)
+        clock = self._clock(
+            time, self.time_unit, format=written.time_format, decimal=written.decimal
+        )
+        return read_csv(
+            path,
+            columns,
+            clock,
+            separator=written.separator,
+            encoding=written.encoding,
+            skip=written.skip,
+        )
+
+
+def _numbers(name: str, series: Any) -> Array:
+    """Return a column of pandas as numbers, NaN where one is missing."""
+    try:
+        found: Array = series.to_numpy(dtype=float, na_value=np.nan)
+    except (TypeError, ValueError):
+        raise SampleError(f"data: column '{name}' does not hold numbers only.") from None
+    return found
+
+
+def _first_keys(path: Path) -> list[str]:
+    """Return the keys of the first object in a file of JSON lines."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            first = json.loads(next((line for line in file if line.strip()), "{}"))
+    except FileNotFoundError:
+        raise no_file(path) from None
+    except (OSError, ValueError) as error:
+        raise SampleError(f"{path}, line 1: is not JSON ({error}).") from error
+    return list(first) if isinstance(first, dict) else []
+
+
+def _parquet_names(path: Path) -> list[str]:
+    """Return the names of the columns of a Parquet file."""
+    with optional("parquet", "Parquet files need pyarrow", DataError):
+        import pyarrow as pa
+        from pyarrow.parquet import read_schema
+    try:
+        return list(read_schema(path).names)
+    except FileNotFoundError:
+        raise no_file(path) from None
+    except (OSError, pa.ArrowException) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise DataError(f"{path} cannot be read as a Parquet file: {reason}.") from error
