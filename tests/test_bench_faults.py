@@ -100,6 +100,19 @@ def test_clocks_go_wrong_and_are_told():
 
 
 @pytest.mark.study
+def test_files_are_changed_and_lose_nothing():
+    assert not failed(faults.faults(only=["files"]))
+
+
+@pytest.mark.study
+@pytest.mark.process
+def test_runs_that_are_killed_every_few_seconds_make_progress(monkeypatch):
+    monkeypatch.setattr("benchmarks.faults.progress.STEPS", {"50 ms": (40, 60)})
+    monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
+    assert not failed(faults.faults(only=["progress"]))
+
+
+@pytest.mark.study
 def test_slow_visitors_keep_nobody_out(monkeypatch):
     monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
     monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test

@@ -632,7 +632,8 @@ class Live:
         return f"nothing has come from the source for more than {self.silence:g} s"
 
     def _refusing(self) -> str:
-        long = not self.busy and self._clock() - self._taken > self.silence
+        waits = not (self.busy or self.feed.done)
+        long = waits and self._clock() - self._taken > self.silence
         if not (long or self._refused >= REFUSED):
             return ""
         if not self._refused:
