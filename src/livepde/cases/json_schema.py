@@ -168,6 +168,8 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "noise": "Standard deviation of a reading, in the unit of the channel.",
         "noise_column": "Column with the standard deviation of each reading.",
         "unit": "Unit of the column; without it that of the model.",
+        "factor": "Number by which the values are multiplied, before the unit is converted.",
+        "late": "How much later than its values the times of the channel are.",
         "offset": "Standard deviation of an unknown offset, in the unit of the channel.",
         "gain": "Standard deviation of an unknown factor about 1.",
         "correlated": "An error of the sensor that fades.",
