@@ -55,7 +55,7 @@ def _lives(
 ) -> tuple[Found, list[int], float]:
     """Return what a run leaves behind, its new samples in each life, and its slowest exit."""
     plant, gains, slow = GrowingFile(folder, rod_rows(samples + 1), 0), list[int](), 0.0
-    plant.supply(samples)
+    plant.supply(samples)  # the last row may be without its end
     with closing(Run(folder, plant.source)) as run:
         case = folder / "case.toml"
         case.write_text(case.read_text().replace("[output]", text + "[output]"))
@@ -63,10 +63,10 @@ def _lives(
             before = run.estimated()
             run.start()
             until = time.monotonic() + life
-            while time.monotonic() < until and run.alive() and run.estimated() < samples:
+            while time.monotonic() < until and run.alive() and run.estimated() < samples - 1:
                 time.sleep(0.02)
             gains.append(run.estimated() - before)
-            if run.estimated() >= samples:
+            if run.estimated() >= samples - 1:
                 break
             begun = time.monotonic()
             run.signal(how)
