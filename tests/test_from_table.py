@@ -190,10 +190,7 @@ def test_days_and_times_of_day_in_two_columns(here, day, hour, form):
     filled |= {"unknowns.alpha.prior": "5e-5 m^2/s", "unknowns.alpha.std": "3e-5 m^2/s"}
     stream = cases.load("mine/case.toml", settings=filled).prepare().stream
     assert np.allclose(stream.t, [0.0, 600.0])
-    with pytest.raises(
-        lp.errors.CaseError, match="skip and a time in two columns belong to a file"
-    ):
-        cases.load("mine/case.toml", settings={**filled, "data.follow": True})
+    assert cases.load("mine/case.toml", settings={**filled, "data.follow": True}).spec.data.live
     with pytest.raises(
         lp.errors.CaseError, match="times in two columns are read from CSV files only"
     ):

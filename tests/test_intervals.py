@@ -42,7 +42,9 @@ def test_a_plain_number_has_value_and_deviations():
         (value - 1.959964 * std, value + 1.959964 * std)
     )
     assert estimate["a"].interval(0.6826895) == pytest.approx((value - std, value + std))
-    assert "a_low" not in data
+    # In a dataset the same variables as those of other priors.
+    assert float(data["a_low"][-1]) == pytest.approx(value - 1.959964 * std)
+    assert float(data["a_high"][-1]) == pytest.approx(value + 1.959964 * std)
 
 
 def test_a_logarithm_has_quantiles_of_a_log_normal_number():

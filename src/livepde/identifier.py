@@ -51,7 +51,7 @@ from livepde.records import Layout
 from livepde.result import Estimate, Result
 from livepde.samples import Readings, Sample, check_noise, is_tabular, number, numbers, sample_of
 from livepde.showing import Shown, listed, options_of
-from livepde.stepping import Advance, Between, End, Held, Interval, Scheme
+from livepde.stepping import MOST_SUBSTEPS, Advance, Between, End, Held, Interval, Scheme
 from livepde.units import conversion
 from livepde.verdict import InputLedger, Verdict, WithheldLedger
 
@@ -686,7 +686,7 @@ class Identifier(Shown):
         Raises
         ------
         SampleError
-            Another shape, text, infinity, or an unknown input.
+            Another shape, text, infinity, an unknown input, or too many substeps between two times.
         TimeOrderError
             Times that do not increase.
         MissingInputError
@@ -710,6 +710,12 @@ class Identifier(Shown):
             raise TimeOrderError(
                 f"forecast: times must increase from the last sample at t = {self._t!r} on; got "
                 f"{t.tolist()}."
+            )
+        far = np.diff(t, prepend=self._t)
+        if any(map(self.problem.control.stretches, far.tolist())):
+            raise SampleError(
+                f"forecast: two times are more than {MOST_SUBSTEPS} substeps of dt_max = "
+                f"{self.problem.control.dt_max:g} apart; give times in between, or a longer dt_max."
             )
         planned = self._channels.planned(inputs or {}, t.tolist(), self._t, self._known)
         state, last = self._state, self._last

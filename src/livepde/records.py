@@ -538,7 +538,7 @@ class Layout:
             )
         )
         data, coords, _ = blank._contents(rows, None)
-        found = {DATE, ESTIMATES, PARAMETER, STATISTIC}
+        found = {DATE, ESTIMATES, PARAMETER, f"{PARAMETER}_unit", STATISTIC}
         for name, (dimensions, *_) in {**data, **coords}.items():
             found |= {name, *([dimensions] if isinstance(dimensions, str) else dimensions)}
         return found
