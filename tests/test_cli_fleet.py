@@ -538,6 +538,7 @@ def test_what_is_finished_is_not_run_again(alike, monkeypatch):
     assert "other settings" in output
 
 
+@pytest.mark.long
 def test_says_why_members_are_run_separately(alike):
     Path("rods.csv").write_text(
         "name,data,initial,law.noise,law.refit\n"

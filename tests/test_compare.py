@@ -46,7 +46,7 @@ def biased(tmp_path, monkeypatch):
 # --- in a terminal ------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
     # The second is no case, the third leaves readings out, the fourth is refuted.
     given = [FREED, "far: channels.T_10.at='9 m'", "channels.T_10.role=ignored"]

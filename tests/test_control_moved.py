@@ -95,6 +95,7 @@ def test_what_is_handed_over_is_the_model_about_the_estimate():
     assert np.abs(found.K - model.K).max() > 0.1 * np.abs(model.K).max()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("using", ["LQ", MPC])
 def test_a_controller_acts_on_the_model_that_it_is_handed(using):
     """As one that was built for it would; and goes back to its own."""

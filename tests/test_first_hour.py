@@ -28,7 +28,7 @@ def test_the_page_shows_the_files(name: str) -> None:
     assert len(shown.splitlines()) <= limit
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("walk", WALKS)
 def test_the_tables_are_those_of_another_code(walk: str, tmp_path) -> None:
     write(tmp_path, walk, WRITTEN)

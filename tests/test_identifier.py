@@ -122,7 +122,7 @@ def test_withheld_channels_are_scored_and_never_used():
     assert second.withheld_error[0] - first.withheld_error[0] == pytest.approx(98.7)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_before_assimilation_begins_data_are_only_scored():
     ident = identifier(assimilate_from=0.25)
     first = ident.step(*sample(0.1))

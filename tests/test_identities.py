@@ -308,7 +308,7 @@ def close(one: lp.Estimate, other: lp.Estimate, size: float = 1.0, rtol: float =
 # --- identities -----------------------------------------------------------------------------------
 
 
-@drawn(5)
+@drawn(4)
 def test_a_run_that_is_restored_continues_to_the_bit(examples):
     def same(o: Options) -> None:
         taken, who, other = samples(o), identifier(o), identifier(o)
@@ -327,7 +327,7 @@ def test_a_run_that_is_restored_continues_to_the_bit(examples):
     check(options(), examples, same)
 
 
-@drawn(5)
+@drawn(4)
 def test_a_forecast_is_the_next_prediction(examples):
     def same(o: Options) -> None:
         who, taken, last, bounded = identifier(o), samples(o), {}, False
@@ -348,7 +348,7 @@ def test_a_forecast_is_the_next_prediction(examples):
     check(options(), examples, same)
 
 
-@drawn(5)
+@drawn(4)
 def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     def same(o: Options) -> None:
         assume(o.linear)
@@ -365,7 +365,7 @@ def test_the_last_smoothed_estimate_is_the_last_filtered_one(examples):
     check(options(multiplies=False, guards=False), examples, same)
 
 
-@drawn(5)
+@drawn(4)
 def test_a_member_of_a_fleet_is_a_single_identifier(examples):
     def same(o: Options) -> None:
         each = [samples(o, member=k) for k in range(2)]
@@ -397,7 +397,7 @@ FRAMES = {
 }
 
 
-@drawn(5)
+@drawn(4)
 @pytest.mark.parametrize("name", FRAMES)
 def test_order_units_and_origin_change_nothing(name, examples):
     frame = FRAMES[name]

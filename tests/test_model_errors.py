@@ -257,6 +257,7 @@ def test_a_model_that_lacks_a_term_ends_in_an_interval_that_holds(wrong):
     assert "interval" in first
 
 
+@pytest.mark.long
 def test_readings_that_no_model_explains_are_not_trusted():
     z = truth(1) + 0.3 * np.sin(9.0 * np.array(TIMES)[:, None] + np.array([0.0, 2.0, 4.0]))
     verdict = ended(z).verdict

@@ -263,6 +263,7 @@ def test_unknowns_that_move_are_not_fitted():
     assert last.fit is None
 
 
+@pytest.mark.long
 def test_a_reading_whose_place_is_missing_is_not_fitted():
     model = heat(lp.interval(0.0, 1.0, 12), lp.Normal(0.2, 0.1), {"left": 1.0, "right": 0.0})
     probe = lp.observation.Moving({"probe": "x_p"}, noise=0.01)

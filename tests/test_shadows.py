@@ -235,6 +235,7 @@ def test_where_nothing_is_wrong_intervals_grow_little() -> None:
     assert widened.diagnostics.shifts.largest < 2.0
 
 
+@pytest.mark.long
 def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
     """Two samples far apart on a mesh of two cells: whatever the shifts, the prior bounds them."""
     given = identifier(2, scheme=ImplicitEuler())
