@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
@@ -93,14 +95,22 @@ def nonlinear(problem: Problem, k: float) -> Array:
         return np.array([np.interp(t, fine, column) for column in g.T])
 
     def rate(t: float, y: Array) -> Array:
-        return system.A @ y + system.B @ driven(t) - 0.5 * y * np.abs(y)
+        return np.asarray(system.A @ y + system.B @ driven(t) - 0.5 * y * np.abs(y))
 
     def jacobian(t: float, y: Array) -> Array:
-        return system.A - np.diag(np.abs(y))
+        return np.asarray(system.A - np.diag(np.abs(y)))
 
-    times, options = problem.times, {"method": "Radau", "rtol": 1e-7, "atol": 1e-9}
-    start = np.zeros(len(system.A))
-    found = solve_ivp(rate, times[[0, -1]], start, t_eval=times, jac=jacobian, **options)
+    times, start = problem.times, np.zeros(len(system.A))
+    found: Any = solve_ivp(
+        rate,
+        (float(times[0]), float(times[-1])),
+        start,
+        method="Radau",
+        t_eval=times,
+        jac=jacobian,
+        rtol=1e-7,
+        atol=1e-9,
+    )
     if not found.success:
         raise RuntimeError(found.message)
     ends = np.array([driven(float(t)) for t in times])
