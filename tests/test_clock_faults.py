@@ -117,7 +117,7 @@ def test_a_block_that_comes_again_with_new_rows(tmp_path):
     same_run(run, given, tmp_path / "alone")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("wait", [0.0, 0.35])
 def test_each_row_twice(tmp_path, wait):
     """The second of each meets the sample while it is open, or when it is released."""

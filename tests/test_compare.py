@@ -206,6 +206,7 @@ def test_an_interval_that_is_not_known_refutes_nothing():
     json.dumps(content, allow_nan=False)
 
 
+@pytest.mark.long
 def test_readings_before_the_start_of_the_fit_do_not_count_as_evidence(biased):
     stated = run_variant(biased, (), Variant("as stated"))
     late = run_variant(biased, (), variant_of("data.assimilate_from='4 min'"))
@@ -213,6 +214,7 @@ def test_readings_before_the_start_of_the_fit_do_not_count_as_evidence(biased):
     assert math.isnan(late.gained(stated))
 
 
+@pytest.mark.long
 def test_the_unit_of_a_column_does_not_change_the_evidence(biased):
     stated = run_variant(biased, (), Variant("as stated"))
     table = pd.read_csv(biased.parent / "rod.csv")
@@ -282,6 +284,7 @@ def test_an_offset_takes_the_prior_that_other_sensors_state(tmp_path):
     assert found.setting == 'channels.T_30.offset="0.3 K"'
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("equation", ROD)
 def test_every_proposed_variant_is_a_case(tmp_path, equation):
     path = short_rod(tmp_path)

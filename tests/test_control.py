@@ -687,7 +687,7 @@ def test_what_is_learned_is_used_after_some_good_samples():
 # --- loop ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["LQ", pytest.param("MPC", marks=needs_mpc)])
 def test_a_loop_goes_on_where_it_was_saved(kind, tmp_path):
     def loop() -> ct.Loop:

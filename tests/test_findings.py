@@ -322,8 +322,27 @@ def test_every_finding_of_the_source_has_its_two_runs():
     assert issued() == set(RUNS)
 
 
+# Runs that take seconds each: before a release.
+LONG = {
+    "assess: misfit",
+    "assess: past",
+    "equation_tests: misfit",
+    "findings: bound",
+    "findings: effect",
+    "run_verdict: gain",
+    "run_verdict: guards",
+    "run_verdict: held",
+    "run_verdict: jump",
+    "run_verdict: misfit",
+    "run_verdict: pause",
+    "shifts: discretisation",
+    "verdict: step",
+}
+EACH = [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in RUNS]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_finding_appears_where_it_should_and_nowhere_else(name: str):
     kind = name.partition(": ")[2]
     assert kind in RUNS[name].appears()

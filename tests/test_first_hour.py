@@ -51,7 +51,7 @@ def test_the_truth_of_the_pumping_test_is_that_of_theis() -> None:
         np.testing.assert_allclose(drawdown[1:], exact, atol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tracer_pulse_is_found() -> None:
     outcome = first_hour(("column",), seeds=2)
     assert outcome.ok, outcome.checks

@@ -341,7 +341,7 @@ def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
 
 
 @pytest.mark.parametrize(("wait", "known"), [(0.0, False), (3 * SECONDS, True)])
-@pytest.mark.slow
+@pytest.mark.long
 def test_beside_a_process_the_wait_decides(tmp_path, wait, known):
     path = plant(tmp_path, wait=wait)
     u = 20.0 + 10.0 * np.sin(2.0 * np.pi * np.arange(COUNT) / COUNT)

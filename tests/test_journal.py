@@ -260,7 +260,7 @@ def test_no_step_begins_before_what_is_old_is_committed(tmp_path):
     assert [number for _, number in watched.acknowledged] == [*range(1, 31)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("error", [np.linalg.LinAlgError("no SVD"), TypeError("a defect")])
 def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
     tmp_path, monkeypatch, error

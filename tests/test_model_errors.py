@@ -306,6 +306,7 @@ def ended_with(z: Any, order: Any = None, scale: float = 1.0, **options: Any) ->
     return last
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("wrong", [(), (("source", 0.06),)])
 @pytest.mark.parametrize("gaps", [False, True])
 def test_order_and_units_of_the_readings_change_no_interval(wrong, gaps):

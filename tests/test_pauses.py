@@ -295,7 +295,7 @@ def few(gap: bool) -> list[tuple[float, dict[str, float]]]:
     return [row for k, row in enumerate(rows) if not (gap and 30 <= k < 38)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("uncertain", [{}, {"input_noise": {"hot": 0.1}}])
 def test_a_pause_of_one_member_is_none_of_another(uncertain: Any) -> None:
     """The samples of one member fail for eight rows: its next interval is a pause."""

@@ -152,7 +152,7 @@ def test_the_second_order_scheme_is_shifted_little() -> None:
     assert np.abs(actual / reference().q_std).max() < 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("cells", [5, 10])
 def test_predicts_the_shift_by_the_mesh(cells: int) -> None:
     estimate = ran(identifier(cells, dt_max=WIDTH / 8), samples())
@@ -197,7 +197,7 @@ def test_predicts_the_shift_by_input_lines() -> None:
     assert_predicts(shifts(estimate, "input"), actual, better.q_std, 0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("evolution", [None, lp.RandomWalk(0.01)])
 def test_no_number_of_the_filter_moves(evolution: Any) -> None:
     found = []

@@ -128,7 +128,7 @@ def test_the_smoother_weighs_each_reading_by_its_noise(names):
         assert float(data[f"{name}_std"][-1]) == pytest.approx(last.std, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_smoothed_is_the_least_squares_solution_over_all_times(name):
     law = Plain(rank=9, gate=np.inf, refit=None)

@@ -117,7 +117,7 @@ def test_the_bound_on_the_cost_is_said_where_it_bites() -> None:
 OTHERS = [pytest.param(stop, marks=pytest.mark.long) for stop in (9, 25)]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [6, *OTHERS])
 def test_a_run_that_is_resumed_takes_the_same_steps(stop: int) -> None:
     whole, first = identifier(), identifier()
