@@ -62,7 +62,6 @@ __all__ = ["Identifier", "Sample"]
 
 FORMAT = 12  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
-READING = {"time", "time_unit", "columns", "units", "strict"}  # options of `run` for tables
 
 
 class Identifier(Shown):
@@ -360,9 +359,13 @@ class Identifier(Shown):
             As of a `Sample`: an array in the order of the sensors, a mapping or a row of a pandas
             table by names.
 
-        A step that fails numerically changes nothing and says so in `status`; the next sample
-        tries again from the last good state. One with the status "departed" takes the sample and
-        holds the unknowns. Bad input raises and changes nothing.
+        Returns
+        -------
+        estimate
+            The estimate after the sample. A step that fails numerically changes nothing and says so
+            in its `status`; the next sample tries again from the last good state. One with the
+            status "departed" takes the sample and holds the unknowns. Bad input raises and changes
+            nothing.
 
         Raises
         ------
@@ -739,7 +742,11 @@ class Identifier(Shown):
         progress: bool = False,
         total: int | None = None,
         fields_every: int = 1,
-        **reading: Any,
+        time: str | None = None,
+        time_unit: str | None = None,
+        columns: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
+        strict: bool | None = None,
     ) -> Result:
         """Take every sample of a table, a file or a stream, and collect the estimates.
 
@@ -758,11 +765,10 @@ class Identifier(Shown):
             Number of samples, for the time left; default len(stream) if it has one.
         fields_every
             Keep the fields of every so many samples (scalars and innovations of all).
-        **reading
-            How a table or a file is read, by the names below.
         time
-            Column of the times. Default: the index of a table, the coordinate of a dataset, or
-            the one column that is called time, date or the like.
+            Column of the times; this and the options below are of tables and files. Default: the
+            index of a table, the coordinate of a dataset, or the one column that is called time,
+            date or the like.
         time_unit
             Unit of times that are numbers; default that of the model.
         columns
@@ -790,7 +796,10 @@ class Identifier(Shown):
         >>> len(rod.run(table))
         2
         """
-        stream = self._samples_of(stream, reading)
+        options: dict[str, Any] = {"time": time, "time_unit": time_unit, "columns": columns}
+        options |= {"units": units, "strict": strict}
+        given = {name: value for name, value in options.items() if value is not None}
+        stream = self._samples_of(stream, given)
         result = Result(
             self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
         )
@@ -812,8 +821,6 @@ class Identifier(Shown):
 
     def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
         """Return a stream as it is, and the samples of a table with times of the model."""
-        if unknown := sorted(reading.keys() - READING):
-            raise TypeError(f"run() got an unexpected keyword argument '{unknown[0]}'")
         if not is_tabular(data):
             if reading:
                 raise ConfigurationError(
