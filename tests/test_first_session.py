@@ -121,6 +121,7 @@ def edit(case: Path, edits: Mapping[str, str]) -> None:
     case.write_text("\n".join(lines) + "\n")
 
 
+@pytest.mark.long
 def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     home = shell.folder
 

@@ -207,9 +207,13 @@ def needs_data(page: Path) -> bool:
     return any("cases/" in one and not _stands_elsewhere(one) for one in commands)
 
 
-# Pages that take more than half a minute each run before a release.
-LONG = ("first-hour.md", "heat.md", "kdv.md", "advection_dispersion.md")
-RUN = [pytest.param(page, marks=pytest.mark.long if page.name in LONG else ()) for page in PAGES]
+def takes_long(page: Path) -> bool:
+    """Return whether a page runs before a release only: models, tutorials, and the like."""
+    deep = len(page.relative_to(ROOT).parts) > 2
+    return deep or page.name == "first-hour.md"
+
+
+RUN = [pytest.param(page, marks=pytest.mark.long if takes_long(page) else ()) for page in PAGES]
 
 
 @pytest.mark.pages
