@@ -86,6 +86,7 @@ def test_a_window_that_is_written_in_place_moves_on(path: Path) -> None:
     assert not kinds(found)
 
 
+@pytest.mark.long
 def test_a_window_that_is_written_all_the_time(path: Path) -> None:
     path.write_text(HEADER + lines(100, 200))
     over = threading.Event()
