@@ -86,7 +86,18 @@ def test_a_window_that_is_written_in_place_moves_on(path: Path) -> None:
     assert not kinds(found)
 
 
-@pytest.mark.long
+def test_a_window_that_moves_on_twice_before_it_is_read_is_reported(path: Path) -> None:
+    path.write_text(HEADER + lines(100, 200))
+    with closing(Follow(path, follow=True)) as source:
+        found = taken(source, 0.1)
+        path.write_text(HEADER + lines(150, 250))  # its first rows are those that were read
+        assert not source.poll(0.0)
+        path.write_text(HEADER + lines(300, 400))
+        found += taken(source, 0.3)
+    assert distinct(times(found)) == [*range(100, 200), *range(300, 400)]
+    assert kinds(found) == ["rewritten"]
+
+
 def test_a_window_that_is_written_all_the_time(path: Path) -> None:
     path.write_text(HEADER + lines(100, 200))
     over = threading.Event()

@@ -101,6 +101,8 @@ class _Content:
     hole: tuple[int, float] = (-1, 0.0)  # where NUL bytes were seen first, and when
     # Of a file that was written again: when it was seen first, last as it is, and how it was.
     restless: tuple[float, float, tuple[int, int]] | None = None
+    # Last line that was read before the file was written again, and the byte after it.
+    follows: tuple[bytes, int] | None = None
 
     @classmethod
     def open(cls, path: Path) -> _Content | None:
@@ -201,11 +203,27 @@ class _Content:
             # Nothing was read before, so nothing shows that.
             if not self.offset and self._written() != before:
                 break
+            if used and self.follows is not None:
+                found += self._missed(chunk, *self.follows)
+                self.follows = None
             self._advance(chunk[:used])
             found += lines
             if found or not used:
                 break
         return found
+
+    def _missed(self, chunk: bytes, last: bytes, offset: int) -> list[Line]:
+        """Return a report if rows may be missing between a file and what it was before.
+
+        Where the last line is still there, as in a window of rows that moves on, none is missing.
+        """
+        if not last or last in chunk:
+            return []
+        text = (
+            f"{self.path.name} was written again; rows that came and went after byte {offset} "
+            "between two looks cannot be known"
+        )
+        return [Line(self.number, 0, b"", "rewritten", text)]
 
     def _advance(self, used: bytes) -> None:
         self.offset += len(used)
@@ -395,17 +413,12 @@ class GrowingFile:
         moment = time.monotonic()
         if now.stat.st_size >= now.offset:  # it was not cut, so old rows may still be replaced
             again.restless = moment, moment, (0, 0)
+        again.follows = now.follows
+        if now.offset:
+            again.follows = now.tail[now.tail.rstrip(b"\n").rfind(b"\n") + 1 :], now.offset
         self._begin(again)
         now.close()
-        # A window of rows that moves on: where the last one is still there, none is missing.
-        last = now.tail[now.tail.rstrip(b"\n").rfind(b"\n") + 1 :]
-        if not now.offset or (last and last in again.at(0, CHUNK)):
-            return []
-        text = (
-            f"{now.path.name} was written again; rows that came and went after byte {now.offset} "
-            "between two looks cannot be known"
-        )
-        return [Line(again.number, 0, b"", "rewritten", text)]
+        return []
 
     def _copy_of(self, now: _Content) -> _Content | None:
         """Return the copy of a file that was made before it was emptied, where it was read to."""
