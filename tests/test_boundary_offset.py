@@ -21,7 +21,7 @@ def biased(folder):
     return path
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     path = biased(tmp_path)
     plain = run_variant(path, [], Variant("as stated"))
@@ -34,9 +34,8 @@ def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     assert alpha.low < 9.7e-5 < alpha.high
     assert found.gained(plain) > 100.0
     assert found.withheld_error < plain.withheld_error
-    # An error that these data would not show may stand behind a part of the offset.
     assert plain.level == "do not trust"
-    assert found.level in {"trusted", "caution"}
+    assert found.level == "trusted"  # the offset itself is less certain than alpha
 
 
 @pytest.mark.long

@@ -12,6 +12,7 @@ from factories import short_rod
 from livepde import cases
 from livepde.cases.remedies import with_settings
 from livepde.errors import CaseError
+from livepde.samples import noise_channel
 
 ROWS = 41
 
@@ -73,7 +74,7 @@ def test_a_factor_corrects_a_scale(tmp_path):
 def test_a_source_that_goes_on_has_no_late_columns(tmp_path):
     path = short_rod(tmp_path, ROWS)
     case = cases.load(path, settings={"channels.T_10.late": "5 s"})
-    with pytest.raises(CaseError, match=r"T_10\.late: late belongs to data that are complete"):
+    with pytest.raises(CaseError, match=r"T_10\.late: late requires complete data"):
         case.read(iter(['{"time": 0.0}']))
 
 
@@ -94,3 +95,57 @@ def test_the_cause_of_a_wrong_column_has_the_key_that_corrects_it(tmp_path, chan
     verdict = with_settings(prepared, prepared.identifier.run(prepared.stream).last.verdict)
     settings = [cause.setting for finding in verdict.findings for cause in finding.causes]
     assert any(setting.startswith(key) for setting in settings), verdict.sentences
+
+
+def test_the_noise_of_a_reading_has_its_time(tmp_path):
+    def noisy(table: pd.DataFrame) -> None:
+        table["s"] = 0.01 * (1.0 + np.arange(len(table)))
+        late_by("T_10", 3)(table)
+        late_by("s", 3)(table)
+
+    path = changed(tmp_path, noisy)
+    step = float(np.median(np.diff(pd.read_csv(path.parent / "rod.csv")["time_s"])))
+    settings = {"channels.T_10.noise_column": "s", "channels.T_10.late": f"{3 * step} s"}
+    found = read(path, **settings)
+    noise = found[noise_channel("T_10")].dropna()
+    known = found["T_10"].dropna()
+    assert len(known) > ROWS // 2
+    assert set(known.index) <= set(noise.index)
+
+
+def test_a_channel_without_values_may_be_late(tmp_path):
+    path = changed(tmp_path, lambda table: table.__setitem__("T_20", np.nan))
+    found = read(path, **{"channels.T_20.late": "5 s"})
+    assert len(found) == ROWS
+    assert found["T_20"].isna().all()
+
+
+def test_a_sensor_between_the_rows_of_the_others_changes_no_input(tmp_path):
+    """Half an interval late: its readings have rows of their own, inputs are as before."""
+    plain = read(short_rod(tmp_path / "plain", ROWS))
+    step = float(np.median(np.diff(plain.index)))
+    found = read(short_rod(tmp_path / "late", ROWS), **{"channels.T_10.late": f"{step / 2} s"})
+    shared = found.index.intersection(plain.index)
+    np.testing.assert_allclose(found.loc[shared, "T_left"], plain.loc[shared, "T_left"])
+    # The first one is before all other rows.
+    assert found["T_10"].count() == plain["T_10"].count() - 1
+    assert not found.loc[shared, "T_10"].notna().any()
+
+
+@pytest.mark.slow
+def test_a_late_sensor_is_fitted_as_if_it_were_not(tmp_path):
+    """Half an interval late, with refits and gaps: the estimate of the table without a fault."""
+    plain = cases.load(short_rod(tmp_path / "plain", 61)).prepare()
+    whole = plain.identifier.run(plain.stream).last
+    path = short_rod(tmp_path / "late", 61)
+    table = pd.read_csv(path.parent / "rod.csv")
+    step = float(np.median(np.diff(table["time_s"])))
+    times = table["time_s"].to_numpy(float)
+    # The table has what T_10 was half an interval before, on a straight line.
+    table["T_10"] = np.interp(times - 0.5 * step, times, table["T_10"])
+    table.loc[[20, 33], "T_10"] = np.nan
+    table.to_csv(path.parent / "rod.csv", index=False)
+    late = cases.load(path, settings={"channels.T_10.late": f"{step / 2} s"}).prepare()
+    found = late.identifier.run(late.stream).last
+    (one, std), (other, _) = found.parameters["alpha"], whole.parameters["alpha"]
+    assert abs(one - other) < 2.0 * std

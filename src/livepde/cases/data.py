@@ -73,8 +73,8 @@ LOG = logging.getLogger("livepde.run")
 FAR = 3.0  # ranges of the other values of a row: a value beyond has to be confirmed
 START = "start"  # kind of remark on values of the first rows
 LATE = (
-    "late belongs to data that are complete. For a source that goes on, delay the other channels "
-    "at the source, or correct the clock."
+    "late requires complete data. For a live source, delay the other channels at the source, or "
+    "correct the clock."
 )
 LEAP = "30 d"  # after a longer pause a second row has to confirm the time
 Data: TypeAlias = str | Iterable[str] | RowSource | None  # a file, lines of JSON, or the case's own
@@ -131,7 +131,9 @@ def read_data(
         return found
     from livepde.streams.join import not_late
 
-    return _merged(case, not_late(found, late), columns)
+    # The noise of a reading has its time.
+    noise = {name: late[of] for name, one in columns.items() if (of := one.noise_of) in late}
+    return _merged(case, not_late(found, late | noise), columns)
 
 
 def _late(case: CaseContent) -> dict[str, float]:
@@ -145,7 +147,7 @@ def _late(case: CaseContent) -> dict[str, float]:
 
 
 def refuse_late(case: CaseContent) -> None:
-    """Refuse late channels of a source that goes on.
+    """Refuse late channels of a live source.
 
     Raises
     ------

@@ -125,7 +125,8 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "shift": "Correction of the clock of the source, added to all times; a time.",
         "overflow": "Samples that come faster than steps wait, are merged, or are dropped.",
         "queue": "Number of samples that may wait.",
-        "silence": "A source counts as silent after this time without a row; without it never.",
+        "silence": "A source is silent after this time without a row; without it after ten usual "
+        "intervals, twice its longest silence so far, and 60 s.",
     },
     "EvolutionSpec": {
         "kind": "Kind of the evolution.",

@@ -127,7 +127,7 @@ def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
         if spec.field:
             return _field(case, spec, name, options)
         if spec.regions is None:
-            return Scalar(**options)
+            return Scalar(**options, corrects=name in map(_offset_label, _shifted(case)))
         places = {region: item.over for region, item in spec.regions.items()}
         regions = _regions(case, places, f"{key}.regions")
         # A region may state a prior of its own; the others share that of the unknown.

@@ -23,6 +23,7 @@ KEYS = {"offset": "offset", "gain": "gain", "position": "at_std"}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
 SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
+STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
 NO_SETTING = "No setting of this case frees it."
 
 
@@ -88,10 +89,11 @@ def _of_sensor(case: Case, cause: Cause) -> tuple[str, ...]:
 
 
 def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
-    """Return the settings that a cause has; none if the case states a factor or a delay already."""
-    channel = case.spec.channels.get(cause.subject)
-    known = channel is not None and (channel.factor, channel.late) != (None, None)
-    return () if known else settings_in(cause.setting)
+    """Return the settings of a cause; none that would replace what the case states."""
+    channel, settings = case.spec.channels.get(cause.subject), settings_in(cause.setting)
+    keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
+    taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
+    return () if taken else settings
 
 
 def _capacity(case: Case) -> float:

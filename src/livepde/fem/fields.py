@@ -350,12 +350,16 @@ class Scalar(_Declared):
         linearisation point nor the reported estimate goes beyond it, and the note "bounded" counts
         the values held there. inf: no limit. A `RandomWalk` has none, since its prior says nothing
         about later values.
+    corrects
+        True for a correction of an input, as an offset of a boundary value. As for those of
+        sensors, how well it is known does not change the level of a verdict.
     """
 
     prior: Prior
     unit: str = ""
     evolution: Evolution = CONSTANT
     within: float = WITHIN
+    corrects: bool = False
 
     def __post_init__(self) -> None:
         self._check()

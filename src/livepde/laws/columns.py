@@ -46,7 +46,7 @@ CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelie
 
 
 class Unit(NamedTuple):
-    """What the values of a column look like; their unit, and factor and constant that mend them."""
+    """A unit that a column may have: in words, its name, and factor and constant to convert it."""
 
     text: str
     name: str
@@ -472,12 +472,12 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
     }
     text, remedy = words[error.kind]()
     late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
-    mended = UNITS[error.unit]
-    factor = mended.factor if error.kind == "unit" else 1.0 / (1.0 + size)
+    unit_of = UNITS[error.unit]
+    factor = unit_of.factor if error.kind == "unit" else 1.0 / (1.0 + size)
     keys = {
         "gain": ("factor", f"{factor:.6g}"),
         "lag": ("late", late),
-        "unit": ("unit", f'"{mended.name}"') if mended.name else ("factor", f"{factor:.6g}"),
+        "unit": ("unit", f'"{unit_of.name}"') if unit_of.name else ("factor", f"{factor:.6g}"),
     }
     setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
     known = float("nan") if error.kind in ("unit", "exchange") else size

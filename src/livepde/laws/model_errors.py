@@ -15,6 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from livepde.fem import Scalar
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
 from livepde.laws.refit import plausible
 from livepde.laws.refit_options import Refit
@@ -210,6 +211,7 @@ def _allowed(
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
     own = set(problem.observed.observation.unknowns)
+    own |= {name for name, item in latent.parts.items() if _corrects(item.unknown)}
     low, high = mixture.interval
     known = samples.filter.estimate(samples.state.now)[0]
     both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
@@ -235,6 +237,11 @@ def _allowed(
         numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
         numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
         yield Allowed.of(name, unit, numbers, of_sensor=name in own)
+
+
+def _corrects(unknown: object) -> bool:
+    """Return whether an unknown corrects an input."""
+    return isinstance(unknown, Scalar) and unknown.corrects
 
 
 def linear_model(

@@ -99,18 +99,22 @@ def join_tables(
 def not_late(table: DataTable, late: Mapping[str, float]) -> list[DataTable]:
     """Return a table as several, in which the times of late channels are earlier.
 
+    A channel without values stays where it is.
+
     Parameters
     ----------
     late
         Channel -> how much later than its values its times are, in the unit of the times.
     """
+    seen = np.isfinite(table.values).any(axis=0)
+    late = {name: by for name, by in late.items() if seen[table.names.index(name)]}
     rest = [name not in late for name in table.names]
     names = tuple(name for name in table.names if name not in late)
     found = [replace(table, values=table.values[:, rest], names=names)] if names else []
     for name, by in late.items():
         values = table.values[:, table.names.index(name)]
-        seen = np.isfinite(values)
-        t, own = table.t[seen] - by, values[seen, None]
+        known = np.isfinite(values)
+        t, own = table.t[known] - by, values[known, None]
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found
 

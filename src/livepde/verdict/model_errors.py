@@ -38,7 +38,7 @@ class Allowed:
     wider
         Width over that of the noise alone.
     of_sensor
-        Whether it belongs to a sensor, as an offset does.
+        Whether it belongs to a sensor, as an offset does, or corrects an input.
     """
 
     label: str
