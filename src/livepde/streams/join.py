@@ -106,8 +106,8 @@ def not_late(table: DataTable, late: Mapping[str, float]) -> list[DataTable]:
     late
         Channel -> how much later than its values its times are, in the unit of the times.
     """
-    seen = np.isfinite(table.values).any(axis=0)
-    late = {name: by for name, by in late.items() if seen[table.names.index(name)]}
+    seen = np.isfinite(table.values)
+    late = {name: by for name, by in late.items() if seen[:, table.names.index(name)].any()}
     rest = [name not in late for name in table.names]
     names = tuple(name for name in table.names if name not in late)
     found = [replace(table, values=table.values[:, rest], names=names)] if names else []
