@@ -222,6 +222,16 @@ def test_noise_of_readings():
     assert found.parameters == identifier().run(rows).last.parameters
 
 
+def test_the_noise_of_readings_has_the_unit_of_the_column():
+    table = measured().drop(columns="battery_V")
+    noise = np.where(np.arange(len(table)) % 2, 0.02, 0.3)
+    plain = identifier().run(table.assign(**{"noise of T_30": noise}))
+    other = table.assign(T_30=1.8 * table["T_30"] + 32.0, **{"noise of T_30": 1.8 * noise})
+    found = identifier().run(other, units={"T_30": "degF"})
+    (one, std), (two, deviation) = (r.last.parameters["alpha"] for r in (plain, found))
+    assert (two, deviation) == pytest.approx((one, std), rel=1e-9)
+
+
 def test_an_xarray_dataset_with_units():
     data = xr.Dataset.from_dataframe(measured())
     assert same(identifier().run(data))

@@ -168,7 +168,8 @@ class Reading:
                 found[name] = replace(found[name], factor=rule.factor, offset=rule.offset)
         for name in self.channels:  # of a reading that has its own
             if (noise := noise_channel(name)) in found:
-                found[noise] = Column(found[noise].names, decimal=decimal, noise_of=name)
+                factor, names_of = found[name].factor, found[noise].names
+                found[noise] = Column(names_of, factor, decimal=decimal, noise_of=name)
         used = {time, *(column.names[0] for column in found.values())}
         if self.strict and (more := [name for name in names if name not in used]):
             raise SampleError(
