@@ -147,18 +147,21 @@ BUILD = {
     "general": SuperLUSolver,
     "symmetric": lambda pattern: SuperLUSolver(pattern, symmetric=True),
     "cholmod": CholmodSolver,
+    "cholmod blocks": lambda pattern: CholmodSolver(pattern, blocks=True),
     "pardiso": PardisoSolver,
     "pardiso symmetric": lambda pattern: PardisoSolver(pattern, symmetric=True),
     "multigrid": MultigridSolver,
 }
-OPTIONAL = {"cholmod": "sksparse", "multigrid": "pyamg"} | dict.fromkeys(
-    ("pardiso", "pardiso symmetric"), "pypardiso"
-)
+OPTIONAL = {
+    "cholmod": "sksparse",
+    "cholmod blocks": "sksparse",
+    "multigrid": "pyamg",
+} | dict.fromkeys(("pardiso", "pardiso symmetric"), "pypardiso")
 ENGINES = [
     pytest.param(name, marks=installed(OPTIONAL[name]) if name in OPTIONAL else ())
     for name in BUILD
 ]
-DEFINITE = ("symmetric", "cholmod", "pardiso symmetric", "multigrid")
+DEFINITE = ("symmetric", "cholmod", "cholmod blocks", "pardiso symmetric", "multigrid")
 
 
 def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
@@ -249,7 +252,8 @@ def test_krylov_methods_say_what_to_do_if_they_do_not_converge(method):
         method(A.__matmul__, np.copy, b, 1e-10, 3, "take a smaller step")
 
 
-def test_engine_is_chosen_by_the_band():
+def test_engine_is_chosen_by_the_band(monkeypatch):
+    monkeypatch.setattr(choice, "_installed", lambda module: False)
     narrow = Pattern.of(sp.diags_array([np.ones(99), np.ones(100)], offsets=[1, 0]))
     wide = Pattern.of(sp.csr_array(np.ones((100, 100))))
     assert isinstance(analyse(narrow), BandedSolver)
@@ -266,10 +270,15 @@ def test_engine_is_chosen_by_the_band():
         ("", False, ["SuperLU", "SuperLU", "SuperLU"]),
         ("pyamg", True, ["SuperLU", "SuperLU", "multigrid"]),
         ("pyamg", False, ["SuperLU", "SuperLU", "SuperLU"]),
-        ("pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
+        ("pypardiso", True, ["SuperLU", "SuperLU", "Pardiso"]),
         ("pypardiso", False, ["SuperLU", "Pardiso", "Pardiso"]),
-        ("pypardiso sksparse", True, ["SuperLU", "CHOLMOD", "CHOLMOD"]),
-        ("pyamg pypardiso", True, ["SuperLU", "Pardiso", "Pardiso"]),
+        (
+            "pypardiso sksparse",
+            True,
+            [f"CHOLMOD (scikit-sparse), {kind}" for kind in ("simpl", "simpl", "supern")],
+        ),
+        ("sksparse", False, ["SuperLU", "SuperLU", "SuperLU"]),
+        ("pyamg pypardiso", True, ["SuperLU", "SuperLU", "Pardiso"]),
     ],
 )
 def test_engine_is_chosen_by_the_band_and_by_what_is_installed(

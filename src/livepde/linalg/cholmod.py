@@ -33,19 +33,30 @@ class CholmodSolver:
     """Sparse Cholesky of one pattern with a fixed fill-reducing order; needs scikit-sparse.
 
     A successful factorisation proves that the matrix is positive definite.
+
+    Parameters
+    ----------
+    blocks
+        Whether the factor has dense blocks (supernodal, L L^T) or none (simplicial, L D L^T).
+        Blocks are faster to compute for wide bands, and slower to solve with at any size.
     """
 
     pattern: Pattern
-    name: str = "CHOLMOD (scikit-sparse)"
+    blocks: bool = False
     definite: bool = True
-    price: float = 20.0
+    price: float = 35.0
+
+    @property
+    def name(self) -> str:
+        """Name of the solver for messages."""
+        return f"CHOLMOD (scikit-sparse), {'supernodal' if self.blocks else 'simplicial'}"
 
     @cached_property
     def _order(self) -> Any:
         from sksparse.cholmod import analyze
 
-        # The other mode computes L D L^T, which also exists for indefinite matrices.
-        return analyze(self._matrix(np.ones(self.pattern.nnz)), mode="supernodal")
+        mode = "supernodal" if self.blocks else "simplicial"
+        return analyze(self._matrix(np.ones(self.pattern.nnz)), mode=mode)
 
     def _matrix(self, data: Array) -> sp.csc_matrix:
         # A symmetric matrix is its transpose; scikit-sparse knows no sparse arrays.
@@ -57,11 +68,16 @@ class CholmodSolver:
 
         if not np.isfinite(data).all():
             raise LinearAlgebraError("The matrix holds values that are not finite.")
+        n = self.pattern.shape[0]
+        failure = LinearAlgebraError(
+            f"The {n} by {n} matrix is singular or not positive definite: check the model's "
+            "forms, or take a smaller time step."
+        )
         try:
-            return CholmodFactor(self._order.cholesky(self._matrix(data)))
+            factor = self._order.cholesky(self._matrix(data))
         except CholmodNotPositiveDefiniteError as error:
-            n = self.pattern.shape[0]
-            raise LinearAlgebraError(
-                f"The {n} by {n} matrix is singular or not positive definite: check the model's "
-                "forms, or take a smaller time step."
-            ) from error
+            raise failure from error
+        # L D L^T also exists for indefinite matrices.
+        if not (self.blocks or (factor.D() > 0.0).all()):
+            raise failure
+        return CholmodFactor(factor)
