@@ -16,6 +16,7 @@ from livepde.errors import ConfigurationError, ModelError, NameClashError
 from livepde.fem import (
     START,
     Channel,
+    Coefficients,
     Composed,
     Field,
     FieldBlock,
@@ -122,6 +123,10 @@ class Model(Shown):
     initial
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
+    coefficients
+        Function q -> {name: number} of further numbers that A reads as q.name. They are computed
+        from unknowns that are numbers, as in lambda q: {"diffusivity": q.k / q.C}. If A is linear
+        in unknowns and these numbers, a step is as fast as if it were linear in the unknowns.
 
     Notes
     -----
@@ -157,10 +162,11 @@ class Model(Shown):
         time_unit: str = "",
         length_unit: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
+        coefficients: Callable[[Any], Mapping[str, Any]] | None = None,
     ) -> None:
         self._parts: dict[str, Any] = {
             **{"A": A, "B": B, "f": f, "M": M, "dA": dA, "dB": dB},
-            **{"inputs": inputs, "initial": initial},
+            **{"inputs": inputs, "initial": initial, "coefficients": coefficients},
         }
         self.state = state
         self.parameter = parameter
@@ -178,7 +184,14 @@ class Model(Shown):
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
         # A in the parameter as forms see it; `form_A` is the same in latent coefficients.
-        self.physical_A = self._form("A", A, triple, "u", dA, "q")
+        # Numbers computed from the unknowns, None if there are none, and A in both.
+        self.coefficients = self._coefficients(coefficients, dA)
+        if self.coefficients is None:
+            self.physical_A = self.linear_A = self._form("A", A, triple, "u", dA, "q")
+        else:
+            self.physical_A = self._form("A", self.coefficients.expanded(A), triple, "u", None, "q")
+            more = triple | {"q": self.coefficients.space}
+            self.linear_A = self._form("A", A, more, "u", None, "q")
         self.form_A = compose(self.physical_A, self.latent)
         sources = f if isinstance(f, Sequence) else [f]
         integrands = [_as_integrand(item, x) for item in sources]
@@ -257,6 +270,19 @@ class Model(Shown):
         mesh, order, inputs = self.mesh, self.order, self.inputs
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
+    def _coefficients(
+        self, function: Callable[[Any], Mapping[str, Any]] | None, dA: Any
+    ) -> Coefficients | None:
+        if function is None:
+            return None
+        if self.parameter_space.single or dA is not None:
+            what = "named unknowns" if self.parameter_space.single else "no dA"
+            raise ModelError(f"coefficients require {what}.")
+        typical = self.latent.value(self.latent.prior)
+        found = Coefficients(self.parameter_space, function, typical)
+        _ = found.space  # fails here, not in a step
+        return found
+
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
         """Return the same process with more unknowns, which its forms do not see: of sensors, say.
 
@@ -325,7 +351,9 @@ class Model(Shown):
                 return [bound(item) for item in part]
             return with_constants(part, values) if callable(part) else part
 
-        parts = {name: bound(part) for name, part in self._parts.items() if name != "inputs"}
+        kept = ("inputs", "coefficients")  # which read no channels
+        parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
+        parts["coefficients"] = self._parts["coefficients"]
         left = [name for name in self.inputs if name not in values]
         return Model(self.state, self.parameter, **parts, inputs=left, **self._units)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from livepde.fem.coefficients import Coefficients, numbers
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
@@ -56,6 +57,7 @@ from livepde.fem.space import FunctionSpace, Named
 __all__ = [
     "START",
     "Channel",
+    "Coefficients",
     "Composed",
     "Declaration",
     "Evolution",
@@ -104,6 +106,7 @@ __all__ = [
     "maximum",
     "minimum",
     "mul",
+    "numbers",
     "positive",
     "quadratic",
     "random_field",

@@ -69,9 +69,10 @@ def borehole(
         state,
         {"k": k, "R_b": R_b, "rho_c": rho_c},
         A=[
-            lambda q, u, v, x: q.k / q.rho_c * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * H * q.rho_c) * v),
+            lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
+            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * H) * q.per_capacity * v),
         ],
+        coefficients=lambda q: {"diffusivity": q.k / q.rho_c, "per_capacity": 1 / q.rho_c},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
         time_unit="s",

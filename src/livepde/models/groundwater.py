@@ -53,9 +53,10 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         state,
         {"k": k, "Ss": Ss},
         A=[
-            lambda q, u, v, x: q.k / q.Ss * x[0] * dot(grad(u), grad(v)),
-            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b * q.Ss) * v),
+            lambda q, u, v, x: q.diffusivity * x[0] * dot(grad(u), grad(v)),
+            On("left", lambda q, _, v, x: -x.inputs["Q"] / (2 * pi * b) * q.per_storage * v),
         ],
+        coefficients=lambda q: {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
         time_unit="s",

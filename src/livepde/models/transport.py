@@ -118,10 +118,10 @@ def mobile_immobile(
 
     # The equations are divided by phi and 1 - phi: the mass form is free of unknowns.
     def transport(q: Any, u: Any, w: Any, x: Any) -> Any:
-        return (q.D * grad(u.c)[0] - q.v / q.phi * u.c) * grad(w.c)[0]
+        return (q.D * grad(u.c)[0] - q.velocity * u.c) * grad(w.c)[0]
 
     def exchange(q: Any, u: Any, w: Any, x: Any) -> Any:
-        return q.omega * (u.c - u.s) * (w.c / q.phi - w.s / (1 - q.phi))
+        return (u.c - u.s) * (q.into_mobile * w.c - q.into_immobile * w.s)
 
     return Model(
         {
@@ -129,7 +129,12 @@ def mobile_immobile(
             "s": Field(mesh, element or linear(mesh), unit=unit),
         },
         {"D": D, "v": v, "phi": phi, "omega": omega},
-        A=[transport, exchange, *_ends(lambda q: q.v / q.phi, lambda u: u.c, inlet)],
+        A=[transport, exchange, *_ends(lambda q: q.velocity, lambda u: u.c, inlet)],
+        coefficients=lambda q: {
+            "velocity": q.v / q.phi,
+            "into_mobile": q.omega / q.phi,
+            "into_immobile": q.omega / (1 - q.phi),
+        },
         inputs=["c_in"],
         time_unit="h",
         length_unit="cm",

@@ -12,9 +12,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
-from livepde.fem import FunctionSpace, Moment, Place, Unknown
+from livepde.fem import FunctionSpace, Moment, Place, Unknown, numbers
 from livepde.linalg import Array, Mask
-from livepde.observation.operator import STEP, Observation, Observed, numbers
+from livepde.observation.operator import STEP, Observation, Observed
 from livepde.spaces import HilbertSpace
 
 __all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]

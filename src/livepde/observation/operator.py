@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from livepde.errors import ObservationError
-from livepde.fem import FieldBlock, FunctionSpace, Moment, Named, Place, Scalars, Unknown
+from livepde.fem import FieldBlock, FunctionSpace, Moment, Place, Unknown, numbers
 from livepde.linalg import Array, IntArray, Mask, Memo
 from livepde.observation.reconstruction import (
     Pseudoinverse,
@@ -23,7 +23,7 @@ from livepde.observation.reconstruction import (
 from livepde.observation.split import Split, is_selection
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Observation", "Observed", "numbers"]
+__all__ = ["Observation", "Observed"]
 
 Direct = Callable[[Any, Place], Any]
 # Complex step: exact to rounding, as in `livepde.fem.forms`.
@@ -410,18 +410,3 @@ class Observed:
         if asked is not None and len(inside):
             inside = inside & asked
         return None if inside.all() and len(inside) else np.flatnonzero(inside)
-
-
-def numbers(parameter: FunctionSpace, q: Array) -> Any:
-    """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""
-    seen: dict[str, Any] = {}
-    for name in parameter.names:
-        part = q[parameter.part(name)]
-        unknown = parameter.unknowns.get(name)
-        if isinstance(unknown, Scalars):
-            seen[name] = dict(zip(unknown.names, part, strict=True))
-        else:
-            seen[name] = part[0] if len(part) == 1 else part
-    if parameter.single:
-        return next(iter(seen.values()))
-    return Named(**seen)

@@ -51,13 +51,17 @@ class BandedStep(NamedTuple):
     factor
         The factorised matrices.
     amounts
-        h q of the physical unknowns, shape (members, unknowns).
+        h q of the unknowns in which A is linear, shape (members, unknowns).
+    slopes
+        Their derivatives in the physical unknowns, (members, unknowns, m); None if these are the
+        same.
     forced
         See `BandedStage`.
     """
 
     factor: BlockFactor
     amounts: Array
+    slopes: Array | None
     forced: tuple[Array, Array] | None
 
 
@@ -70,11 +74,11 @@ class BandedStage(MemberStage):
 
     def __init__(self, model: Model) -> None:
         self.model = model
-        form, zero, free = model.physical_A, np.zeros(model.X.dim), model.X.free
+        form, zero, free = model.linear_A, np.zeros(model.X.dim), model.X.free
         fields = [block.field for block in model.state_space.fields.values()]
         values = [value for field in fields for value in field.boundary_values]
         fixed_in_time = all(isinstance(value, int | float | Channel) for value in values)
-        units = np.eye(model.parameter_space.dim)
+        units = np.eye(form.spaces["q"].dim)
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
         # Masks of the entries between free coefficients, and of free rows with Dirichlet columns.
@@ -123,9 +127,9 @@ class BandedStage(MemberStage):
     @staticmethod
     def refuses(model: Model) -> str:
         """Return the reason why a model does not fit this stage; empty if it fits."""
-        if not (model.physical_A.linear_in_parameter and model.affine):
+        if not (model.linear_A.linear_in_parameter and model.affine):
             return "the model is not affine in its state and its unknowns"
-        if model.parameter_space.dim > MOST_UNKNOWNS:
+        if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
             return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
         if not model.steady:
             return "the matrices of the model depend on time or inputs"
@@ -189,6 +193,8 @@ class BandedStage(MemberStage):
             if offset is not None:
                 driven = driven + offset
             along, chosen = stage.h * stage.directions, together // size - 1
+            if step.slopes is not None:
+                along = along @ step.slopes.transpose(0, 2, 1)
             if chosen:
                 known[size:together] -= _along(along[:, :chosen], driven)
             if stage.apart:
@@ -202,11 +208,15 @@ class BandedStage(MemberStage):
         """Return what all stages of a length share, and keep it for the next one."""
         latent, h = self.model.latent, stage.h
         unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
+        slopes, coefficients = None, self.model.coefficients
+        if coefficients is not None:
+            slopes = np.array([coefficients.slopes(q) for q in unknowns])
+            unknowns = np.array([coefficients.value(q) for q in unknowns])
         weights = np.empty((len(unknowns), unknowns.shape[1] + 2))
         amounts = np.multiply(unknowns, h, out=weights[:, :-2])
         weights[:, -2], weights[:, -1] = h, 1.0
         factor = self._blocks.factorise(weights.dot(self._bands))
-        step = BandedStep(factor, amounts, self._forced(h))
+        step = BandedStep(factor, amounts, slopes, self._forced(h))
         stage.factors[h] = step
         return step
 
@@ -236,7 +246,7 @@ def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
     whole = Assembler(model.X.dim)
     whole.add("M", model.form_M.pattern("v", "u"))
     whole.add("B", model.form_B.pattern("v", "u"))
-    whole.add("A", model.physical_A.pattern("v", "u"))
+    whole.add("A", model.linear_A.pattern("v", "u"))
     return whole.build()
 
 

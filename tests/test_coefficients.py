@@ -1,0 +1,124 @@
+"""Numbers computed from the unknowns, in which a form is linear: the numbers of the plain form."""
+
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+import livepde as lp
+from livepde.errors import ConfigurationError, ModelError
+from livepde.fem import Moment
+from livepde.models import mobile_immobile, pumping_test
+from livepde.stepping import BandedStage, member_stage
+
+UNKNOWNS = {"k": lp.LogNormal(1.0, std=0.5), "C": lp.LogNormal(2.0, std=0.5)}
+
+
+def per_capacity(q):
+    return {"diffusivity": q.k / q.C, "per_capacity": 1 / q.C}
+
+
+def rod(named: bool, **options):
+    state = lp.Field(
+        lp.interval(0.0, 1.0, 12), lp.linear(lp.interval(0.0, 1.0, 12)), dirichlet={"right": 0.0}
+    )
+    if named:
+        A = [
+            lambda q, u, v, x: q.diffusivity * lp.dot(lp.grad(u), lp.grad(v)),
+            lp.On("left", lambda q, _, v, x: -x.inputs["Q"] * q.per_capacity * v),
+        ]
+        options["coefficients"] = per_capacity
+    else:
+        A = [
+            lambda q, u, v, x: q.k / q.C * lp.dot(lp.grad(u), lp.grad(v)),
+            lp.On("left", lambda q, _, v, x: -x.inputs["Q"] / q.C * v),
+        ]
+    return lp.Model(state, UNKNOWNS, A, inputs=["Q"], **options)
+
+
+def estimates(model):
+    sensors = lp.Points({"T_1": 0.2, "T_2": 0.6}, noise=0.01)
+    identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=0.0)
+    rng = np.random.default_rng(3)
+    for k in range(1, 21):
+        t = 0.05 * k
+        z = {"T_1": 0.4 * (1 - np.exp(-2 * t)), "T_2": 0.2 * (1 - np.exp(-t)), "Q": 1.0 + (k > 9)}
+        estimate = identifier.step(t, z | {"T_1": z["T_1"] + 0.01 * rng.standard_normal()})
+    return estimate
+
+
+def test_estimates_are_those_of_the_form_in_the_unknowns():
+    plain, named = rod(named=False), rod(named=True)
+    assert isinstance(member_stage(named), BandedStage)
+    assert not isinstance(member_stage(plain), BandedStage)
+    found, expected = estimates(named), estimates(plain)
+    for name in UNKNOWNS:
+        assert found[name].mean == pytest.approx(expected[name].mean, rel=1e-6)
+        assert found[name].std == pytest.approx(expected[name].std, rel=1e-5)
+
+
+def test_fluxes_and_errors_of_sensors_may_be_added():
+    more = rod(named=True).with_unknowns({"o": lp.Normal(0.0, std=1.0)})
+    more = more.with_terms(A=[lp.On("left", lambda q, u, v, x: q.o * u * v)])
+    assert isinstance(member_stage(more), BandedStage)
+    q = np.array([0.5, 2.0, 3.0])
+    np.testing.assert_allclose(more.coefficients.value(q), [*q, 0.25, 0.5])
+    by_hand = [[0.5, -0.125, 0.0], [0.0, -0.25, 0.0]]
+    np.testing.assert_allclose(more.coefficients.slopes(q), [*np.eye(3), *by_hand])
+
+
+@pytest.mark.parametrize(
+    ("model", "q"),
+    [
+        (
+            pumping_test(
+                lp.interval(0.1, 100.0, 10, geometric=True),
+                lp.LogNormal(1e-3, std=1e-3),
+                lp.LogNormal(1e-4, std=1e-4),
+                b=3.0,
+            ),
+            [2e-3, 3e-4],
+        ),
+        (
+            mobile_immobile(
+                lp.interval(0.0, 30.0, 10),
+                lp.LogNormal(1.0, std=1.0),
+                lp.LogNormal(5.0, std=1.0),
+                lp.LogitNormal(0.5, std=0.1, bounds=(0.0, 1.0)),
+                lp.LogNormal(0.1, std=0.1),
+            ),
+            [2.0, 4.0, 0.3, 0.2],
+        ),
+    ],
+)
+def test_both_forms_of_a_ready_made_equation_agree(model, q):
+    rng = np.random.default_rng(0)
+    u, q = rng.standard_normal(model.X.dim), np.array(q)
+    moment = Moment(0.0, dict.fromkeys(model.channels, 2.0))
+    at = {"u": u, "moment": moment}
+    p = model.coefficients.value(q)
+    found = model.linear_A.vector("v", q=p, **at)
+    np.testing.assert_allclose(found, model.physical_A.vector("v", q=q, **at), rtol=1e-12)
+    slopes = model.linear_A.matrix("v", "q", q=p, **at) @ model.coefficients.slopes(q)
+    np.testing.assert_allclose(
+        slopes, model.physical_A.matrix("v", "q", q=q, **at).toarray(), rtol=1e-11, atol=1e-13
+    )
+
+
+def test_what_does_not_fit_is_refused():
+    with pytest.raises(ModelError, match="named unknowns"):
+        lp.Model(
+            lp.Field(lp.interval(0.0, 1.0, 4), lp.linear(lp.interval(0.0, 1.0, 4))),
+            lp.LogNormal(1.0, std=0.5),
+            lambda q, u, v, x: q * u * v,
+            coefficients=lambda q: {"double": 2 * q},
+        )
+    with pytest.raises(ModelError, match="no dA"):
+        rod(named=True, dA=lambda q, u, du, v, x: q.k * du * v)
+
+
+def test_a_model_with_numbers_is_pickled_with_its_functions():
+    with pytest.raises(ConfigurationError, match="lambda"):
+        pickle.dumps(rod(named=True))
