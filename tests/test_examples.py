@@ -18,7 +18,7 @@ from livepde.models import EQUATIONS
 pytestmark = pytest.mark.pages
 
 ROOT = Path(__file__).parents[1]
-TUTORIAL = ROOT / "docs" / "tutorials" / "own-pde.md"
+EXTENDING = ROOT / "docs" / "extending.md"
 TOML = re.compile(r"^```toml[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 BLOCK = re.compile(r"^```python[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -108,17 +108,17 @@ def test_a_new_pde_takes_forty_lines_which_the_page_shows():
     """Model, data and checks together; what the docs show is the file that runs."""
     example = (ROOT / "examples" / "own_pde.py").read_text()
     assert len(example.splitlines()) <= 40
-    first, *_ = BLOCK.findall(TUTORIAL.read_text())
+    first, *_ = BLOCK.findall(EXTENDING.read_text())
     assert first == example
 
 
 def test_the_case_of_a_new_pde_finds_the_truth(tmp_path, monkeypatch):
-    """The tutorial runs it; without its channel or without permission it is one sentence."""
+    """The page runs it; without its channel or without permission it is one sentence."""
     example = ROOT / "examples" / "own_pde.py"
     (tmp_path / "own_pde.py").write_text(example.read_text())
-    (case,) = TOML.findall(TUTORIAL.read_text())
+    (case,) = TOML.findall(EXTENDING.read_text())
     (tmp_path / "rod.toml").write_text(case)
-    *_, data = BLOCK.findall(TUTORIAL.read_text())
+    (data,) = (block for block in BLOCK.findall(EXTENDING.read_text()) if "rod.csv" in block)
     monkeypatch.chdir(tmp_path)
     exec(data, vars(load("own_pde")))
     (tmp_path / "less.toml").write_text(re.sub(r"^a = .*\n", "", case, flags=re.MULTILINE))
