@@ -33,14 +33,12 @@ from typing import Any
 
 import pytest
 import typer
-from pydantic import BaseModel
 from typer.main import get_command
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app as benchmarks
 from experiments.__main__ import app as experiments
 from livepde.cases.read import read_spec
-from livepde.cases.schema import CaseSpec
 from livepde.cli import app
 from livepde.errors import LivepdeError
 from livepde.reproduce import EXPERIMENTS
@@ -385,26 +383,6 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert '## `[law]`, `kind = "gradient"`' in keys
     assert "| `refit` | true or false or a table | `true` |" in keys
     assert "## `[[variants]]`" in keys
-
-
-def test_every_key_of_a_case_has_a_meaning():
-    """The page of case files says what each key is for that the schema knows."""
-    page = (ROOT / "docs" / "cases.md").read_text(encoding="utf-8")
-    known = re.findall(r"[a-z_0-9]+", " ".join(re.findall(r"`([^`\n]+)`", page)))
-    for model in (CaseSpec, *_inside(CaseSpec)):
-        for name, item in model.model_fields.items():
-            assert (item.alias or name) in known, f"{model.__name__}: {item.alias or name}"
-
-
-def _inside(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """Yield the models of a model's tables."""
-    rest = [item.annotation for item in model.model_fields.values()]
-    while rest:
-        kind = rest.pop()
-        rest += getattr(kind, "__args__", ())
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            yield kind
-            yield from _inside(kind)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
