@@ -67,7 +67,6 @@ ELSEWHERE = {
     "test_compare.py::test_the_program_finds_the_fault_from_a_case_and_from_a_run": [
         "livepde compare"
     ],
-    "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
     "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
     "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [
         "livepde run mycase/case.toml --watch",
