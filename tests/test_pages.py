@@ -384,6 +384,26 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert "## `[[variants]]`" in keys
 
 
+def test_phrases_long_sentences_and_long_pages_are_found(tmp_path, monkeypatch):
+    """Code and targets of links are no text; `make check` runs the check on the pages."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    check = importlib.import_module("plain_english")
+    page = tmp_path / "trust.md"
+    code = "`it says`, [a link](hardly.md)\n\n```sh\ntold\n```\n\n"
+    page.write_text(code + "A b. " * 700)
+    check.main([str(page)])
+    wrong = "It goes\non. " + "One, " * 30 + "two.\n\n| a cell | hardly any |\n\n"
+    page.write_text(code + wrong + "A b. " * 800)
+    with pytest.raises(SystemExit) as refused:
+        check.main([str(page)])
+    assert str(refused.value).replace(f"{page}:", "").splitlines() == [
+        "7: goes on -> continue",
+        "7: One, One, One, One, One, One, ... (31 words) -> at most 30",
+        "10: hardly -> barely",
+        "1: 1641 words -> at most 1500",
+    ]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_formulas_are_written_in_unicode(page):
     """The pages load nothing from elsewhere, so that nothing would draw LaTeX."""
