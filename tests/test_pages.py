@@ -33,14 +33,12 @@ from typing import Any
 
 import pytest
 import typer
-from pydantic import BaseModel
 from typer.main import get_command
 from typer.testing import CliRunner
 
 from benchmarks.__main__ import app as benchmarks
 from experiments.__main__ import app as experiments
 from livepde.cases.read import read_spec
-from livepde.cases.schema import CaseSpec
 from livepde.cli import app
 from livepde.errors import LivepdeError
 from livepde.reproduce import EXPERIMENTS
@@ -69,7 +67,6 @@ ELSEWHERE = {
     "test_compare.py::test_the_program_finds_the_fault_from_a_case_and_from_a_run": [
         "livepde compare"
     ],
-    "test_cli_fleet.py::test_each_row_is_a_run_of_its_own": ["livepde fleet mycase"],
     "test_dashboard.py::test_watch_says_where_and_ends_with_ctrl_c": ["livepde watch"],
     "test_dashboard.py::test_the_page_follows_a_run_and_looks_back": [
         "livepde run mycase/case.toml --watch",
@@ -387,24 +384,24 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert "## `[[variants]]`" in keys
 
 
-def test_every_key_of_a_case_has_a_meaning():
-    """The page of case files says what each key is for that the schema knows."""
-    page = (ROOT / "docs" / "cases.md").read_text(encoding="utf-8")
-    known = re.findall(r"[a-z_0-9]+", " ".join(re.findall(r"`([^`\n]+)`", page)))
-    for model in (CaseSpec, *_inside(CaseSpec)):
-        for name, item in model.model_fields.items():
-            assert (item.alias or name) in known, f"{model.__name__}: {item.alias or name}"
-
-
-def _inside(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """Yield the models of a model's tables."""
-    rest = [item.annotation for item in model.model_fields.values()]
-    while rest:
-        kind = rest.pop()
-        rest += getattr(kind, "__args__", ())
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            yield kind
-            yield from _inside(kind)
+def test_phrases_long_sentences_and_long_pages_are_found(tmp_path, monkeypatch):
+    """Code and targets of links are no text; `make check` runs the check on the pages."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    check = importlib.import_module("plain_english")
+    page = tmp_path / "trust.md"
+    code = "`it says`, [a link](hardly.md)\n\n```sh\ntold\n```\n\n"
+    page.write_text(code + "A b. " * 700)
+    check.main([str(page)])
+    wrong = "It goes\non. " + "One, " * 30 + "two.\n\n| a cell | hardly any |\n\n"
+    page.write_text(code + wrong + "A b. " * 800)
+    with pytest.raises(SystemExit) as refused:
+        check.main([str(page)])
+    assert str(refused.value).replace(f"{page}:", "").splitlines() == [
+        "7: goes on -> continue",
+        "7: One, One, One, One, One, One, ... (31 words) -> at most 30",
+        "10: hardly -> barely",
+        "1: 1641 words -> at most 1500",
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
