@@ -80,9 +80,14 @@ def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
 
 def keep(path: Path, content: Mapping[str, Any]) -> None:
     """Write what was measured, with the commit."""
+    path.write_text(json.dumps({"commit": commit(), **content}, indent=1) + "\n")
+
+
+def commit() -> str:
+    """Return the short name of the present commit."""
     command = ["git", "rev-parse", "--short=8", "HEAD"]
     done = subprocess.run(command, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=True)
-    path.write_text(json.dumps({"commit": done.stdout.strip(), **content}, indent=1) + "\n")
+    return done.stdout.strip()
 
 
 def measured(content: Mapping[str, Any]) -> str:
