@@ -205,9 +205,9 @@ def needs_data(page: Path) -> bool:
 
 
 def takes_long(page: Path) -> bool:
-    """Return whether a page runs before a release only: models, tutorials, and the like."""
+    """Return whether a page runs before a release only: equations, tutorials, and the like."""
     deep = len(page.relative_to(ROOT).parts) > 2
-    return deep or page.name == "first-hour.md"
+    return deep or page.name in ("first-hour.md", "models.md", "extending.md")
 
 
 RUN = [pytest.param(page, marks=pytest.mark.long if takes_long(page) else ()) for page in PAGES]
