@@ -137,7 +137,7 @@ def test_the_case_of_a_new_pde_finds_the_truth(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", EQUATIONS)
 def test_every_equation_has_a_line_and_an_example(name):
-    """Its line in the table leads to its section, whose example runs; so do links of other pages."""
+    """Its line in the table, and links of the page of cases, lead to a section with an example."""
     page = (ROOT / "docs" / "models.md").read_text()
     sections = {}
     for section in re.split(r"^## ", page, flags=re.MULTILINE)[1:]:
