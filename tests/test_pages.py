@@ -380,6 +380,30 @@ def test_pages_that_the_program_writes(monkeypatch):
     assert "## `[[variants]]`" in keys
 
 
+def test_the_navigation_is_short_and_complete():
+    """Every page that people write is in it."""
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    nav = text[text.index("\nnav:") : text.index("\nnot_in_nav:")]
+    names = re.findall(r": ([\w/-]+\.md)$", nav, flags=re.MULTILINE)
+    assert len(names) == len(set(names)) <= 24
+    written = {*(path.relative_to(ROOT / "docs") for path in (ROOT / "docs").rglob("*.md"))}
+    generated = {"api", "gallery", "peers", "performance"}
+    assert {str(path) for path in written if path.parts[0] not in generated} - set(names) == {
+        "benchmark-commands.md",
+        "experiment-commands.md",
+    }
+
+
+def test_every_finding_is_explained():
+    """The page that assesses a run has a line for each finding, by the name that programs read."""
+    source = "".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
+    found = set(re.findall(r'\b(?:Finding|_said)\(\s*"([a-z ]+)"', source))
+    page = (ROOT / "docs" / "trust.md").read_text(encoding="utf-8")
+    explained = " ".join(re.findall(r"^\| (`.*?`) \|", page, flags=re.MULTILINE))
+    assert len(found) > 20
+    assert found <= set(re.findall(r"`([^`]+)`", explained))
+
+
 def test_phrases_long_sentences_and_long_pages_are_found(tmp_path, monkeypatch):
     """Code and targets of links are no text; `make check` runs the check on the pages."""
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
