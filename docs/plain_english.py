@@ -72,7 +72,7 @@ def blocks(text: str) -> Iterator[tuple[int, str]]:
 def plain(text: str) -> str:
     """Return text without targets of links, attributes and inline code, which is one word."""
     text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)|\{[ #:][^}]*\}", r"\1", text)
-    return re.sub(r"`+[^`]+`+", "X", text)
+    return re.sub(r"(?<!`)(`+)(?!`).+?(?<!`)\1(?!`)", "X", text)
 
 
 def problems(page: Path) -> Iterator[str]:
