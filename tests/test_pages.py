@@ -263,7 +263,7 @@ def test_what_a_page_names_is_there(page):
     """Commands, experiments, files and tests of the project, in quotes."""
     program = get_command(app)
     modules = {words: get_command(module).commands for words, module in PROGRAMS.items()}
-    for name in set(re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8"))):
+    for name in set(re.findall(r"(?<!`)`([^`\n]+)`(?!`)", page.read_text(encoding="utf-8"))):
         words = name.split()
         if re.fullmatch(r"test_\w+\.py(::\w+)?", name):
             assert is_a_test(name), name
