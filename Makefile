@@ -98,11 +98,12 @@ versions: $(READY)  ## Run the same on every other Python that is found, with co
 package: $(READY)  ## Build wheel and source distribution into dist/, and try the wheel in an empty environment
 	@$(BIN)/python .ci/package.py
 
-check: $(READY)  ## Check style, format, types and import layers
+check: $(READY)  ## Check style, format, types, import layers and plain English
 	@$(BIN)/ruff check --quiet
 	@$(BIN)/ruff format --check --quiet || { echo "Not formatted as agreed: run 'make format'."; exit 1; }
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+	@$(BIN)/python docs/plain_english.py
 
 format: $(READY)  ## Format the code and mend what can be mended automatically
 	@$(BIN)/ruff check --fix-only

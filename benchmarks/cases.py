@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -37,13 +38,14 @@ from livepde.verdict import MOST
 __all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
 
 GALLERY = """\
-# Gallery: cases
+# Gallery
 
-Every case on measurements or fields that others published, with its variants: what was estimated,
-the deviation that the law states, what others found, and the checks of the case. Written by
-`python -m benchmarks cases --gallery FOLDER`. RMSE is one step ahead, with all learning in it,
-"prior" that of the model with its unknowns at their prior, and time that of a sample over that of a
-forward step of the same model. Figures show the first run of each case.
+Every case on published measurements or fields, with its variants: estimates, their standard
+deviations, published values, and the checks of the case. RMSE is one step ahead and includes the
+learning phase; *prior* is the RMSE of the model with its unknowns at their prior. *Time* is the
+processor time of a sample over the time of a forward step. Figures show the first run of each case.
+Experiments of the paper and of examples have [their own page](experiments.md). Written by
+`python -m benchmarks cases --gallery docs/gallery`.
 
 """
 
@@ -387,5 +389,8 @@ def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
             lines.append(f"![{path.stem}]({job.figure.name})")
         parts.append("\n\n".join([*lines, re.sub("(?m)^## (.*)$", r"**\1**", report)]))
     target = folder / "gallery.md"
-    target.write_text(GALLERY + "\n".join(parts), encoding="utf-8")
+    command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=8", "HEAD"]
+    commit = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
+    recorded = f"Recorded at commit {commit}.\n\n"
+    target.write_text(GALLERY + recorded + "\n".join(parts), encoding="utf-8")
     return target

@@ -3,14 +3,15 @@
 Runs what `livepde reproduce` knows, the studies and scripts of experiments/, `python -m benchmarks
 control`, and the programs of examples/, each by the name of its experiment or file; without names
 all of them, which takes hours. What they print and draw is kept in docs/gallery/experiments/, and
-the page is made of all that is there. `--draw` runs nothing. The data of the cases are read from
-$LIVEPDE_DATA.
+the page is made of all that is there, with the commit of each run. `--draw` runs nothing. The data
+of the cases are read from $LIVEPDE_DATA.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import re
 import subprocess
 import sys
@@ -21,7 +22,7 @@ from pathlib import Path
 from textwrap import indent
 
 from matplotlib.figure import Figure
-from performance import printed, report
+from performance import commit, printed, report
 from PIL import Image
 
 from livepde.plots import PALETTE, figure
@@ -30,6 +31,7 @@ from livepde.reproduce import EXPERIMENTS
 PROJECT = Path(__file__).resolve().parents[1]
 PAGE = PROJECT / "docs" / "gallery" / "experiments.md"
 KEPT = PAGE.with_suffix("")
+COMMITS = KEPT / "commits.json"  # name -> commit of its last run
 WIDEST, COLOURS = 1100, 48  # pixels and colours of a figure
 LONGEST = 45  # lines of what a script prints that are shown
 OPTIONS = {
@@ -39,9 +41,9 @@ OPTIONS = {
 HEAD = """\
 # Gallery: experiments
 
-What the paper shows, what follows from it, and what needs the truth or hindsight, which the library
-must never see. Each with its figure, its table and its command. Written by `python
-docs/experiments_page.py`. The cases on data of others have [a page of their own](gallery.md).
+Experiments of the paper, studies that follow from it, and scripts that need the truth or hindsight.
+Each one has its command, its figure, its table and the commit at which it was recorded. Written by
+`python docs/experiments_page.py`. Cases on published data are in the [gallery](gallery.md).
 """
 COMMANDS = {  # what draws, and checks its numbers -> how it is run
     **dict.fromkeys(EXPERIMENTS, "livepde reproduce"),
@@ -54,7 +56,7 @@ COMMANDS = {  # what draws, and checks its numbers -> how it is run
 PARTS = {
     "reproduce": "Published experiments; commands and tests check their bounds.",
     "studies": "What follows from the paper; commands and tests check their bounds.",
-    "benchmarks": "What is held against others; the page of the benchmark has more.",
+    "benchmarks": "Comparisons with other methods; commands check their bounds.",
     "scripts": "They use the truth or hindsight. A dot is a number of the table below.",
     "examples": "Programs to start from.",
 }
@@ -219,12 +221,15 @@ def _script_command(path: Path) -> list[str]:
 def page() -> str:
     """Return the page of all that is kept."""
     files = scripts()
+    commits = json.loads(COMMITS.read_text(encoding="utf-8"))
     parts = [HEAD]
     for title, words in PARTS.items():
         names = [name for name in (*COMMANDS, *files) if _part(name, files) == title]
         kept = [name for name in names if _kept(name).exists()]
         parts += [f"## {title.capitalize()}\n\n{words}\n"] if kept else []
-        parts += [_script(files[name]) if name in files else _report(name) for name in kept]
+        for name in kept:
+            parts.append(_script(files[name]) if name in files else _report(name))
+            parts.append(f"Recorded at commit {commits[name]}.\n")
     return "\n".join(parts)
 
 
@@ -278,8 +283,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--draw", action="store_true", help="run nothing")
     chosen = parser.parse_args(arguments)
     KEPT.mkdir(exist_ok=True)
+    commits = json.loads(COMMITS.read_text(encoding="utf-8"))
     for name in () if chosen.draw else chosen.names or known:
         run(name)
+        commits[name] = commit()
+        COMMITS.write_text(json.dumps(commits, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     PAGE.write_text(page(), encoding="utf-8")
 
 

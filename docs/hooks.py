@@ -1,10 +1,10 @@
-"""What the program writes into pages while the site is built, in the place of comments.
+"""Replace comments of pages by text of the program while the site is built.
 
 <!-- command line -->             the help of all commands
 <!-- benchmarks -->               the help of all benchmarks
 <!-- experiments -->              the help of all studies
 <!-- keys of a case -->           tables of all keys of a case file
-<!-- members of livepde.ROOM -->  what a room exports beside what livepde itself does
+<!-- members of livepde.NAME -->  the exports of a package that livepde itself does not export
 """
 
 from __future__ import annotations
@@ -47,8 +47,18 @@ def command_line(module: str = "livepde.cli", name: str = "livepde") -> str:
     text = text.replace("* `--help`: Show this message and exit.\n", "")
     text = text.replace("**Options**:\n\n\n", "").split("\n\n", 1)[1]
     # Examples are words to Typer: a line for each, and as code.
-    example = r"^(.*?)(Example|Replay|Service): +(\S.*)$"
+    example = r"^(.*?)(Example|Your own|Replay|Service): +(\S.*)$"
     return re.sub(example, r"\1\n\n\2: `\3`", text, flags=re.MULTILINE)
+
+
+def commands() -> str:
+    """Return the help of all commands of livepde, as sections below a heading."""
+    return below(command_line())
+
+
+def below(text: str) -> str:
+    """Return text with its headings one rank lower."""
+    return re.sub(r"^##", "###", text, flags=re.MULTILINE)
 
 
 def benchmarks() -> str:
@@ -61,18 +71,18 @@ def experiments() -> str:
     return command_line("experiments.__main__", "python -m experiments")
 
 
-def members(room: str) -> str:
-    """Return a directive for mkdocstrings that shows what only this room exports."""
-    names = [name for name in import_module(room).__all__ if name not in livepde.__all__]
+def members(package: str) -> str:
+    """Return a directive for mkdocstrings that shows what only this package exports."""
+    names = [name for name in import_module(package).__all__ if name not in livepde.__all__]
     hidden = {"show_root_heading": False, "show_root_toc_entry": False}
     options = {"heading_level": 3, "members": names, **hidden}
-    return f"::: {room}\n    options: {json.dumps(options)}\n"
+    return f"::: {package}\n    options: {json.dumps(options)}\n"
 
 
 def keys_of_a_case() -> str:
     """Return what each table of a case file may hold, from the models that validate it."""
     schema = case_schema()
-    return "\n".join(_section("", schema, schema["$defs"]))
+    return below("\n".join(_section("", schema, schema["$defs"])))
 
 
 def _section(path: str, model: Schema, models: Schema) -> Iterator[str]:
@@ -158,7 +168,7 @@ SIMPLE = {
     "string": "text",
 }
 WRITERS = {
-    "<!-- command line -->": command_line,
+    "<!-- command line -->": commands,
     "<!-- benchmarks -->": benchmarks,
     "<!-- experiments -->": experiments,
     "<!-- keys of a case -->": keys_of_a_case,

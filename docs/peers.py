@@ -1,9 +1,8 @@
-"""Measure what docs/peers.md shows, with: python docs/peers.py [rod heat2d ...].
+"""Write docs/peers/results.md, with: python docs/peers.py [rod heat2d ...].
 
 Runs `python -m benchmarks peers` for each problem, keeps what it prints as JSON in docs/peers/, and
-puts all that is there into the page, between two of its headings. `--draw` measures nothing: so
-files of other runs can be added by hand, as
-`python -m benchmarks peers --only rod --seeds 16 --json > docs/peers/rod.json`.
+makes a page of all that is there. `--draw` measures nothing: so files of other runs can be added by
+hand, as `python -m benchmarks peers --only rod --seeds 16 --json > docs/peers/rod.json`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from performance import printed, report
+from performance import keep, measured, printed, report
 
 DOCS = Path(__file__).resolve().parent
 MEASURED = DOCS / "peers"
@@ -22,11 +21,13 @@ PROBLEMS = ("rod", "rod-source", "seed", "seed-excited", "heat2d", "burgers-vary
 SEEDS: Mapping[str, int] = {"rod": 16, "rod-source": 16}
 FEW = 4  # seeds of the others
 
-BEGIN, END = "## What was measured\n", "## What these tables do not say\n"
-MADE = (
-    "Each table is what the command above it has printed, kept in `docs/peers/*.json`; "
-    "`python docs/peers.py` runs them, with more data sets, and makes this part of the page."
-)
+PAGE = """\
+# Comparison with peers: results
+
+Written by `python docs/peers.py` from `docs/peers/*.json`; each section names its command and the
+commit that was measured. [Performance and comparison](../performance.md#comparison-with-peers)
+explains the rows and columns.
+"""
 
 
 def measure(names: Iterable[str]) -> None:
@@ -35,27 +36,22 @@ def measure(names: Iterable[str]) -> None:
     for name in names:
         seeds = str(SEEDS.get(name, FEW))
         content = printed(["peers", "--only", name, "--seeds", seeds, "--json"])
-        (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+        keep(MEASURED / f"{name}.json", content)
 
 
 def section(name: str, content: Mapping[str, Any]) -> str:
-    """Return what was printed of a problem as a part of the page."""
+    """Return what was printed of a problem as a section of the page."""
     text = report(name, {**content, "notes": []})
-    lines = [f"##{line}" if line.startswith("#") else line for line in text.splitlines()]
-    return "\n".join([lines[0], "", f"```sh\n{content['command']}\n```", *lines[1:]]) + "\n"
+    lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
+    return "\n".join([lines[0], "", measured(content), *lines[1:]]) + "\n"
 
 
 def write(folder: Path = DOCS) -> None:
-    """Put what was measured into the page."""
+    """Make the page of what was measured."""
     files = [folder / "peers" / f"{name}.json" for name in PROBLEMS]
     found = {path.stem: json.loads(path.read_text()) for path in files if path.exists()}
-    parts = ["", MADE, "", *(section(name, content) for name, content in found.items())]
-    page = folder / "peers.md"
-    before, rest = page.read_text().split(BEGIN)
-    _, after = rest.split(END)
-    page.write_text(
-        before + BEGIN + "\n".join([*parts, ""]).replace("\n\n\n", "\n\n") + END + after
-    )
+    parts = [PAGE, *(section(name, content) for name, content in found.items())]
+    (folder / "peers" / "results.md").write_text("\n".join(parts))
 
 
 def main() -> None:

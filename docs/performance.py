@@ -1,9 +1,9 @@
-"""Measure what docs/performance.md shows, with: python docs/performance.py [step scale ...].
+"""Write docs/performance/costs.md, with: python docs/performance.py [step scale ...].
 
 Runs benchmarks of livepde, keeps what they print as JSON in docs/performance/, and makes page and
 figures of all that is there. `--draw` measures nothing: so files of longer runs can be added by
-hand, as `python -m benchmarks step --size 1000000 --json > docs/performance/step-1e6.json`. Of a
-row that stands in several files the last one, by name, is shown.
+hand, as `python -m benchmarks step --size 1000000 --json > docs/performance/step-1e6.json`. If a
+row is in several files, the last one by name is shown.
 """
 
 from __future__ import annotations
@@ -46,40 +46,21 @@ MARKERS = "osD^vP*X"
 Row = Mapping[str, Any]
 
 PAGE = """\
-# What it costs
+# Measured costs
 
-A step of an identification against one of a simulation, and the memory that it takes, against the
-size of the mesh. Costs are ratios of processor times taken in one process, pair by pair: they hold
-on any machine, up to some ten per cent from run to run. Bounds stand in the code beside what they
-bound; `--json` prints them, and its exit code is 1 if one fails.
+Written by `python docs/performance.py` from `docs/performance/*.json`; each section names its
+command and the commit that was measured. [Performance and comparison](../performance.md) explains
+the columns. A check that fails is marked `FAILED`.
 
-The page, its figures and the numbers behind them (`docs/performance/*.json`) are made by
-`python docs/performance.py`.
+![One step over one forward step](step.png)
 
-![One step over one forward step](performance/step.png)
-
-*Solid: the median of the pairs. Dashed, in the same colour: what was promised. The forward step is
-one of the same model, by the law's own scheme, with a known parameter, its matrix factorised once.*
-
-On rods, and on a square of 10 000 nodes, `python -m benchmarks step` times the laws for a few
-numbers from the first sample on: medians, and beside them means, which have the first sample and
-refits in them. Rows with `source` have constant ends and a constant source, as a forward step of
-little work; rows with `channels` read the temperatures of both ends from the stream, as the rod of
-the README. The *lean reference* is the same filter in thirty lines of NumPy and LAPACK
-(`benchmarks/lean.py`), without safeguards, missing samples, bounds or substeps: it has the same
-numbers, and a test says so. Bounds mean forward steps of commit 51ef98c, so that a faster forward
-step does not make them harder; `python -m benchmarks.earlier` steps that commit and today's sources
-in turns, in a process each, and prints today's forward step over that one's.
-
-The same command times usual samples: `SensitivityLaw` with its defaults on the samples 100 to 300,
-and a fleet of 1000 rods with the defaults of fleets. There a forward step is one of implicit Euler.
-The mean includes refits, the largest sample does not. Checks that fail are marked `FAILED`.
+*Solid: median. Dashed, in the same colour: bound.*
 """
 MEMORY = """\
-![Memory per state unknown](performance/memory.png)
+![Memory per state unknown](memory.png)
 
-*What an identification adds to a process that has imported livepde, the forward model included, per
-state unknown.*
+*Memory that an identification adds to a process that has imported livepde, the forward model
+included, per state unknown.*
 """
 
 
@@ -94,7 +75,26 @@ def measure(names: Iterable[str], sizes: Sequence[int]) -> None:
             chosen = [word for size in sizes for word in ("--size", str(size))]
             command = [name, *(chosen if name in SIZED else []), "--json"]
             content = printed(command)
-        (MEASURED / f"{name}.json").write_text(json.dumps(content, indent=1) + "\n")
+        keep(MEASURED / f"{name}.json", content)
+
+
+def keep(path: Path, content: Mapping[str, Any]) -> None:
+    """Write what was measured, with the commit."""
+    path.write_text(json.dumps({"commit": commit(), **content}, indent=1) + "\n")
+
+
+def commit() -> str:
+    """Return the short name of the present commit."""
+    command = ["git", "rev-parse", "--short=8", "HEAD"]
+    done = subprocess.run(command, cwd=PROJECT, stdout=subprocess.PIPE, text=True, check=True)
+    return done.stdout.strip()
+
+
+def measured(content: Mapping[str, Any]) -> str:
+    """Return the command and the commit of what was measured, as a part of a page."""
+    commands = content.get("commands") or [content["command"]]
+    commits = content.get("commits") or [content["commit"]]
+    return "\n".join(["```sh", *commands, "```", "", f"Recorded at commit {', '.join(commits)}."])
 
 
 def printed(command: Sequence[str]) -> dict[str, Any]:
@@ -125,11 +125,13 @@ def _memory(sizes: Sequence[int]) -> dict[str, Any]:
 def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     """Return several outputs of one benchmark as one: rows and checks by their first cells."""
     commands: list[str] = []
+    commits: list[str] = []
     tables: dict[str, dict[str, Any]] = {}
     checks: dict[str, Any] = {}
     notes: dict[str, None] = {}
     for content in contents:
         commands.append(content["command"])
+        commits.append(content["commit"])
         checks |= {item["name"]: item for item in content["checks"]}
         notes |= dict.fromkeys(content["notes"])
         for table in content["tables"]:
@@ -140,6 +142,7 @@ def merged(contents: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
         table["rows"] = list(table["rows"].values())
     return {
         "commands": list(dict.fromkeys(commands)),
+        "commits": list(dict.fromkeys(commits)),
         "tables": list(tables.values()),
         "checks": list(checks.values()),
         "notes": list(notes),
@@ -225,8 +228,7 @@ def section(name: str, content: Mapping[str, Any]) -> str:
     title = f"python -m benchmarks {name}" if name != "memory" else "Memory"
     text = report(title, content)
     lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
-    commands = "\n".join(content["commands"])
-    return "\n".join([lines[0], "", f"```sh\n{commands}\n```", *lines[1:]]) + "\n"
+    return "\n".join([lines[0], "", measured(content), *lines[1:]]) + "\n"
 
 
 def write(folder: Path = DOCS) -> None:
@@ -246,7 +248,7 @@ def write(folder: Path = DOCS) -> None:
         memory(lines).savefig(folder / "performance" / "memory.png", dpi=120)
         parts.append(MEMORY)
     parts += [section(name, content) for name, content in contents.items()]
-    (folder / "performance.md").write_text("\n".join(parts))
+    (folder / "performance" / "costs.md").write_text("\n".join(parts))
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
-"""Take the pictures of docs/live-page.md, with: python docs/screenshots.py.
+"""Take the picture of the live page in docs/service.md, with: python docs/screenshots.py.
 
-Runs cases of the project on real data, and photographs their pages in headless Chromium. Needs
-$LIVEPDE_DATA, and Chromium with its driver (Debian: chromium chromium-driver).
+Runs a case of the project on real data, and takes a screenshot of its page in headless Chromium.
+Requires $LIVEPDE_DATA, and Chromium with its driver (Debian: chromium chromium-driver).
 """
 
 from __future__ import annotations
@@ -87,10 +87,10 @@ def take(
 
 
 def main() -> None:
-    """Take all pictures."""
+    """Take the picture of a live run."""
     page = browser()
     with tempfile.TemporaryDirectory() as scratch:
-        soil, field = Path(scratch) / "soil", Path(scratch) / "field"
+        soil = Path(scratch) / "soil"
         live = subprocess.Popen(
             command("soil_layers.toml", soil, "--realtime", "--speed", "36000"),
             stdout=subprocess.DEVNULL,
@@ -100,15 +100,8 @@ def main() -> None:
                 raise SystemExit("the run has ended early")
             time.sleep(0.5)
         take(page, soil, "live-page", (1280, 1500), lambda p: facts(p) >= LIVE)
-        take(page, soil, "live-page-phone", (390, 1250), lambda p: facts(p) >= LIVE)
         live.terminate()
         live.wait()
-        subprocess.run(
-            command("horkheim_field.toml", field, "--allow-code"),
-            check=True,
-            stdout=subprocess.DEVNULL,
-        )
-        take(page, field, "live-page-map", (1280, 1480), lambda p: facts(p) > 0)
     page.quit()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -89,6 +90,7 @@ def test_a_case_with_variants_and_one_that_fails(project, tmp_path):
     assert "has no function 'raed'" in found["notes"][0]
     page = (tmp_path / "page" / "gallery.md").read_text()
     assert "![rod](rod.png)" in page
+    assert re.search(r"^Recorded at commit [0-9a-f]{8}\.$", page, re.MULTILINE)
     assert (tmp_path / "page" / "rod.png").exists()
 
 

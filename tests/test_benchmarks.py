@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -110,6 +111,7 @@ def output(ratio: float, *, nodes: int, ok: bool = True) -> str:
         ],
     }
     content = {
+        "commit": "0123abcd",
         "command": "python -m benchmarks step",
         "checks": [check],
         "tables": [table],
@@ -125,14 +127,16 @@ def test_the_page_of_costs_shows_all_that_was_measured(page, tmp_path):
     (folder / "step-again.json").write_text(output(2.75, nodes=31))
     (folder / "step-large.json").write_text(output(2.5, nodes=1_000))
     table = {"title": "Memory", "columns": ["nodes", "kB per unknown"], "rows": [[1_000, 1.5]]}
-    found = {"command": "python -m benchmarks scale", "checks": [], "tables": [table], "notes": []}
+    found = {"commit": "4567cdef", "command": "python -m benchmarks scale", "checks": []}
+    found |= {"tables": [table], "notes": []}
     (folder / "scale.json").write_text(json.dumps(found))
     page.write(tmp_path)
-    text = (tmp_path / "performance.md").read_text()
+    text = (folder / "costs.md").read_text()
     assert "| 31 | gradient, gain 1, c1 0.1 | 2.75 | 2.75 | 2.75 | 3 |" in text
     assert "| 1000 | sensitivity | 1 | 2 | 3 | – |" in text
     assert "4.25" not in text  # measured again
     assert text.count("python -m benchmarks step\n") == 2  # title and command
+    assert text.count("Recorded at commit 0123abcd.\n") == 1
     assert {"step.png", "memory.png"} <= {file.name for file in folder.iterdir()}
     assert page.remembered({"scale": found}) == {"scale": [(1_000, 1.5)]}
 
@@ -141,6 +145,7 @@ def test_what_a_benchmark_prints_is_kept(page, tmp_path, monkeypatch):
     monkeypatch.setattr(page, "MEASURED", tmp_path / "performance")
     page.measure(["step"], [12])
     found = json.loads((tmp_path / "performance" / "step.json").read_text())
+    assert re.fullmatch("[0-9a-f]{8}", found["commit"])
     assert {row["nodes"] for row in page.rows_of(found)} == {12}
     assert len({row["law"] for row in page.rows_of(found)}) > 3
     with pytest.raises(SystemExit, match="no JSON"):
@@ -156,7 +161,6 @@ def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
     peers = importlib.import_module("peers")
     folder = tmp_path / "peers"
     folder.mkdir()
-    (tmp_path / "peers.md").write_text((peers.DOCS / "peers.md").read_text())
     columns = ["noise", "estimator", "error", "mean"]
     check = {"name": "cost", "value": 1.5, "bound": 1.0, "sense": "<=", "ok": False}
     for name, cost in (("rod", 4.25), ("wall", 2.5)):
@@ -165,20 +169,17 @@ def test_the_page_of_peers_shows_all_that_was_measured(page, tmp_path):
             "columns": columns,
             "rows": [["1%", "lean", 0.5, cost]],
         }
-        content = {"command": f"python -m benchmarks peers --only {name}", "checks": [check]}
+        content = {"commit": "0123abcd", "command": f"python -m benchmarks peers --only {name}"}
         (folder / f"{name}.json").write_text(
-            json.dumps(content | {"tables": [table], "notes": ["a note"]})
+            json.dumps(content | {"checks": [check], "tables": [table], "notes": ["a note"]})
         )
     peers.write(tmp_path)
-    text = (tmp_path / "peers.md").read_text()
-    peers.write(tmp_path)
-    assert (tmp_path / "peers.md").read_text() == text  # what was there is replaced
+    text = (folder / "results.md").read_text()
     assert text.startswith("# Comparison with peers")
-    assert text.index("### rod") < text.index("| 1% | lean | 0.5 | 4.25 |") < text.index("### wall")
+    assert text.index("## rod") < text.index("| 1% | lean | 0.5 | 4.25 |") < text.index("## wall")
     assert text.count("python -m benchmarks peers --only wall") == 1
     assert text.count("FAILED") == 2
     assert "a note" not in text
-    assert "## What these tables do not say" in text
 
 
 def test_the_page_of_peers_knows_the_problems_of_the_benchmark(page):

@@ -18,7 +18,7 @@ from livepde.models import EQUATIONS
 pytestmark = pytest.mark.pages
 
 ROOT = Path(__file__).parents[1]
-TUTORIAL = ROOT / "docs" / "tutorials" / "own-pde.md"
+EXTENDING = ROOT / "docs" / "extending.md"
 TOML = re.compile(r"^```toml[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 BLOCK = re.compile(r"^```python[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
@@ -108,17 +108,17 @@ def test_a_new_pde_takes_forty_lines_which_the_page_shows():
     """Model, data and checks together; what the docs show is the file that runs."""
     example = (ROOT / "examples" / "own_pde.py").read_text()
     assert len(example.splitlines()) <= 40
-    first, *_ = BLOCK.findall(TUTORIAL.read_text())
+    first, *_ = BLOCK.findall(EXTENDING.read_text())
     assert first == example
 
 
 def test_the_case_of_a_new_pde_finds_the_truth(tmp_path, monkeypatch):
-    """The tutorial runs it; without its channel or without permission it is one sentence."""
+    """The page runs it; without its channel or without permission it is one sentence."""
     example = ROOT / "examples" / "own_pde.py"
     (tmp_path / "own_pde.py").write_text(example.read_text())
-    (case,) = TOML.findall(TUTORIAL.read_text())
+    (case,) = TOML.findall(EXTENDING.read_text())
     (tmp_path / "rod.toml").write_text(case)
-    *_, data = BLOCK.findall(TUTORIAL.read_text())
+    (data,) = (block for block in BLOCK.findall(EXTENDING.read_text()) if "rod.csv" in block)
     monkeypatch.chdir(tmp_path)
     exec(data, vars(load("own_pde")))
     (tmp_path / "less.toml").write_text(re.sub(r"^a = .*\n", "", case, flags=re.MULTILINE))
@@ -135,17 +135,18 @@ def test_the_case_of_a_new_pde_finds_the_truth(tmp_path, monkeypatch):
     assert abs(found["eps"] - 0.8) < 3 * found["eps.std"] < 0.02
 
 
-def test_every_page_of_an_equation_is_in_the_navigation():
-    named = re.findall(r"models/(\w+)\.md", (ROOT / "mkdocs.yml").read_text())
-    assert sorted(named) == sorted(path.stem for path in (ROOT / "docs" / "models").glob("*.md"))
-
-
 @pytest.mark.parametrize("name", EQUATIONS)
-def test_every_equation_has_a_page_and_a_line(name):
-    """The page names it and has an example that runs; the table of the cases leads there."""
-    pages = {path.stem: path.read_text() for path in (ROOT / "docs" / "models").glob("*.md")}
-    described = [stem for stem, text in pages.items() if f"`{name}`" in text and BLOCK.search(text)]
-    assert described
-    lines = (ROOT / "docs" / "cases.md").read_text().splitlines()
-    links = [line for line in lines if line.startswith(f"| [`{name}`](models/")]
-    assert [re.search(r"models/(\w+)\.md", line)[1] in described for line in links] == [True]
+def test_every_equation_has_a_line_and_an_example(name):
+    """Its line in the table, and links of the page of cases, lead to a section with an example."""
+    page = (ROOT / "docs" / "models.md").read_text()
+    sections = {}
+    for section in re.split(r"^## ", page, flags=re.MULTILINE)[1:]:
+        title = section.splitlines()[0]
+        sections[re.search(r"\{#(\w+)\}$", title)[1]] = (title, section)
+    (anchor,) = re.findall(rf"^\| \[`{name}`\]\(#(\w+)\)", page, flags=re.MULTILINE)
+    title, section = sections[anchor]
+    assert f"`{name}`" in title
+    assert BLOCK.search(section)
+    for line in (ROOT / "docs" / "cases.md").read_text().splitlines():
+        for named, to in re.findall(r"\[`(\w+)`\]\(models\.md#(\w+)\)", line):
+            assert named != name or to == anchor

@@ -14,7 +14,8 @@ from livepde.reproduce import EXPERIMENTS
 
 PACKAGES = ("livepde.", "experiments.")
 ROOT = Path(__file__).parents[1]
-PAGE = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+WHOLE = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+PAGE = WHOLE[WHOLE.index("## Line by line") : WHOLE.index("## Conditions along a run")]
 QUOTED = sorted(set(re.findall(r"`([^`]+)`", PAGE)))
 
 # Labels of the paper's equations, assumptions, lemmas, propositions, theorems and figures.

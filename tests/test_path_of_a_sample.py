@@ -1,4 +1,4 @@
-"""The path of one sample in docs/developers.md is the one that a profiler sees."""
+"""The path of one sample in CONTRIBUTING.md is the one that a profiler sees."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import pytest
 import livepde as lp
 from livepde.models import heat
 
-PAGE = Path(__file__).parent.parent / "docs" / "developers.md"
+PAGE = Path(__file__).parent.parent / "CONTRIBUTING.md"
 SOURCE = Path(lp.__file__).parent
 
 
 def documented() -> list[tuple[str, list[str]]]:
     """Return functions of the path, and the files that the page gives for each."""
-    table = PAGE.read_text().split("## The path of one sample")[1].split("\n## ")[0]
+    table = PAGE.read_text().split("### The path of one sample")[1].split("\n### ")[0]
     found = []
     for line in table.splitlines():
         if not line.startswith("| `"):
