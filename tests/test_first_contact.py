@@ -474,8 +474,66 @@ def test_inference_data_for_arviz():
     assert tree["posterior"]["alpha"].sizes == {"chain": 1, "draw": 50}
     assert tree["prior"]["alpha"].std() > 3.0 * tree["posterior"]["alpha"].std()
     assert np.allclose(tree["observed_data"]["T_30"], dated()["T_30"])
+    assert tree["posterior_predictive"]["T_30"].sizes == {"chain": 1, "draw": 50, "time": 24}
     arviz = pytest.importorskip("arviz_base")
     assert arviz.extract(tree)["alpha"].sizes["sample"] == 50
+
+
+def test_the_likelihood_of_draws_is_that_of_simulations():
+    noise = np.where(np.arange(24) % 2, NOISE, 2.0 * NOISE)
+    table = dated().assign(**{"noise of T_30": noise})
+    table.iloc[7, 1] = np.nan
+    who = identifier(dt_max=0.005, law=lp.SensitivityLaw(shadows=None))
+    tree = who.run(table).to_inference_data(400, seed=3)
+    found = tree["log_likelihood"]["readings"].isel(chain=0)
+    t, nodes = measured().index.to_numpy(), [6, 12]
+    for draw in (0, 1):
+        q = rod().initial_parameter({"alpha": tree["posterior"]["alpha"].values[0, draw]})
+
+        def ends(when):  # inputs change linearly between their readings
+            return {"T_left": float(np.interp(when, t, table["T_left"]))}
+
+        fine = lp.Advance(lp.Alexander2(), 0.005)
+        run = lp.simulate(rod(), q, 0.0, t.tolist(), fine, ends)
+        shown = np.array([(rod().state_block.at_vertices @ u)[nodes] for _, u in run])
+        std = np.column_stack([noise, np.full(24, NOISE)])
+        e = (table[["T_30", "T_60"]].to_numpy() - shown) / std
+        density = (-0.5 * e**2 - np.log(std * np.sqrt(2.0 * np.pi)))[1:]  # the start is known
+        assert np.allclose(
+            found[draw], density[np.isfinite(density)], rtol=0.0, atol=5e-3
+        )  # linear
+    assert list(found["sensor"].values[:4]) == ["T_30", "T_60", "T_30", "T_60"]
+    assert found["time"].values[0] == table.index.values[1]
+    shown = tree["posterior_predictive"]["T_30"].isel(time=slice(2, None))
+    assert np.allclose(shown.std(("chain", "draw")), noise[2:], rtol=0.25)
+
+
+def test_arviz_compares_by_the_likelihood():
+    stats = pytest.importorskip("arviz_stats")
+    tree = found().to_inference_data(400)
+    loo = stats.loo(tree)
+    assert 0.5 < loo.p < 2.0  # one unknown
+    row = stats.summary(tree, var_names=["alpha"]).loc["alpha"]
+    assert float(row["mean"]) == pytest.approx(TRUE, rel=0.1)
+
+
+def test_noise_of_inputs_widens_the_likelihood():
+    exact, noisy = (
+        identifier(**options).run(measured().iloc[:9]).to_inference_data(99)
+        for options in ({}, {"input_noise": {"T_left": 2.0}})
+    )
+    spread = [tree["posterior_predictive"]["T_30"].std("draw").mean() for tree in (exact, noisy)]
+    assert spread[1] > 2.0 * spread[0]
+
+
+def test_unknowns_that_move_have_no_likelihood_of_a_draw():
+    drifting = lp.Scalar(lp.LogNormal(0.1, std=0.05), evolution=lp.RandomWalk(0.1))
+    model = heat(lp.interval(0.0, 1.0, 8), drifting, {"right": 0.0})
+    who = lp.Identifier(model, lp.Points({"T": 0.5}, noise=0.1), u0=1.0)
+    assert "log_likelihood" not in who.run([(0.1, [1.0])]).to_inference_data(3)
+    who = identifier()
+    who.run(measured().iloc[:9])
+    assert "log_likelihood" not in who.run(measured().iloc[9:]).to_inference_data(3)
 
 
 # --- objects that show themselves ----------------------------------------------------------------

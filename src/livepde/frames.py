@@ -27,6 +27,7 @@ __all__ = [
     "frame",
     "model_errors",
     "over_time",
+    "predictive",
     "prior_draws",
     "relative_error",
     "times",
@@ -186,6 +187,47 @@ def prior_draws(
         latent = prior.latent_mean + prior.latent_std * rng.standard_normal(n)
         found[label] = np.clip(prior.transform.value(latent), *prior.bounds)
     return found
+
+
+def predictive(
+    measured: pd.DataFrame,
+    expected: Array,
+    std: Array,
+    seed: int | np.random.Generator | None,
+) -> dict[str, xr.Dataset]:
+    """Return draws of readings and log densities: see `Result.to_inference_data`.
+
+    Parameters
+    ----------
+    measured
+        Readings, one column for each sensor.
+    expected, std
+        What they are for each draw, shape (n, samples, sensors), and their standard deviations
+        about it, shape (samples, sensors).
+    """
+    import xarray as xr
+
+    n, values = len(expected), measured.to_numpy()
+    drawn = expected + std * np.random.default_rng(seed).standard_normal(expected.shape)
+    shown = {name: (("draw", "time"), drawn[..., k]) for k, name in enumerate(measured)}
+    rows, columns = (np.isfinite(values) & np.isfinite(std)).nonzero()
+    scale = std[rows, columns]
+    e = (values[rows, columns] - expected[:, rows, columns]) / scale
+    density = -0.5 * e**2 - np.log(scale) - 0.5 * math.log(2.0 * math.pi)
+    # ArviZ refuses readings that are the same for all draws, as where the initial state is known.
+    told = np.ptp(density, axis=0) > 1e-12 * np.abs(density).max(axis=0, initial=1.0)
+    about = {
+        "time": ("reading", measured.index[rows[told]]),
+        "sensor": ("reading", measured.columns[columns[told]].to_numpy(dtype=str)),
+    }
+    groups = {
+        "posterior_predictive": xr.Dataset(shown, {"time": measured.index}),
+        "log_likelihood": xr.Dataset({"readings": (("draw", "reading"), density[:, told])}, about),
+    }
+    return {
+        name: group.assign_coords(draw=np.arange(n)).expand_dims(chain=[0])
+        for name, group in groups.items()
+    }
 
 
 def _factor(belief: Belief) -> Array:

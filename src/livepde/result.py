@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -19,6 +19,7 @@ from livepde.frames import (
     estimates,
     frame,
     over_time,
+    predictive,
     prior_draws,
     times,
     with_estimates,
@@ -387,6 +388,8 @@ class Result(Shown):
         self._ended = False  # a last fit was asked for
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.readings: Callable[[], Array] | None = None  # of all samples, (samples, sensors)
+        # From q and draws of it to the readings that they lead to, and their deviations.
+        self.expected: Callable[[Array, Array], tuple[Array, Array]] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
@@ -594,8 +597,23 @@ class Result(Shown):
     def to_inference_data(self, n: int = 1000, seed: int | None = 0) -> xr.DataTree:
         """Return what ArviZ (from 1.0 on) plots and compares: an xarray DataTree.
 
-        Its groups are `posterior`, the draws of `sample`; `prior`, draws of the numbers among the
-        unknowns; and `observed_data`, the readings, if they are known (see `measured`).
+        Its groups:
+
+        - `posterior`: the draws of `sample`. `prior`: draws of the numbers among the unknowns.
+        - `observed_data`: the readings of all sensors, of a result of `Identifier.run`.
+        - `posterior_predictive`: for each draw of the unknowns, draws of the readings of the
+          assimilated sensors, noise included.
+        - `log_likelihood`: `readings` over `reading`, for each draw of the unknowns the log density
+          of each assimilated reading, so that `arviz.loo` compares models by it. A reading that no
+          unknown reaches, as at a known initial state, is left out.
+
+        For the last two all samples are taken again, which takes as long as a run. What a draw
+        leads to is linear about the last estimate: the model from the initial state on, without
+        corrections by the readings. So these are no predictions one step ahead, which are
+        `predicted` and do not depend on a draw. Noise of inputs, errors of the initial state and of
+        the discretisation widen each density. Readings that the gate has refused count as the
+        others. Runs of unknowns that move, and runs that continue an earlier one, have neither
+        group.
 
         Parameters
         ----------
@@ -614,6 +632,12 @@ class Result(Shown):
         if self.readings is not None:
             frame = self.measured
             chains["observed_data"] = xr.Dataset({name: frame[name] for name in frame})
+        if self.expected is not None:
+            last = self._last("to_inference_data")
+            # The same draws as in `sample`, without what the law takes no account of.
+            q, _ = draws(replace(last.belief, rest=None), last.space, n, seed)
+            measured = self.measured[list(self.layout.sensors)]
+            chains |= predictive(measured, *self.expected(last.q, q), seed)
         return xr.DataTree.from_dict(chains)
 
     @property
@@ -708,6 +732,7 @@ class Result(Shown):
             "_last_fields": fields,
             "_complete": True,
             "smoother": None,
+            "expected": None,
         }
         if self.readings is not None:
             own["readings"] = partial(kept, self.readings())
