@@ -424,6 +424,51 @@ def test_draws_have_the_moments_of_the_estimate():
     assert two().sample(3, seed=1).identical(two().sample(3, seed=1))
 
 
+def test_a_field_at_points():
+    estimate, data = two().last, two().to_xarray().isel(snapshot=-1)
+    x = np.array([0.05, 0.3, 0.325])
+    for name in ("s", "u"):
+        found = estimate[name].at(x)
+        std = data[f"{name}_std"].values
+        assert np.allclose(found.mean, np.interp(x, data["x"], data[name]))
+        assert np.allclose(found.std[:2], std[[1, 6]])
+        assert found.std[2] < std[6:8].max() + 1e-12
+        low, high = found.interval()
+        assert np.allclose((high - low) / 2.0, 1.959964 * found.std)
+    drawn = two().sample(4000, seed=1)["u"].values
+    at = estimate["u"].at(0.325)  # between two vertices
+    assert at.std == pytest.approx(drawn[:, 6:8].mean(axis=1).std(), rel=0.05)
+    assert isinstance(at.mean, float)
+    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5\] lies outside of the"):
+        estimate["u"].at([0.5, 1.5])
+    with pytest.raises(lp.errors.ConfigurationError, match=r"expected numbers, shape \(points,\)"):
+        estimate["u"].at([[0.5, 1.5]])
+    with pytest.raises(lp.errors.ConfigurationError, match="only a field has values at points"):
+        estimate["k"].at(0.5)
+    with pytest.raises(lp.errors.ConfigurationError, match=r"no unknown 'D'; there are .*'s', 'u'"):
+        estimate["D"]
+
+
+def test_a_vector_field_and_a_logarithm_at_points():
+    from skfem import ElementQuad1, ElementVector
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
+    state = lp.Field(mesh, ElementVector(ElementQuad1()))
+    k = lp.Field(mesh, lp.linear(mesh), prior=lp.LogNormal(2.0, std=0.2), inner="H1")
+    model = lp.Model(state, {"k": k}, A=lambda q, u, v, x: q.k * lp.dot(u, v))
+    sensors = lp.Points({"a": (0.25, 0.5)}, component=0, noise=0.1)
+    start = lambda x: np.array([1.0 + x[0], 3.0 * x[1]])  # noqa: E731
+    estimate = lp.Identifier(model, sensors, u0=start).step(1e-9, [1.25])
+    found = estimate["u"].at([(0.25, 0.5), (0.3, 0.9)])
+    assert np.allclose(found.mean, [[1.25, 1.5], [1.3, 2.7]])
+    assert estimate["u"].at((0.25, 0.5)).std.shape == (2,)
+    inside = estimate["k"].at((0.1, 0.2))
+    assert inside.median == pytest.approx(2.0)
+    assert inside.interval()[0] > 0.0
+    with pytest.raises(lp.errors.ObservationError, match=r"point 0 at \[2.0, 0.5\] lies outside"):
+        estimate["k"].at([2.0, 0.5])
+
+
 def test_draws_lie_within_bounds():
     mesh = lp.interval(0.0, 1.0, 20)
     model = heat(mesh, lp.LogitNormal(0.1, bounds=(0.0, 0.2), std=0.05), {"right": 0.0})
@@ -451,6 +496,10 @@ def test_results_and_estimates_are_pickled():
     assert result.covariance().equals(found().covariance())
     estimate = pickle.loads(pickle.dumps(found().last))
     assert estimate.parameters == found().last.parameters
+    with pytest.raises(lp.errors.ConfigurationError, match="no unknown 'u'; there are"):
+        estimate["u"]
+    with pytest.raises(lp.errors.ConfigurationError, match="pickled, without its mesh"):
+        pickle.loads(pickle.dumps(two().last))["s"].at(0.5)
     with pytest.raises(lp.errors.ConfigurationError, match="this result was pickled"):
         result.sample(1)
 

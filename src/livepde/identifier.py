@@ -568,6 +568,7 @@ class Identifier(Shown):
             diagnose=lambda: report.diagnostics,
             held=held,
             space=self.model.parameter_space,
+            state_space=self.model.state_space,
             judge=self._judge(judge, lambda: report.diagnostics),
             fit=self.law.fit(self._work, self._state),
         )

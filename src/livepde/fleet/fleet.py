@@ -389,6 +389,7 @@ class Fleet:
             held=held,
             space=self.model.parameter_space,
             belief=lambda k: self._believed(state, k),
+            state_space=self.model.state_space,
         )
 
     @staticmethod
