@@ -825,3 +825,77 @@ def test_points_on_a_vector_field():
         assert np.allclose(who.forecast([0.0])["a"], expected), options
     with pytest.raises(lp.errors.ObservationError, match="name the measured one, as component = 0"):
         lp.Identifier(model, lp.Points({"a": (0.25, 0.5)}, noise=0.1), u0=start)
+
+
+# --- own data by coordinates ---------------------------------------------------------------------
+
+
+def test_data_of_a_subdomain_by_coordinates():
+    mesh = lp.interval(0.0, 1.0, 10)
+    model = heat(mesh, lp.Normal(0.1, std=0.05), {"right": 0.0})
+    omega = lp.Subdomain(lambda x: x[0] < 0.45, noise=0.1)
+    z = omega.sample(lambda x: x[0] ** 2, model.state_space)
+    assert np.allclose(z, np.linspace(0.0, 0.4, 5) ** 2)
+    assert (lp.Full().sample(lambda x: 3.0, model.state_space) == np.full(10, 3.0)).all()
+    camera = np.linspace(0.5, 0.0, 51)  # other places than the nodes, and downwards
+    table = xr.DataArray(
+        np.outer([1.0, 2.0], np.cos(camera)), {"time": [0.1, 0.2], "x": camera}, ("time", "x")
+    )
+    data = omega.sample(table, model.state_space)
+    assert np.allclose(data, np.outer([1.0, 2.0], np.cos(np.linspace(0.0, 0.4, 5))), atol=1e-4)
+    result = lp.Identifier(model, omega, u0=1.0).run(zip(table["time"].values, data, strict=True))
+    assert np.allclose(result.measured, data)
+    table[1, 25] = np.nan
+    assert np.isnan(omega.sample(table, model.state_space)).sum() < 2
+    for given, message in (
+        (table, r"for x from 0 to 0.5; they are needed from 0 to 1"),
+        (
+            table.rename(x="place"),
+            r"the dimensions \['time', 'place'\]; expected the coord.*\['x'\]",
+        ),
+        (lambda x: np.ones(3), r"the function returns shape \(3,\) for x of shape \(1, 11\)"),
+        (np.ones(10), "got ndarray; expected a function of x or a DataArray"),
+    ):
+        with pytest.raises(lp.errors.ObservationError, match=message):
+            lp.Full().sample(given, model.state_space)
+
+
+def test_data_of_elements_with_slopes_are_projected_on_the_subdomain():
+    from skfem import ElementLineHermite, ElementQuad2
+
+    mesh = lp.interval(0.0, 1.0, 10)
+    state = lp.Field(mesh, ElementLineHermite(), dirichlet={"left": 0.0})
+    model = lp.Model(state, {"k": lp.Normal(1.0, 0.1)}, A=lambda q, u, v, x: q.k * u * v)
+    omega = lp.Subdomain(lambda x: x[0] < 0.35)
+    whole = lp.Full().sample(lambda x: x[0] ** 3 - x[0], model.state_space)
+    cubic = model.state_block.interpolate(lambda x: x[0] ** 3 - x[0])
+    assert np.allclose(whole, cubic[lp.Full().selected(model.state_block)], atol=1e-9)
+    within = omega.sample(lambda x: np.where(x[0] < 0.3, x[0] ** 3 - x[0], 99.0), model.state_space)
+    assert np.allclose(within, cubic[omega.selected(model.state_block)], atol=1e-9)
+    plate = lp.rectangle((0.0, 1.0), (0.0, 2.0), (3, 4))
+    model = lp.Model(
+        {"c": lp.Field(plate, ElementQuad2()), "d": lp.Field(plate, lp.linear(plate))},
+        {"k": lp.Normal(1.0, 0.1)},
+        A=lambda q, u, v, x: q.k * u.c * v.d,
+    )
+    x, y = np.linspace(0.0, 1.0, 30), np.linspace(0.0, 2.0, 40)
+    grid = xr.DataArray(2.0 * x[:, None] - y, {"x": x, "y": y}, ("x", "y"))
+    for of in ("c", "d"):
+        found = lp.Full(of=of).sample(grid, model.state_space)
+        at = model.state_space.fields[of].doflocs
+        assert np.allclose(found, 2.0 * at[0] - at[1], atol=1e-9)
+    with pytest.raises(lp.errors.ObservationError, match="a value is not finite"):
+        lp.Full(of="c").sample(lambda x: np.nan, model.state_space)
+
+
+def test_data_of_a_vector_field():
+    from skfem import ElementQuad1, ElementVector
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+    state = lp.Field(mesh, ElementVector(ElementQuad1()))
+    model = lp.Model(state, {"k": lp.Normal(0.0, 0.1)}, A=lambda q, u, v, x: q.k * lp.dot(u, v))
+    flow = lambda x: np.array([x[0], 3.0 * x[1]])  # noqa: E731
+    expected = model.state_block.interpolate(flow)
+    assert np.allclose(lp.Full().sample(flow, model.state_space), expected)
+    with pytest.raises(lp.errors.ObservationError, match="a row for each of 2 components"):
+        lp.Full().sample(lambda x: x[0], model.state_space)
