@@ -794,6 +794,42 @@ def test_a_diffusion_of_the_wrong_sign_is_said():
     lp.Model(state, {"k": lp.Normal(0.0, std=0.1)}, A=growing)
 
 
+def test_the_sign_of_diffusion_in_systems_and_directions():
+    k = {"k": lp.LogNormal(1.0, std=0.1)}
+    line, plate = lp.interval(0.0, 1.0, 8), lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+
+    def fields(*names: str) -> dict[str, lp.Field]:
+        return {name: lp.Field(line, lp.linear(line)) for name in names}
+
+    def flux(u, v):
+        return lp.dot(lp.grad(u), lp.grad(v))
+
+    def opposed(q, u, v, x):
+        return q.k * flux(u.c, v.c) - q.k * flux(u.d, v.d)
+
+    with pytest.warns(UserWarning, match="the diffusion of 'd' is negative at the prior mean"):
+        lp.Model(fields("c", "d"), k, A=opposed)
+    with pytest.warns(UserWarning, match="the diffusion of the model is negative"):
+        lp.Model(
+            lp.Field(plate, lp.linear(plate)),
+            k,
+            A=lambda q, u, v, x: q.k * (flux(u, v) - 3.0 * lp.grad(u)[1] * lp.grad(v)[1]),
+        )
+    with pytest.warns(UserWarning, match="the diffusion of the model is negative"):
+        lp.Model(
+            fields("u")["u"], k, A=lambda q, u, v, x: q.k * flux(u, v), M=lambda u, v, x: -u * v
+        )
+    # Right ones: both signs turned, no change of d in time, and diffusion across that makes up.
+    lp.Model(fields("u")["u"], k, A=lambda q, u, v, x: -q.k * flux(u, v), M=lambda u, v, x: -u * v)
+    lp.Model(fields("c", "d"), k, A=opposed, M=lambda u, v, x: u.c * v.c)
+    lp.Model(
+        fields("c", "d"),
+        k,
+        A=lambda q, u, v, x: q.k * (flux(u.c, v.c) + 2.0 * flux(u.d, v.c) - 2.0 * flux(u.c, v.d)),
+        B=lambda u, v, x: -0.1 * flux(u.d, v.d),
+    )
+
+
 def system() -> lp.Model:
     mesh = lp.interval(0.0, 1.0, 8)
     parts = {name: lp.Field(mesh, lp.linear(mesh)) for name in ("c", "d")}
@@ -805,8 +841,24 @@ def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
     assert (lp.Identifier(system(), sensors, u0=20.0).u0 == 20.0).all()
     both = lp.Identifier(system(), sensors, u0={"c": 1.0, "d": lambda x: 2.0 + 0.0 * x[0]})
     assert np.allclose(both.u0, [1.0] * 9 + [2.0] * 9)
-    with pytest.raises(lp.errors.ConfigurationError, match=r"u0 has no value for \['d'\]"):
-        lp.Identifier(system(), sensors, u0={"c": 1.0})
+    control, law = lp.Advance(lp.Alexander2(), 0.1), lp.SensitivityLaw()
+    partial = {"c": 1.0}
+    for begin in (
+        lambda u0: lp.Identifier(system(), sensors, u0=u0),
+        lambda u0: lp.Fleet(system(), sensors, law, 2, u0=u0),
+        lambda u0: list(lp.simulate(system(), np.ones(1), u0, [0.0, 1.0], control)),
+    ):
+        with pytest.raises(lp.errors.ConfigurationError, match=r"u0 has no value for \['d'\]"):
+            begin(partial)
+        with pytest.raises(lp.errors.ConfigurationError, match="u0 has values that are not finite"):
+            begin({"c": lambda x: np.where(x[0] < 0.5, np.nan, 1.0), "d": 1.0})
+    for wrong, message in (
+        ([1.0, 2.0], r"coefficients of shape \(2,\); expected \(18,\)"),
+        (lambda x: x[0], r"a function of x for \['c', 'd'\]: give a mapping"),
+        ({"c": 1.0, "d": 1.0, "e": 1.0}, r"no unknown is called \['e'\]"),
+    ):
+        with pytest.raises(lp.errors.ConfigurationError, match=message):
+            lp.Identifier(system(), sensors, u0=wrong)
 
 
 def test_points_on_a_vector_field():

@@ -179,7 +179,7 @@ class Identifier(Shown):
         self.assimilate_from = assimilate_from
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
-        self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
+        self._u0 = model.initial_values(0.0 if u0 is None else u0)
         self._stated = model.boundary_readings(u0)  # at t0
         self._state: Any = None
         self._t = float(t0)
@@ -1073,12 +1073,6 @@ def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any])
     for name, given in uncertain.items():
         if given and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
-    components = model.state_space.fields
-    if isinstance(u0, Mapping) and (missing := [name for name in components if name not in u0]):
-        raise ConfigurationError(
-            f"u0 has no value for {missing}: give one for each component of the state, "
-            f"{list(components)}; one number is that of all of them."
-        )
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."
