@@ -682,6 +682,15 @@ def test_measured_against_predicted():
         found().plot.measured_and_predicted(sensors=["T_3"])
 
 
+def test_the_figure_of_a_run_begins_with_what_was_measured():
+    pytest.importorskip("matplotlib")
+    first = found().plot().axes[0]
+    assert np.allclose(first.lines[0].get_ydata(), dated()["T_30"])
+    assert [text.get_text() for text in first.get_legend().get_texts()][
+        -1
+    ] == "T_60 again (withheld)"
+
+
 def test_sensors_of_several_units_have_a_figure_for_each():
     pytest.importorskip("matplotlib")
     cold = lp.Points({"T_60": 0.6}, noise=NOISE, unit="K")

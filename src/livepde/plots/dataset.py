@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,7 +29,9 @@ __all__ = [
     "prior_left",
     "scalars",
     "scored_from",
+    "sensor_names",
     "sensor_places",
+    "sensor_units",
     "time_label",
     "time_scale",
     "time_text",
@@ -154,6 +157,21 @@ def scored_from(data: xr.Dataset) -> int:
         return 0
     first = int(np.searchsorted(data["time"].values, float(start)))
     return first if first < data.sizes["time"] else 0
+
+
+def sensor_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the assimilated and then of the withheld sensors."""
+    return [str(name) for of in ("sensor", "withheld") if of in data for name in data[of].values]
+
+
+def sensor_units(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
+    """Return the unit of each sensor."""
+    units = dict.fromkeys(names, str(data["innovation"].attrs.get("units", "")))
+    for dimension in ("sensor", "withheld"):
+        if f"{dimension}_unit" in data.coords:
+            own = data[f"{dimension}_unit"].values
+            units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
+    return units
 
 
 class SensorPlaces(NamedTuple):
