@@ -602,6 +602,22 @@ def test_a_model_shows_its_equation_priors_and_mesh():
     assert "unknown alpha: LogNormal(0.1, std=0.05) m^2/s" in repr(rod())
 
 
+def test_a_ready_made_equation_shows_its_formula():
+    from livepde.models import EQUATIONS, burgers, conduction, with_conditions
+
+    assert "equation: u_t = div(alpha grad u)\n" in repr(rod())
+    mesh, one = lp.interval(0.0, 1.0, 8), lp.LogNormal(1.0, std=0.1)
+    lossy = conduction(mesh, one, {"left": 0.0}, C=2.0, loss=one)
+    assert "equation: C u_t = div(k grad u) - loss (u - ambient)\n" in repr(lossy)
+    assert "lambda" not in repr(lossy)
+    assert "mass" not in repr(lossy)
+    assert "equation: u_t + a u u_x = nu u_xx\n" in repr(burgers(mesh, one, 1.0))
+    heated = with_conditions(lossy, sources={"heater": lp.models.Source(5.0)})
+    assert "- loss (u - ambient), with added conditions and sources\n" in repr(heated)
+    for equation in EQUATIONS.values():
+        assert equation.written(equation.unknowns) == equation.formula
+
+
 def conduction(q, u, v, x):
     """Return the form of conduction, in one expression."""
     return q.k * lp.dot(lp.grad(u), lp.grad(v))

@@ -119,6 +119,8 @@ class Model(Shown):
         Names of the channels that forms read as x.inputs["name"].
     time_unit, length_unit
         Units of times and coordinates, for tables, figures and sentences.
+    formula
+        The equation as text, which `repr` shows; default the weak form as it is written in code.
     initial
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
@@ -156,6 +158,7 @@ class Model(Shown):
         inputs: Sequence[str] = (),
         time_unit: str = "",
         length_unit: str = "",
+        formula: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
     ) -> None:
         self._parts: dict[str, Any] = {
@@ -165,7 +168,11 @@ class Model(Shown):
         self.state = state
         self.parameter = parameter
         self.time_unit, self.length_unit = time_unit, length_unit
-        self._units: dict[str, Any] = {"time_unit": time_unit, "length_unit": length_unit}
+        self._about: dict[str, Any] = {
+            "time_unit": time_unit,
+            "length_unit": length_unit,
+            "formula": formula,
+        }
         self.state_space = FunctionSpace.of(state, "u")
         self.mesh = _common_mesh(self.state_space)
         self.parameter_space = FunctionSpace.of(parameter, "q")
@@ -201,9 +208,10 @@ class Model(Shown):
             rows[f"state {name}"] = f"{kind}, {block.size} coefficients"
             if block.field.dirichlet:
                 rows[f"state {name}"] += f", Dirichlet values {_boundaries(block.field.dirichlet)}"
-        rows["equation"] = _equation(self._parts)
+        formula = self._about["formula"]
+        rows["equation"] = formula or _equation(self._parts)
         for name, what in {"M": "mass M(u, v)", "initial": "initial state"}.items():
-            if self._parts[name] is not None:
+            if self._parts[name] is not None and not (formula and name == "M"):
                 rows[what] = " + ".join(_terms(self._parts[name]))
         for name, unknown in self.parameter_space.unknowns.items():
             of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
@@ -233,7 +241,7 @@ class Model(Shown):
         ConfigurationError
             A function that pickle cannot find by its name.
         """
-        parts = self.state, self.parameter, {**self._parts, **self._units}
+        parts = self.state, self.parameter, {**self._parts, **self._about}
         try:
             pickle.dumps(parts)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -271,7 +279,7 @@ class Model(Shown):
             what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
             raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
         unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
-        return Model(self.state, unknowns, **self._parts, **self._units)
+        return Model(self.state, unknowns, **self._parts, **self._about)
 
     def with_terms(
         self,
@@ -300,7 +308,10 @@ class Model(Shown):
             given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
             parts[name] = [*given, *more]
         parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
-        return Model(self.state, self.parameter, **parts, **self._units)
+        about, added = dict(self._about), ", with added conditions and sources"
+        if about["formula"] and not about["formula"].endswith(added):
+            about["formula"] += added
+        return Model(self.state, self.parameter, **parts, **about)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
         """Return the same process with constants in the place of some of its inputs.
@@ -327,7 +338,7 @@ class Model(Shown):
 
         parts = {name: bound(part) for name, part in self._parts.items() if name != "inputs"}
         left = [name for name in self.inputs if name not in values]
-        return Model(self.state, self.parameter, **parts, inputs=left, **self._units)
+        return Model(self.state, self.parameter, **parts, inputs=left, **self._about)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
@@ -350,7 +361,7 @@ class Model(Shown):
             return finer(parts)
 
         state, parameter = of(self.state), of(self.parameter)
-        return Model(state, parameter, **self._parts, **self._units)
+        return Model(state, parameter, **self._parts, **self._about)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
