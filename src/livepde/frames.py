@@ -13,7 +13,16 @@ from livepde.errors import LawError
 from livepde.fem import FunctionSpace
 from livepde.laws import Belief
 from livepde.linalg import Array
-from livepde.records import DATE, ESTIMATES, PARAMETER, STATISTIC, STATUS_CODES
+from livepde.records import (
+    DATE,
+    ESTIMATES,
+    PARAMETER,
+    STATISTIC,
+    STATUS_CODES,
+    field_names,
+    interval_95,
+    scalars,
+)
 from livepde.verdict import ModelErrors
 
 if TYPE_CHECKING:
@@ -54,8 +63,6 @@ def estimates(data: xr.Dataset) -> pd.DataFrame:
     """Return the last estimates of the numbers of a run, one row for each: see `Result.summary`."""
     import pandas as pd
 
-    from livepde.plots.dataset import interval_95, scalars  # with the figures, which load later
-
     errors = model_errors(data)
     verdict = json.loads(data.attrs["verdict"]) if "verdict" in data.attrs else {}
     allowed = {} if errors is None else {one.label: one for one in errors.unknowns}
@@ -93,8 +100,6 @@ def frame(data: xr.Dataset) -> pd.DataFrame:
     """Return numbers over time, one row for each sample: see `Result.to_dataframe`."""
     import pandas as pd
 
-    from livepde.plots.dataset import interval_95, scalars
-
     columns: dict[str, Array] = {}
     for label in scalars(data):
         low, high = interval_95(data, label)
@@ -117,8 +122,6 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
     """Return the dataset of a run with dates, and with its numbers on axes of their own."""
-    from livepde.plots.dataset import field_names, interval_95, scalars
-
     found: dict[str, Any] = {}
     labels = scalars(data)
     for name in [*labels, *field_names(data)]:

@@ -33,19 +33,16 @@ from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
 from livepde.plots.dataset import (
     MOST_LINES,
-    field_names,
     groups,
-    interval_95,
     labelled,
     modes_told,
     note,
     prior_left,
-    scalars,
     scored_from,
     sensor_names,
     sensor_units,
 )
-from livepde.records import used_errors
+from livepde.records import field_names, interval_95, scalars, used_errors
 from livepde.runs.summary import shown
 
 __all__ = ["SECTIONS", "Panel", "panels"]

@@ -14,9 +14,7 @@ from livepde.linalg import Array
 from livepde.plots.curves import profiles
 from livepde.plots.dataset import (
     MOST_LINES,
-    field_names,
     groups,
-    interval_95,
     labelled,
     note,
     scored_from,
@@ -27,7 +25,7 @@ from livepde.plots.dataset import (
     time_values,
 )
 from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, panel, time_axis
-from livepde.records import refused_readings, used_errors
+from livepde.records import field_names, interval_95, refused_readings, used_errors
 
 if TYPE_CHECKING:
     import xarray as xr

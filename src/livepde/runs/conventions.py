@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from livepde.dates import since
-from livepde.plots.dataset import field_names, interval_95, scalars
+from livepde.records import field_names, interval_95, scalars
 from livepde.runs.directory import plain
 
 __all__ = ["DIFFERENCES", "bounded", "cf", "free_names", "kinds_of", "oriented", "udunits"]
