@@ -40,7 +40,7 @@ export OMP_NUM_THREADS ?= 1
 comma := ,
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-fast test-system test-long test-threads test-all coverage mpi lowest versions package check format docs bench experiment lock clean
+.PHONY: help demo test test-fast test-system test-long test-threads test-all coverage mpi lowest versions package platforms check format docs bench experiment lock clean
 
 help:  ## List the targets
 	@echo "make TARGET [PYTHON=python3.12]"
@@ -97,6 +97,9 @@ versions: $(READY)  ## Run the same on every other Python that is found, with co
 
 package: $(READY)  ## Build wheel and source distribution into dist/, and try the wheel in an empty environment
 	@$(BIN)/python .ci/package.py
+
+platforms: $(READY)  ## Resolve the core for Linux, macOS and Windows with binary wheels only: 80 s
+	@$(BIN)/python .ci/platforms.py
 
 check: $(READY)  ## Check style, format, types, import layers and plain English
 	@$(BIN)/ruff check --quiet

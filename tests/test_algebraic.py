@@ -55,6 +55,7 @@ def test_a_model_with_an_algebraic_component_passes_its_check():
     assert "algebraic components: size of their inverse" in names
 
 
+@pytest.mark.filterwarnings("ignore:the diffusion of 'c' is negative")  # relative to M
 @pytest.mark.parametrize(
     ("options", "failed"),
     [

@@ -181,7 +181,7 @@ def test_nonlinear_reaction_system_conserves_what_it_turns_over(mesh):
     run = simulate(
         model,
         np.array([3.0]),
-        {"a": lambda x: 1 + x[0]},
+        {"a": lambda x: 1 + x[0], "b": 0.0},
         [0.0, 0.5, 1.0],
         Advance(Alexander2(), 0.1),
     )

@@ -285,6 +285,17 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     seen = view.look()
     assert (seen.status, seen.samples) == ("silent", 30)
     assert np.array_equal(seen.dataset["loss"], journal.dataset()["loss"])
+    _, readings = journal.readings(["a", "b"])
+    panel = panels.panels(seen.dataset)[0]
+    assert (panel.name, panel.section) == ("measured:degC", "measured")
+    assert next(iter(panels.SECTIONS)) == "measured"
+    points, lines = panel.figure.data[::2], panel.figure.data[1::2]
+    errors = [seen.dataset[name].values[:, 0] for name in ("innovation", "withheld_error")]
+    for k, error in enumerate(errors):
+        assert np.array_equal(points[k].y, readings[:, k])
+        assert np.allclose(lines[k].y, readings[:, k] - error)
+    assert [line.name for line in lines] == ["a", "b (withheld)"]
+    assert [line.line.dash for line in lines] == [None, "dash"]
     said = str(cards.verdict(seen))
     assert "The source is silent: nothing from the source for 9 s." in said
     assert "Irregular rows or values: 3 malformed." in said
@@ -310,6 +321,8 @@ def test_a_long_run_is_read_bit_by_bit_and_thinned(tmp_path, monkeypatch):
     assert seen.samples == 450
     assert seen.dataset.sizes["time"] <= 60
     assert 4 <= seen.dataset.sizes["snapshot"] <= 10
+    warm = 20.0 + np.sin(0.5 * seen.dataset["time"])
+    assert np.allclose(seen.dataset["readings of sensors"][:, 0], 0.3 * warm)
     for end in (0, -1):
         assert float(seen.dataset["time"][end]) == float(whole["time"][end])
         assert np.array_equal(seen.dataset["u"][end], whole["u"][end])

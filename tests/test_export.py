@@ -17,6 +17,7 @@ import pytest
 import xarray as xr
 from commands import call
 from meshio.xdmf import TimeSeriesReader
+from scipy.io import netcdf_file
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.wait import WebDriverWait
@@ -194,6 +195,7 @@ def test_xarray_opens_times_as_dates(rod, tmp_path, ending):
     assert found["time"].values[1] == np.datetime64("2025-04-01T06:01:00")
     assert found["snapshot"].values[-1] == np.datetime64("2025-04-01T06:05:00")
     assert found["time"].attrs["standard_name"] == "time"
+    assert [found[name].attrs.get("axis") for name in ("time", "snapshot", "x")] == ["T", "T", None]
     assert found.attrs["Conventions"] == "CF-1.11"
     assert found.attrs["title"] == "A rod"
     assert found.attrs["source"] == "livepde 1.2"
@@ -216,6 +218,8 @@ def test_without_dates_times_are_numbers_with_a_unit(tmp_path):
         assert found["time"].values.tolist() == [60.0 * k for k in range(SAMPLES)]
         assert found["time"].attrs["units"] == "s"
         assert found["snapshot"].attrs["units"] == "s"
+        for name in ("time", "snapshot"):  # CF: a time counts from a date
+            assert not {"standard_name", "axis"} & set(found[name].attrs)
 
 
 def test_times_of_a_model_without_units_are_plain_numbers(tmp_path):
@@ -458,6 +462,42 @@ def test_all_formats_are_looked_at_before_one_is_written(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kind", ["line", "triangle", "tetra"])
+def test_vtk_reads_the_meshes(tmp_path, kind):
+    pyvista = pytest.importorskip("pyvista")  # the readers of ParaView
+    run = made(tmp_path / "run", kind)
+    last = run.dataset["u"].values[-1]
+    for ending in (".vtu", ".vtk"):
+        export(run, tmp_path / f"run{ending}")
+        assert np.allclose(pyvista.read(tmp_path / f"run{ending}").point_data["u"], last)
+    export(run, tmp_path / "run.xdmf")
+    reader = pyvista.get_reader(tmp_path / "run.xdmf")
+    assert list(reader.time_values) == run.dataset["snapshot"].values.tolist()
+    reader.set_active_time_value(reader.time_values[-1])
+    found = reader.read()
+    found = found[0] if isinstance(found, pyvista.MultiBlock) else found
+    assert np.allclose(found.point_data["u"], last)
+
+
+@pytest.mark.slow
+def test_netcdf_c_reads_the_files(rod, tmp_path):
+    netCDF4 = pytest.importorskip("netCDF4")
+    export(rod, tmp_path / "rod.nc")
+    for path in (tmp_path / "rod.nc", rod.path / "estimates.nc"):
+        with netCDF4.Dataset(path) as found:
+            assert np.array_equal(found["u"][:], rod.dataset["u"])
+            assert "since" in found["time"].units
+            assert "_FillValue" not in found["time"].ncattrs()
+
+
+@pytest.mark.slow
+def test_coordinates_have_no_fill_value(rod):
+    with netcdf_file(rod.path / "estimates.nc", mmap=False) as found:
+        assert not hasattr(found.variables["time"], "_FillValue")
+        assert not hasattr(found.variables["snapshot"], "_FillValue")
+
+
+@pytest.mark.slow
 def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
     run = watched_run(tmp_path / "run")
     (run.path / "case.toml").write_bytes('title = "Fühler"'.encode("cp1252"))
@@ -492,6 +532,7 @@ def test_a_report_fetches_nothing(tmp_path):
     run = watched_run(tmp_path / "run")
     write_report(run, tmp_path / "run.html")
     page = Page(tmp_path / "run.html")
+    assert page.text.index("Measured and modelled") < page.text.index("Estimates")
     assert page.fetched == []
     assert not {"link", "iframe", "object", "embed", "base", "img"} & set(page.tags)
     text = (tmp_path / "run.html").read_text(encoding="utf-8")

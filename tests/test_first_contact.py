@@ -424,6 +424,51 @@ def test_draws_have_the_moments_of_the_estimate():
     assert two().sample(3, seed=1).identical(two().sample(3, seed=1))
 
 
+def test_a_field_at_points():
+    estimate, data = two().last, two().to_xarray().isel(snapshot=-1)
+    x = np.array([0.05, 0.3, 0.325])
+    for name in ("s", "u"):
+        found = estimate[name].at(x)
+        std = data[f"{name}_std"].values
+        assert np.allclose(found.mean, np.interp(x, data["x"], data[name]))
+        assert np.allclose(found.std[:2], std[[1, 6]])
+        assert found.std[2] < std[6:8].max() + 1e-12
+        low, high = found.interval()
+        assert np.allclose((high - low) / 2.0, 1.959964 * found.std)
+    drawn = two().sample(4000, seed=1)["u"].values
+    at = estimate["u"].at(0.325)  # between two vertices
+    assert at.std == pytest.approx(drawn[:, 6:8].mean(axis=1).std(), rel=0.05)
+    assert isinstance(at.mean, float)
+    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5\] lies outside of the"):
+        estimate["u"].at([0.5, 1.5])
+    with pytest.raises(lp.errors.ConfigurationError, match=r"expected numbers, shape \(points,\)"):
+        estimate["u"].at([[0.5, 1.5]])
+    with pytest.raises(lp.errors.ConfigurationError, match="only a field has values at points"):
+        estimate["k"].at(0.5)
+    with pytest.raises(lp.errors.ConfigurationError, match=r"no unknown 'D'; there are .*'s', 'u'"):
+        estimate["D"]
+
+
+def test_a_vector_field_and_a_logarithm_at_points():
+    from skfem import ElementQuad1, ElementVector
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
+    state = lp.Field(mesh, ElementVector(ElementQuad1()))
+    k = lp.Field(mesh, lp.linear(mesh), prior=lp.LogNormal(2.0, std=0.2), inner="H1")
+    model = lp.Model(state, {"k": k}, A=lambda q, u, v, x: q.k * lp.dot(u, v))
+    sensors = lp.Points({"a": (0.25, 0.5)}, component=0, noise=0.1)
+    start = lambda x: np.array([1.0 + x[0], 3.0 * x[1]])  # noqa: E731
+    estimate = lp.Identifier(model, sensors, u0=start).step(1e-9, [1.25])
+    found = estimate["u"].at([(0.25, 0.5), (0.3, 0.9)])
+    assert np.allclose(found.mean, [[1.25, 1.5], [1.3, 2.7]])
+    assert estimate["u"].at((0.25, 0.5)).std.shape == (2,)
+    inside = estimate["k"].at((0.1, 0.2))
+    assert inside.median == pytest.approx(2.0)
+    assert inside.interval()[0] > 0.0
+    with pytest.raises(lp.errors.ObservationError, match=r"point 0 at \[2.0, 0.5\] lies outside"):
+        estimate["k"].at([2.0, 0.5])
+
+
 def test_draws_lie_within_bounds():
     mesh = lp.interval(0.0, 1.0, 20)
     model = heat(mesh, lp.LogitNormal(0.1, bounds=(0.0, 0.2), std=0.05), {"right": 0.0})
@@ -451,6 +496,10 @@ def test_results_and_estimates_are_pickled():
     assert result.covariance().equals(found().covariance())
     estimate = pickle.loads(pickle.dumps(found().last))
     assert estimate.parameters == found().last.parameters
+    with pytest.raises(lp.errors.ConfigurationError, match="no unknown 'u'; there are"):
+        estimate["u"]
+    with pytest.raises(lp.errors.ConfigurationError, match="pickled, without its mesh"):
+        pickle.loads(pickle.dumps(two().last))["s"].at(0.5)
     with pytest.raises(lp.errors.ConfigurationError, match="this result was pickled"):
         result.sample(1)
 
@@ -474,8 +523,66 @@ def test_inference_data_for_arviz():
     assert tree["posterior"]["alpha"].sizes == {"chain": 1, "draw": 50}
     assert tree["prior"]["alpha"].std() > 3.0 * tree["posterior"]["alpha"].std()
     assert np.allclose(tree["observed_data"]["T_30"], dated()["T_30"])
+    assert tree["posterior_predictive"]["T_30"].sizes == {"chain": 1, "draw": 50, "time": 24}
     arviz = pytest.importorskip("arviz_base")
     assert arviz.extract(tree)["alpha"].sizes["sample"] == 50
+
+
+def test_the_likelihood_of_draws_is_that_of_simulations():
+    noise = np.where(np.arange(24) % 2, NOISE, 2.0 * NOISE)
+    table = dated().assign(**{"noise of T_30": noise})
+    table.iloc[7, 1] = np.nan
+    who = identifier(dt_max=0.005, law=lp.SensitivityLaw(shadows=None))
+    tree = who.run(table).to_inference_data(400, seed=3)
+    found = tree["log_likelihood"]["readings"].isel(chain=0)
+    t, nodes = measured().index.to_numpy(), [6, 12]
+    for draw in (0, 1):
+        q = rod().initial_parameter({"alpha": tree["posterior"]["alpha"].values[0, draw]})
+
+        def ends(when):  # inputs change linearly between their readings
+            return {"T_left": float(np.interp(when, t, table["T_left"]))}
+
+        fine = lp.Advance(lp.Alexander2(), 0.005)
+        run = lp.simulate(rod(), q, 0.0, t.tolist(), fine, ends)
+        shown = np.array([(rod().state_block.at_vertices @ u)[nodes] for _, u in run])
+        std = np.column_stack([noise, np.full(24, NOISE)])
+        e = (table[["T_30", "T_60"]].to_numpy() - shown) / std
+        density = (-0.5 * e**2 - np.log(std * np.sqrt(2.0 * np.pi)))[1:]  # the start is known
+        assert np.allclose(
+            found[draw], density[np.isfinite(density)], rtol=0.0, atol=5e-3
+        )  # linear
+    assert list(found["sensor"].values[:4]) == ["T_30", "T_60", "T_30", "T_60"]
+    assert found["time"].values[0] == table.index.values[1]
+    shown = tree["posterior_predictive"]["T_30"].isel(time=slice(2, None))
+    assert np.allclose(shown.std(("chain", "draw")), noise[2:], rtol=0.25)
+
+
+def test_arviz_compares_by_the_likelihood():
+    stats = pytest.importorskip("arviz_stats")
+    tree = found().to_inference_data(400)
+    loo = stats.loo(tree)
+    assert 0.5 < loo.p < 2.0  # one unknown
+    row = stats.summary(tree, var_names=["alpha"]).loc["alpha"]
+    assert float(row["mean"]) == pytest.approx(TRUE, rel=0.1)
+
+
+def test_noise_of_inputs_widens_the_likelihood():
+    exact, noisy = (
+        identifier(**options).run(measured().iloc[:9]).to_inference_data(99)
+        for options in ({}, {"input_noise": {"T_left": 2.0}})
+    )
+    spread = [tree["posterior_predictive"]["T_30"].std("draw").mean() for tree in (exact, noisy)]
+    assert spread[1] > 2.0 * spread[0]
+
+
+def test_unknowns_that_move_have_no_likelihood_of_a_draw():
+    drifting = lp.Scalar(lp.LogNormal(0.1, std=0.05), evolution=lp.RandomWalk(0.1))
+    model = heat(lp.interval(0.0, 1.0, 8), drifting, {"right": 0.0})
+    who = lp.Identifier(model, lp.Points({"T": 0.5}, noise=0.1), u0=1.0)
+    assert "log_likelihood" not in who.run([(0.1, [1.0])]).to_inference_data(3)
+    who = identifier()
+    who.run(measured().iloc[:9])
+    assert "log_likelihood" not in who.run(measured().iloc[9:]).to_inference_data(3)
 
 
 # --- objects that show themselves ----------------------------------------------------------------
@@ -493,6 +600,22 @@ def test_a_model_shows_its_equation_priors_and_mesh():
     ):
         assert line in shown
     assert "unknown alpha: LogNormal(0.1, std=0.05) m^2/s" in repr(rod())
+
+
+def test_a_ready_made_equation_shows_its_formula():
+    from livepde.models import EQUATIONS, burgers, conduction, with_conditions
+
+    assert "equation: u_t = div(alpha grad u)\n" in repr(rod())
+    mesh, one = lp.interval(0.0, 1.0, 8), lp.LogNormal(1.0, std=0.1)
+    lossy = conduction(mesh, one, {"left": 0.0}, C=2.0, loss=one)
+    assert "equation: C u_t = div(k grad u) - loss (u - ambient)\n" in repr(lossy)
+    assert "lambda" not in repr(lossy)
+    assert "mass" not in repr(lossy)
+    assert "equation: u_t + a u u_x = nu u_xx\n" in repr(burgers(mesh, one, 1.0))
+    heated = with_conditions(lossy, sources={"heater": lp.models.Source(5.0)})
+    assert "- loss (u - ambient), with added conditions and sources\n" in repr(heated)
+    for equation in EQUATIONS.values():
+        assert equation.written(equation.unknowns) == equation.formula
 
 
 def conduction(q, u, v, x):
@@ -573,6 +696,15 @@ def test_measured_against_predicted():
     assert len(ax.lines) == 2
     with pytest.raises(lp.errors.ConfigurationError, match="no sensor 'T_3'; there are"):
         found().plot.measured_and_predicted(sensors=["T_3"])
+
+
+def test_the_figure_of_a_run_begins_with_what_was_measured():
+    pytest.importorskip("matplotlib")
+    first = found().plot().axes[0]
+    assert np.allclose(first.lines[0].get_ydata(), dated()["T_30"])
+    assert [text.get_text() for text in first.get_legend().get_texts()][
+        -1
+    ] == "T_60 again (withheld)"
 
 
 def test_sensors_of_several_units_have_a_figure_for_each():
@@ -687,6 +819,42 @@ def test_a_diffusion_of_the_wrong_sign_is_said():
     lp.Model(state, {"k": lp.Normal(0.0, std=0.1)}, A=growing)
 
 
+def test_the_sign_of_diffusion_in_systems_and_directions():
+    k = {"k": lp.LogNormal(1.0, std=0.1)}
+    line, plate = lp.interval(0.0, 1.0, 8), lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+
+    def fields(*names: str) -> dict[str, lp.Field]:
+        return {name: lp.Field(line, lp.linear(line)) for name in names}
+
+    def flux(u, v):
+        return lp.dot(lp.grad(u), lp.grad(v))
+
+    def opposed(q, u, v, x):
+        return q.k * flux(u.c, v.c) - q.k * flux(u.d, v.d)
+
+    with pytest.warns(UserWarning, match="the diffusion of 'd' is negative at the prior mean"):
+        lp.Model(fields("c", "d"), k, A=opposed)
+    with pytest.warns(UserWarning, match="the diffusion of the model is negative"):
+        lp.Model(
+            lp.Field(plate, lp.linear(plate)),
+            k,
+            A=lambda q, u, v, x: q.k * (flux(u, v) - 3.0 * lp.grad(u)[1] * lp.grad(v)[1]),
+        )
+    with pytest.warns(UserWarning, match="the diffusion of the model is negative"):
+        lp.Model(
+            fields("u")["u"], k, A=lambda q, u, v, x: q.k * flux(u, v), M=lambda u, v, x: -u * v
+        )
+    # Right ones: both signs turned, no change of d in time, and diffusion across that makes up.
+    lp.Model(fields("u")["u"], k, A=lambda q, u, v, x: -q.k * flux(u, v), M=lambda u, v, x: -u * v)
+    lp.Model(fields("c", "d"), k, A=opposed, M=lambda u, v, x: u.c * v.c)
+    lp.Model(
+        fields("c", "d"),
+        k,
+        A=lambda q, u, v, x: q.k * (flux(u.c, v.c) + 2.0 * flux(u.d, v.c) - 2.0 * flux(u.c, v.d)),
+        B=lambda u, v, x: -0.1 * flux(u.d, v.d),
+    )
+
+
 def system() -> lp.Model:
     mesh = lp.interval(0.0, 1.0, 8)
     parts = {name: lp.Field(mesh, lp.linear(mesh)) for name in ("c", "d")}
@@ -698,8 +866,24 @@ def test_the_initial_state_of_a_system_names_all_of_it_or_is_one_number():
     assert (lp.Identifier(system(), sensors, u0=20.0).u0 == 20.0).all()
     both = lp.Identifier(system(), sensors, u0={"c": 1.0, "d": lambda x: 2.0 + 0.0 * x[0]})
     assert np.allclose(both.u0, [1.0] * 9 + [2.0] * 9)
-    with pytest.raises(lp.errors.ConfigurationError, match=r"u0 has no value for \['d'\]"):
-        lp.Identifier(system(), sensors, u0={"c": 1.0})
+    control, law = lp.Advance(lp.Alexander2(), 0.1), lp.SensitivityLaw()
+    partial = {"c": 1.0}
+    for begin in (
+        lambda u0: lp.Identifier(system(), sensors, u0=u0),
+        lambda u0: lp.Fleet(system(), sensors, law, 2, u0=u0),
+        lambda u0: list(lp.simulate(system(), np.ones(1), u0, [0.0, 1.0], control)),
+    ):
+        with pytest.raises(lp.errors.ConfigurationError, match=r"u0 has no value for \['d'\]"):
+            begin(partial)
+        with pytest.raises(lp.errors.ConfigurationError, match="u0 has values that are not finite"):
+            begin({"c": lambda x: np.where(x[0] < 0.5, np.nan, 1.0), "d": 1.0})
+    for wrong, message in (
+        ([1.0, 2.0], r"coefficients of shape \(2,\); expected \(18,\)"),
+        (lambda x: x[0], r"a function of x for \['c', 'd'\]: give a mapping"),
+        ({"c": 1.0, "d": 1.0, "e": 1.0}, r"no unknown is called \['e'\]"),
+    ):
+        with pytest.raises(lp.errors.ConfigurationError, match=message):
+            lp.Identifier(system(), sensors, u0=wrong)
 
 
 def test_points_on_a_vector_field():
@@ -718,3 +902,77 @@ def test_points_on_a_vector_field():
         assert np.allclose(who.forecast([0.0])["a"], expected), options
     with pytest.raises(lp.errors.ObservationError, match="name the measured one, as component = 0"):
         lp.Identifier(model, lp.Points({"a": (0.25, 0.5)}, noise=0.1), u0=start)
+
+
+# --- own data by coordinates ---------------------------------------------------------------------
+
+
+def test_data_of_a_subdomain_by_coordinates():
+    mesh = lp.interval(0.0, 1.0, 10)
+    model = heat(mesh, lp.Normal(0.1, std=0.05), {"right": 0.0})
+    omega = lp.Subdomain(lambda x: x[0] < 0.45, noise=0.1)
+    z = omega.sample(lambda x: x[0] ** 2, model.state_space)
+    assert np.allclose(z, np.linspace(0.0, 0.4, 5) ** 2)
+    assert (lp.Full().sample(lambda x: 3.0, model.state_space) == np.full(10, 3.0)).all()
+    camera = np.linspace(0.5, 0.0, 51)  # other places than the nodes, and downwards
+    table = xr.DataArray(
+        np.outer([1.0, 2.0], np.cos(camera)), {"time": [0.1, 0.2], "x": camera}, ("time", "x")
+    )
+    data = omega.sample(table, model.state_space)
+    assert np.allclose(data, np.outer([1.0, 2.0], np.cos(np.linspace(0.0, 0.4, 5))), atol=1e-4)
+    result = lp.Identifier(model, omega, u0=1.0).run(zip(table["time"].values, data, strict=True))
+    assert np.allclose(result.measured, data)
+    table[1, 25] = np.nan
+    assert np.isnan(omega.sample(table, model.state_space)).sum() < 2
+    for given, message in (
+        (table, r"for x from 0 to 0.5; they are needed from 0 to 1"),
+        (
+            table.rename(x="place"),
+            r"the dimensions \['time', 'place'\]; expected the coord.*\['x'\]",
+        ),
+        (lambda x: np.ones(3), r"the function returns shape \(3,\) for x of shape \(1, 11\)"),
+        (np.ones(10), "got ndarray; expected a function of x or a DataArray"),
+    ):
+        with pytest.raises(lp.errors.ObservationError, match=message):
+            lp.Full().sample(given, model.state_space)
+
+
+def test_data_of_elements_with_slopes_are_projected_on_the_subdomain():
+    from skfem import ElementLineHermite, ElementQuad2
+
+    mesh = lp.interval(0.0, 1.0, 10)
+    state = lp.Field(mesh, ElementLineHermite(), dirichlet={"left": 0.0})
+    model = lp.Model(state, {"k": lp.Normal(1.0, 0.1)}, A=lambda q, u, v, x: q.k * u * v)
+    omega = lp.Subdomain(lambda x: x[0] < 0.35)
+    whole = lp.Full().sample(lambda x: x[0] ** 3 - x[0], model.state_space)
+    cubic = model.state_block.interpolate(lambda x: x[0] ** 3 - x[0])
+    assert np.allclose(whole, cubic[lp.Full().selected(model.state_block)], atol=1e-9)
+    within = omega.sample(lambda x: np.where(x[0] < 0.3, x[0] ** 3 - x[0], 99.0), model.state_space)
+    assert np.allclose(within, cubic[omega.selected(model.state_block)], atol=1e-9)
+    plate = lp.rectangle((0.0, 1.0), (0.0, 2.0), (3, 4))
+    model = lp.Model(
+        {"c": lp.Field(plate, ElementQuad2()), "d": lp.Field(plate, lp.linear(plate))},
+        {"k": lp.Normal(1.0, 0.1)},
+        A=lambda q, u, v, x: q.k * u.c * v.d,
+    )
+    x, y = np.linspace(0.0, 1.0, 30), np.linspace(0.0, 2.0, 40)
+    grid = xr.DataArray(2.0 * x[:, None] - y, {"x": x, "y": y}, ("x", "y"))
+    for of in ("c", "d"):
+        found = lp.Full(of=of).sample(grid, model.state_space)
+        at = model.state_space.fields[of].doflocs
+        assert np.allclose(found, 2.0 * at[0] - at[1], atol=1e-9)
+    with pytest.raises(lp.errors.ObservationError, match="a value is not finite"):
+        lp.Full(of="c").sample(lambda x: np.nan, model.state_space)
+
+
+def test_data_of_a_vector_field():
+    from skfem import ElementQuad1, ElementVector
+
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+    state = lp.Field(mesh, ElementVector(ElementQuad1()))
+    model = lp.Model(state, {"k": lp.Normal(0.0, 0.1)}, A=lambda q, u, v, x: q.k * lp.dot(u, v))
+    flow = lambda x: np.array([x[0], 3.0 * x[1]])  # noqa: E731
+    expected = model.state_block.interpolate(flow)
+    assert np.allclose(lp.Full().sample(flow, model.state_space), expected)
+    with pytest.raises(lp.errors.ObservationError, match="a row for each of 2 components"):
+        lp.Full().sample(lambda x: x[0], model.state_space)

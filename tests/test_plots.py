@@ -325,12 +325,26 @@ def test_measured_and_expected_curves_of_each_sensor() -> None:
     measured = np.column_stack([t, 2.0 * t, 3.0 * t])
     measured[4, 1] = np.nan
     (ax,) = drawn(plots.curves(data, t, measured, title="A run")).axes
-    assert texts(ax) == ["s0", "s1", "w0"]
+    assert texts(ax) == ["s0", "s1", "w0 (withheld)"]
+    assert [line.get_linestyle() for line in ax.lines[1::2]] == ["-", "-", "--"]
     points, lines = ax.lines[::2], ax.lines[1::2]
     errors = [data["innovation"][:, 0], data["innovation"][:, 1], data["withheld_error"][:, 0]]
     for k, (point, line) in enumerate(zip(points, lines, strict=True)):
         np.testing.assert_array_equal(point.get_ydata(), measured[:, k])
         np.testing.assert_allclose(line.get_ydata(), measured[:, k] - errors[k].values)
+
+
+def test_the_overview_begins_with_what_was_measured() -> None:
+    data = dataset(scalars={"k": 3.0}, withheld=1)
+    t = data["time"].values
+    first, *rest = drawn(plots.overview(data, measured=(t, np.ones((30, 3))))).axes
+    assert first.get_title().startswith("measured (points)")
+    assert texts(first) == ["s0", "s1", "w0 (withheld)"]
+    assert first.get_position().width > 1.6 * rest[0].get_position().width
+    plain = drawn(plots.overview(data)).axes
+    assert [ax.get_title() for ax in rest] == [ax.get_title() for ax in plain]
+    (ax,) = drawn(plots.curves(dataset(sensors=9), t, np.zeros((30, 9)))).axes
+    assert ax.get_title().endswith(", 7 of 9 sensors")
 
 
 def test_curves_of_a_journal_that_has_lost_its_first_samples() -> None:

@@ -25,7 +25,7 @@ def energy(model, u, c2=1.0):
 
 def test_a_standing_wave_has_its_period():
     model = wave(STRING, lp.Normal(4.0), dirichlet=FIXED, element=ElementLineP2())
-    start = {"w": lambda x: np.sin(np.pi * x[0])}
+    start = {"w": lambda x: np.sin(np.pi * x[0]), "p": 0.0}
     run = simulate(model, np.array([4.0]), start, [0.0, 0.25, 1.0], Advance(Alexander2(), 0.01))
     first, quarter, last = (u for _, u in run)
     w = model.state_space.part("w")
@@ -36,7 +36,7 @@ def test_a_standing_wave_has_its_period():
 @pytest.mark.parametrize("d", [0.0, 0.8])
 def test_the_energy_decays_only_by_damping(d):
     model = wave(STRING, lp.Normal(1.0), d, FIXED)
-    start = {"w": lambda x: np.sin(np.pi * x[0])}
+    start = {"w": lambda x: np.sin(np.pi * x[0]), "p": 0.0}
     run = simulate(model, np.ones(1), start, np.linspace(0, 2, 21), Advance(Alexander2(), 0.01))
     energies = np.array([energy(model, u) for _, u in run])
     assert np.all(np.diff(energies) < 1e-9)
@@ -57,7 +57,7 @@ def test_a_moving_end_needs_its_velocity():
         wave(STRING, lp.Normal(1.0), dirichlet=moving)
     speed = {"left": lambda x, t: np.cos(t)}
     model = wave(STRING, lp.Normal(1.0), dirichlet=moving, velocity=speed)
-    u0 = {"p": lambda x: np.exp(-((x[0] / 0.1) ** 2))}
+    u0 = {"w": 0.0, "p": lambda x: np.exp(-((x[0] / 0.1) ** 2))}
     *_, (_, u) = simulate(model, np.ones(1), u0, [0.0, 0.5], Advance(Alexander2(), 0.01))
     assert model.state_space.probe(np.array([[0.0]]), of="w") @ u == pytest.approx(np.sin(0.5))
 
@@ -76,7 +76,7 @@ def test_speed_and_damping_from_two_points():
         model=model,
         observation=sensors,
         q_true={"c2": 1.0, "d": 0.5},
-        u0={"w": pluck},
+        u0={"w": pluck, "p": 0.0},
         times=TIMES,
         scheme=Alexander2(),
         noise=AbsoluteNoise(0.01),
@@ -101,7 +101,7 @@ def test_the_speed_as_a_field():
         model=model,
         observation=sensors,
         q_true={"c2": exact},
-        u0={"w": pluck},
+        u0={"w": pluck, "p": 0.0},
         times=TIMES,
         scheme=Alexander2(),
         noise=AbsoluteNoise(0.005),

@@ -15,7 +15,7 @@ from livepde.linalg import Array
 from livepde.observation import Observed
 from livepde.stepping import Interval
 
-__all__ = ["Forecast", "ahead"]
+__all__ = ["Forecast", "ahead", "seen_rows"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,11 +87,19 @@ def ahead(
 def _seen(sensors: Observed, belief: Belief, moment: Moment) -> tuple[Array, Array]:
     """Return the predicted readings of a belief, and their standard deviations."""
     z = sensors.predict(belief.u, belief.q, moment)
-    if belief.u_factor is None or belief.q_factor is None:
+    rows = seen_rows(sensors, belief, moment)
+    if rows is None:
         return z, np.full_like(z, np.nan)
+    return z, np.where(np.isnan(z), np.nan, np.linalg.norm(rows, axis=1))
+
+
+def seen_rows(sensors: Observed, belief: Belief, moment: Moment) -> Array | None:
+    """Return the square root of the covariance of predicted readings, shape (sensors, r).
+
+    Its columns belong to those of the factors of the belief; None for one without.
+    """
+    if belief.u_factor is None or belief.q_factor is None:
+        return None
     H_u, H_q = sensors.jacobian(belief.u, belief.q, moment)
-    factor = H_u @ belief.u_factor
-    if H_q is not None:
-        factor = factor + H_q @ belief.q_factor
-    std = np.linalg.norm(factor, axis=1)
-    return z, np.where(np.isnan(z), np.nan, std)
+    rows: Array = np.asarray(H_u @ belief.u_factor)
+    return rows if H_q is None else rows + H_q @ belief.q_factor

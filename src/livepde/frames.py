@@ -13,7 +13,16 @@ from livepde.errors import LawError
 from livepde.fem import FunctionSpace
 from livepde.laws import Belief
 from livepde.linalg import Array
-from livepde.records import DATE, ESTIMATES, PARAMETER, STATISTIC, STATUS_CODES
+from livepde.records import (
+    DATE,
+    ESTIMATES,
+    PARAMETER,
+    STATISTIC,
+    STATUS_CODES,
+    field_names,
+    interval_95,
+    scalars,
+)
 from livepde.verdict import ModelErrors
 
 if TYPE_CHECKING:
@@ -27,6 +36,7 @@ __all__ = [
     "frame",
     "model_errors",
     "over_time",
+    "predictive",
     "prior_draws",
     "relative_error",
     "times",
@@ -52,8 +62,6 @@ def relative_error(data: xr.Dataset, label: str) -> float:
 def estimates(data: xr.Dataset) -> pd.DataFrame:
     """Return the last estimates of the numbers of a run, one row for each: see `Result.summary`."""
     import pandas as pd
-
-    from livepde.plots.dataset import interval_95, scalars  # with the figures, which load later
 
     errors = model_errors(data)
     verdict = json.loads(data.attrs["verdict"]) if "verdict" in data.attrs else {}
@@ -92,8 +100,6 @@ def frame(data: xr.Dataset) -> pd.DataFrame:
     """Return numbers over time, one row for each sample: see `Result.to_dataframe`."""
     import pandas as pd
 
-    from livepde.plots.dataset import interval_95, scalars
-
     columns: dict[str, Array] = {}
     for label in scalars(data):
         low, high = interval_95(data, label)
@@ -116,8 +122,6 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
     """Return the dataset of a run with dates, and with its numbers on axes of their own."""
-    from livepde.plots.dataset import field_names, interval_95, scalars
-
     found: dict[str, Any] = {}
     labels = scalars(data)
     for name in [*labels, *field_names(data)]:
@@ -186,6 +190,47 @@ def prior_draws(
         latent = prior.latent_mean + prior.latent_std * rng.standard_normal(n)
         found[label] = np.clip(prior.transform.value(latent), *prior.bounds)
     return found
+
+
+def predictive(
+    measured: pd.DataFrame,
+    expected: Array,
+    std: Array,
+    seed: int | np.random.Generator | None,
+) -> dict[str, xr.Dataset]:
+    """Return draws of readings and log densities: see `Result.to_inference_data`.
+
+    Parameters
+    ----------
+    measured
+        Readings, one column for each sensor.
+    expected, std
+        What they are for each draw, shape (n, samples, sensors), and their standard deviations
+        about it, shape (samples, sensors).
+    """
+    import xarray as xr
+
+    n, values = len(expected), measured.to_numpy()
+    drawn = expected + std * np.random.default_rng(seed).standard_normal(expected.shape)
+    shown = {name: (("draw", "time"), drawn[..., k]) for k, name in enumerate(measured)}
+    rows, columns = (np.isfinite(values) & np.isfinite(std)).nonzero()
+    scale = std[rows, columns]
+    e = (values[rows, columns] - expected[:, rows, columns]) / scale
+    density = -0.5 * e**2 - np.log(scale) - 0.5 * math.log(2.0 * math.pi)
+    # ArviZ refuses readings that are the same for all draws, as where the initial state is known.
+    told = np.ptp(density, axis=0) > 1e-12 * np.abs(density).max(axis=0, initial=1.0)
+    about = {
+        "time": ("reading", measured.index[rows[told]]),
+        "sensor": ("reading", measured.columns[columns[told]].to_numpy(dtype=str)),
+    }
+    groups = {
+        "posterior_predictive": xr.Dataset(shown, {"time": measured.index}),
+        "log_likelihood": xr.Dataset({"readings": (("draw", "reading"), density[:, told])}, about),
+    }
+    return {
+        name: group.assign_coords(draw=np.arange(n)).expand_dims(chain=[0])
+        for name, group in groups.items()
+    }
 
 
 def _factor(belief: Belief) -> Array:

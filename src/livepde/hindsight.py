@@ -1,4 +1,4 @@
-"""Smoothed estimates of a run: fixed-interval smoothing of its recorded samples."""
+"""The samples of a run, taken again: smoothed estimates, and readings for given unknowns."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from livepde.stepping import End, Interval
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Hindsight", "with_smoothed"]
+__all__ = ["Hindsight", "LinearReadings", "with_smoothed"]
 
 
 class Hindsight:
@@ -112,6 +112,54 @@ class Hindsight:
             held=(),
             space=result.model.parameter_space,
         )
+
+
+class LinearReadings:
+    """Readings of samples for draws of the unknowns, to first order.
+
+    Parameters
+    ----------
+    shifts
+        Latent coefficients of the draws minus those of the linearisation point, shape (n, m).
+    """
+
+    def __init__(self, shifts: Array) -> None:
+        self._shifts = shifts
+        self._factor, self._weights, self._known = np.zeros((0, 0)), shifts, np.zeros((0, 0))
+        self._readings: list[Array] = []
+        self._std: list[Array] = []
+
+    def add(self, predicted: Array, rows: Array, factor: Array, noise: Array) -> None:
+        """Add a sample.
+
+        Parameters
+        ----------
+        predicted
+            Its readings at the linearisation point, shape (sensors,).
+        rows, factor
+            Joint square root of the covariance of readings and latent unknowns, shapes
+            (sensors, r) and (m, r).
+        noise
+            Standard deviation of each reading, shape (sensors,).
+        """
+        if not np.array_equal(factor, self._factor):  # of constant unknowns it stays the same
+            inverse = np.linalg.pinv(factor)
+            self._factor, self._weights = factor, self._shifts @ inverse.T
+            self._known = inverse @ factor
+        # What the unknowns do not explain is the state's own uncertainty.
+        left = rows - rows @ self._known
+        self._readings.append(predicted + self._weights @ rows.T)
+        self._std.append(np.sqrt(noise**2 + (left * left).sum(axis=1)))
+
+    @property
+    def readings(self) -> Array:
+        """Readings of each draw without noise, shape (n, samples, sensors)."""
+        return np.array(self._readings).swapaxes(0, 1)
+
+    @property
+    def std(self) -> Array:
+        """Standard deviation of each reading about them, shape (samples, sensors)."""
+        return np.array(self._std)
 
 
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:

@@ -28,8 +28,8 @@ from livepde.errors import (
 )
 from livepde.fem import Inputs, Moment
 from livepde.fingerprint import Fingerprint, fingerprint
-from livepde.forecast import Forecast, ahead
-from livepde.hindsight import Hindsight
+from livepde.forecast import Forecast, ahead, seen_rows
+from livepde.hindsight import Hindsight, LinearReadings
 from livepde.laws import (
     AnyLaw,
     Belief,
@@ -179,7 +179,7 @@ class Identifier(Shown):
         self.assimilate_from = assimilate_from
         self._work = law.prepare(self.problem)
         self._q0 = model.initial_parameter(q0)
-        self._u0 = model.state_space.interpolate(0.0 if u0 is None else u0)
+        self._u0 = model.initial_values(0.0 if u0 is None else u0)
         self._stated = model.boundary_readings(u0)  # at t0
         self._state: Any = None
         self._t = float(t0)
@@ -568,18 +568,16 @@ class Identifier(Shown):
             diagnose=lambda: report.diagnostics,
             held=held,
             space=self.model.parameter_space,
+            state_space=self.model.state_space,
             judge=self._judge(judge, lambda: report.diagnostics),
             fit=self.law.fit(self._work, self._state),
         )
 
     def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
         """Return the variance of the predicted values of withheld sensors, without their noise."""
-        if self.withheld is None or belief.u_factor is None or belief.q_factor is None:
+        rows = None if self.withheld is None else seen_rows(self.withheld, belief, moment)
+        if rows is None:
             return np.zeros(self._withheld.last.shape)
-        H_u, H_q = self.withheld.jacobian(belief.u, belief.q, moment)
-        rows = np.asarray(H_u @ belief.u_factor)
-        if H_q is not None:
-            rows = rows + H_q @ belief.q_factor
         found: Array = (rows * rows).sum(axis=1)
         return found
 
@@ -817,6 +815,9 @@ class Identifier(Shown):
                 on_estimate(estimate)
         if result.last is not None:
             result.settle(self.settled(result.last))
+            noise = self.law.reading_noise(self._work, self._state)
+            if noise is not None and not begun._samples and not self.model.latent.moves:
+                result.expected = partial(begun._expected, taken, noise)
         return result
 
     def _samples_of(self, data: Any, reading: Mapping[str, Any]) -> Iterable[Any]:
@@ -907,6 +908,48 @@ class Identifier(Shown):
         data = run.fixed_interval(fields_every)
         beliefs = data and self.law.smoothed(self._work, before, who._state, data)
         return run.dataset(result, self.problem, beliefs or ())
+
+    def _expected(
+        self, samples: Iterable[Sample], noise: Array, q: Array, draws: Array
+    ) -> tuple[Array, Array]:
+        """Return readings that draws of the unknowns lead to, and their standard deviation.
+
+        Linear about q: the samples are taken again from there, without their readings.
+
+        Parameters
+        ----------
+        noise
+            Of each sensor, shape (sensors,).
+        q, draws
+            Coefficients of constant unknowns, shapes (m,) and (n, m).
+
+        Returns
+        -------
+        readings, std
+            Shapes (n, samples, sensors) and (samples, sensors); NaN where a step fails.
+        """
+        latent = self.model.latent
+        centre = latent.inverse(q)
+        found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
+        who = self.started(centre, self._u0, self.problem.initial_errors)
+        who._state = None
+        if not who.inputs:
+            who._begin(who._inputs)
+        nothing = np.full(self.observed.size, np.nan)
+        for sample in samples:
+            _, own, _, named = self._channels.parse(sample.z, sample.inputs or {})
+            inputs = {name: named[name] for name in self.inputs if name in named}
+            estimate, interval = who._taken(sample.t, nothing, inputs)
+            std = noise if own is None else np.where(np.isnan(own), noise, own)
+            used = estimate.status.ok and estimate.t >= self.assimilate_from
+            latent_factor = who.latent_belief().q_factor
+            belief = who._belief()
+            predicted = self.observed.predict(belief.u, belief.q, interval.end)
+            rows = seen_rows(self.observed, belief, interval.end)
+            if latent_factor is None or rows is None:
+                raise LawError(f"{type(self.law).__name__} has no covariance: use SensitivityLaw.")
+            found.add(predicted, rows, latent_factor, std if used else nothing)
+        return found.readings, found.std
 
     @property
     def fingerprint(self) -> Fingerprint:
@@ -1030,12 +1073,6 @@ def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any])
     for name, given in uncertain.items():
         if given and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
-    components = model.state_space.fields
-    if isinstance(u0, Mapping) and (missing := [name for name in components if name not in u0]):
-        raise ConfigurationError(
-            f"u0 has no value for {missing}: give one for each component of the state, "
-            f"{list(components)}; one number is that of all of them."
-        )
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError(
             "the model has an initial state of its own (initial=): leave out u0."

@@ -120,6 +120,8 @@ class Model(Shown):
         Names of the channels that forms read as x.inputs["name"].
     time_unit, length_unit
         Units of times and coordinates, for tables, figures and sentences.
+    formula
+        The equation as text, which `repr` shows; default the weak form as it is written in code.
     initial
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
@@ -161,6 +163,7 @@ class Model(Shown):
         inputs: Sequence[str] = (),
         time_unit: str = "",
         length_unit: str = "",
+        formula: str = "",
         initial: Integrand | On | Sequence[Integrand | On] | None = None,
         coefficients: Callable[[Any], Mapping[str, Any]] | None = None,
     ) -> None:
@@ -171,7 +174,11 @@ class Model(Shown):
         self.state = state
         self.parameter = parameter
         self.time_unit, self.length_unit = time_unit, length_unit
-        self._units: dict[str, Any] = {"time_unit": time_unit, "length_unit": length_unit}
+        self._about: dict[str, Any] = {
+            "time_unit": time_unit,
+            "length_unit": length_unit,
+            "formula": formula,
+        }
         self.state_space = FunctionSpace.of(state, "u")
         self.mesh = _common_mesh(self.state_space)
         self.parameter_space = FunctionSpace.of(parameter, "q")
@@ -214,9 +221,10 @@ class Model(Shown):
             rows[f"state {name}"] = f"{kind}, {block.size} coefficients"
             if block.field.dirichlet:
                 rows[f"state {name}"] += f", Dirichlet values {_boundaries(block.field.dirichlet)}"
-        rows["equation"] = _equation(self._parts)
+        formula = self._about["formula"]
+        rows["equation"] = formula or _equation(self._parts)
         for name, what in {"M": "mass M(u, v)", "initial": "initial state"}.items():
-            if self._parts[name] is not None:
+            if self._parts[name] is not None and not (formula and name == "M"):
                 rows[what] = " + ".join(_terms(self._parts[name]))
         for name, unknown in self.parameter_space.unknowns.items():
             of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
@@ -246,7 +254,7 @@ class Model(Shown):
         ConfigurationError
             A function that pickle cannot find by its name.
         """
-        parts = self.state, self.parameter, {**self._parts, **self._units}
+        parts = self.state, self.parameter, {**self._parts, **self._about}
         try:
             pickle.dumps(parts)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -297,7 +305,7 @@ class Model(Shown):
             what = f"the name '{taken[0]}' is taken" if taken else "its one unknown has no name"
             raise ModelError(f"with_unknowns: {what}; write parameter={{name: unknown, ...}}.")
         unknowns = {**cast(Mapping[str, Unknown], self.parameter), **more}
-        return Model(self.state, unknowns, **self._parts, **self._units)
+        return Model(self.state, unknowns, **self._parts, **self._about)
 
     def with_terms(
         self,
@@ -326,7 +334,10 @@ class Model(Shown):
             given = parts[name] if isinstance(parts[name], Sequence) else [parts[name]]
             parts[name] = [*given, *more]
         parts["inputs"] = tuple(dict.fromkeys([*self.inputs, *inputs]))
-        return Model(self.state, self.parameter, **parts, **self._units)
+        about, added = dict(self._about), ", with added conditions and sources"
+        if about["formula"] and not about["formula"].endswith(added):
+            about["formula"] += added
+        return Model(self.state, self.parameter, **parts, **about)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
         """Return the same process with constants in the place of some of its inputs.
@@ -355,7 +366,7 @@ class Model(Shown):
         parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
         parts["coefficients"] = self._parts["coefficients"]
         left = [name for name in self.inputs if name not in values]
-        return Model(self.state, self.parameter, **parts, inputs=left, **self._units)
+        return Model(self.state, self.parameter, **parts, inputs=left, **self._about)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
@@ -378,7 +389,7 @@ class Model(Shown):
             return finer(parts)
 
         state, parameter = of(self.state), of(self.parameter)
-        return Model(state, parameter, **self._parts, **self._units)
+        return Model(state, parameter, **self._parts, **self._about)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
@@ -394,20 +405,52 @@ class Model(Shown):
 
     def _check_diffusion(self) -> None:
         """Warn of a diffusion that is negative everywhere at the prior mean: u_t = -k u_xx."""
-        q = self.parameter_space.prior
-        for u in (0.1, 1.0, 10.0):  # of a diffusivity that depends on u
-            parts = self.physical_A.diffusion(u, q=q), self.form_B.diffusion(u)
-            if parts[0] is None or parts[1] is None:
-                return
-            factors = parts[0] + parts[1]
-            if not (factors < 0.0).any() or not (factors <= 0.0).all():
-                return
-        warnings.warn(
-            "the diffusion of the model is negative at the prior mean, which is ill-posed: small "
-            "disturbances grow without bound. In the weak form of u_t = k u_xx the term is "
-            "+ k * dot(grad(u), grad(v)): change its sign in A or B.",
-            stacklevel=3,
-        )
+        for name in self.state_space.fields:
+            if self._grows(name):
+                what = "the model" if self.state_space.single else f"'{name}'"
+                warnings.warn(
+                    f"the diffusion of {what} is negative at the prior mean, which is ill-posed: "
+                    "small disturbances grow without bound. In the weak form of u_t = k u_xx the "
+                    "term is + k * dot(grad(u), grad(v)): change its sign in A or B.",
+                    stacklevel=4,
+                )
+
+    def _grows(self, name: str) -> bool:
+        """Return whether a component has negative diffusion in a direction, on all of the mesh.
+
+        Not where other components or higher derivatives may make up for it, nor for a component
+        without a change in time, whose sign is free.
+        """
+        mine = list(self.state_space.blocks).index(name)
+        owners = self.form_M.owners("u")
+        values = [k for k, owner in enumerate(owners) if owner == (mine, "value")]
+        masses = [self.form_M.factor(k, k, 0.0) for k in values]
+        if all((mass >= 0.0).all() and (mass > 0.0).any() for mass in masses):
+            sign = 1.0
+        elif all((mass <= 0.0).all() and (mass < 0.0).any() for mass in masses):
+            sign = -1.0
+        else:
+            return False
+        slopes = [k for k, (_, part) in enumerate(owners) if part == "grad"]
+        own = [k for k in slopes if owners[k][0] == mine]
+        levels = (0.1, 1.0, 10.0)  # of a diffusivity that depends on u
+        growing = [k for k in own if all(self._negative(sign, k, u) for u in levels)]
+        if not growing:
+            return False
+        higher = [k for k, (_, part) in enumerate(owners) if part not in ("value", "grad")]
+        others = [k for k in slopes if owners[k][0] != mine]
+        coupled = [*((k, k) for k in higher)]
+        coupled += [pair for k in growing for j in others for pair in ((k, j), (j, k))]
+        return not any(self._pairing(*pair, 1.0).any() for pair in coupled)
+
+    def _pairing(self, of: int, tested: int, u: float) -> Array:
+        """Return the factor of two components in A and B, at the prior mean of the unknowns."""
+        A = self.physical_A.factor(of, tested, u, q=self.parameter_space.prior)
+        return A + self.form_B.factor(of, tested, u)
+
+    def _negative(self, sign: float, k: int, u: float) -> bool:
+        factors = sign * self._pairing(k, k, u)
+        return bool((factors < 0.0).any() and (factors <= 0.0).all())
 
     def _check_names(self) -> None:
         """Refuse names that a run's dataset could not tell apart."""
@@ -611,8 +654,31 @@ class Model(Shown):
         return {channel: float(there.mean()) for channel, there in values.items() if fits[channel]}
 
     def initial(self, u0: Any, moment: Moment = START) -> Array:
-        """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
-        return self.impose(self.state_space.interpolate(u0), moment)
+        """Return coefficients of u0 with the boundary values of a moment; see `initial_values`."""
+        return self.impose(self.initial_values(u0), moment)
+
+    def initial_values(self, u0: Any) -> Array:
+        """Return coefficients of u0: a number, a function of x, coefficients, or a mapping.
+
+        A number is the value of all components of the state; a mapping names each of them.
+
+        Raises
+        ------
+        ModelError
+            A mapping that leaves out a component; values that are not finite.
+        SpaceError
+            Coefficients of another shape, or an unknown component.
+        """
+        components = self.state_space.fields
+        if isinstance(u0, Mapping) and (left := [name for name in components if name not in u0]):
+            raise ModelError(
+                f"u0 has no value for {left}: give one for each component of the state, "
+                f"{list(components)}; one number is that of all of them."
+            )
+        found = self.state_space.interpolate(u0)
+        if not np.isfinite(found).all():
+            raise ModelError("u0 has values that are not finite: give finite values.")
+        return found
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
         """Return coefficients of the initial state that belongs to a latent parameter."""

@@ -27,6 +27,7 @@ __all__ = [
     "DATE",
     "ESTIMATES",
     "FIELD_ENDS",
+    "NORMAL_95",
     "NOTE",
     "NUMBER_ENDS",
     "PARAMETER",
@@ -40,12 +41,16 @@ __all__ = [
     "Records",
     "Snapshot",
     "bare",
+    "field_names",
+    "interval_95",
     "name_clashes",
     "refusal",
     "refused_readings",
+    "scalars",
     "used_errors",
 ]
 
+NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 
 NOTE = "note_"  # prefix of a note whose own name is taken
@@ -661,3 +666,25 @@ def _uses(name: str, kind: str, ends: Mapping[str, str]) -> Iterator[tuple[str, 
         yield f"{name}{end}", f"{meaning} of '{name}'"
     for end in ("", *STATE_ENDS, *INTERVAL_ENDS):
         yield f"{name}{SMOOTHED}{end}", f"a smoothed variable of '{name}'"
+
+
+def scalars(data: xr.Dataset) -> list[str]:
+    """Return the labels of the scalar unknowns."""
+    return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
+
+
+def field_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the unknown fields."""
+    return str(data.attrs.get("fields", "")).split()
+
+
+def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
+    """Return the ends of the 95 % interval of a variable with a standard deviation.
+
+    The ends stored in the dataset are mapped through a transform and lie within bounds; without
+    them the interval is the value +- 1.96 standard deviations.
+    """
+    if f"{name}_low" in data:
+        return data[f"{name}_low"].values, data[f"{name}_high"].values
+    value, half = data[name].values, NORMAL_95 * data[f"{name}_std"].values
+    return value - half, value + half

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
@@ -19,6 +20,7 @@ from livepde.frames import (
     estimates,
     frame,
     over_time,
+    predictive,
     prior_draws,
     times,
     with_estimates,
@@ -93,6 +95,8 @@ class Estimate(Shown):
         also those without a value at the initial time, whose first one was held.
     space
         The unknowns.
+    state_space
+        The components of the state; None for an estimate that was pickled.
     judge
         Function that returns the verdict of the law on the run so far; see `verdict`.
     fit
@@ -110,6 +114,7 @@ class Estimate(Shown):
     space: FunctionSpace
     judge: Callable[[], Verdict] = Verdict.unjudged
     fit: Fit | None = None
+    state_space: FunctionSpace | None = None
 
     @classmethod
     def deferred(
@@ -126,6 +131,7 @@ class Estimate(Shown):
         space: FunctionSpace,
         judge: Callable[[], Verdict],
         fit: Fit | None = None,
+        state_space: FunctionSpace | None = None,
     ) -> Estimate:
         """Return an estimate whose belief is computed when it is first read, and kept then.
 
@@ -147,6 +153,7 @@ class Estimate(Shown):
             space=space,
             judge=judge,
             fit=fit,
+            state_space=state_space,
         )
         return estimate
 
@@ -173,6 +180,7 @@ class Estimate(Shown):
             "diagnose": partial(kept, self.diagnostics),
             "judge": partial(kept, self.verdict),
             "space": self.space.described,
+            "state_space": None,
         }
         return {k: v for k, v in vars(self).items() if k != "_read"} | own
 
@@ -263,7 +271,8 @@ class Estimate(Shown):
         Parameters
         ----------
         name
-            Label of an unknown number, or name of a field.
+            Label of an unknown number, or name of a field or of a component of the state, which
+            have values at coordinates: `estimate["u"].at([0.1, 0.5])`.
 
         Raises
         ------
@@ -275,13 +284,63 @@ class Estimate(Shown):
         if name in space.labels:
             k = space.labels[name]
             return Marginal(float(self.q[k]), float(std[k]), unknown_of(space, name))
-        if name not in space.fields:
+        if name in space.fields:
+            part = space.part(name)
+            known = unknown_of(space, name)
+            return Marginal(self.q[part], std[part], known, partial(self._at, name))
+        if self.state_space is not None and name in self.state_space.fields:
+            part = self.state_space.part(name)
+            u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
+            known = unknown_of(self.state_space, name)
+            return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
+        components = () if self.state_space is None else self.state_space.fields
+        raise ConfigurationError(
+            f"estimate['{name}']: there is no unknown '{name}'; there are "
+            f"{[*space.labels, *space.fields, *components]}."
+        )
+
+    def _at(self, name: str, points: ArrayLike) -> Marginal:
+        """Return the marginals of the values of a field at points."""
+        if self.state_space is None:
             raise ConfigurationError(
-                f"estimate['{name}']: there is no unknown '{name}'; there are "
-                f"{[*space.labels, *space.fields]}."
+                f"estimate['{name}'].at: this estimate was pickled, without its mesh: call `at` "
+                "of the estimate of an identifier."
             )
-        part = space.part(name)
-        return Marginal(self.q[part], std[part], unknown_of(space, name))
+        unknown = name in self.space.fields
+        space = self.space if unknown else self.state_space
+        block, part = space.fields[name], space.part(name)
+        at, one = _coordinates(points, len(block.box[0]), name)
+        rows = block.probe(at, f"estimate['{name}'].at: point")
+        if unknown:
+            values, std = rows @ self.q[part], self.belief.deviation(rows, part)
+        else:
+            factor = self.belief.u_factor
+            values = rows @ self.u[part]
+            std = None if factor is None else np.linalg.norm(rows @ factor[part], axis=1)
+        std = np.full_like(values, np.nan) if std is None else std
+        shape = () if one else (at.shape[1],)
+        if block.vector:
+            values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
+            shape = (*shape, values.shape[1])
+        if not shape:
+            return Marginal(float(values[0]), float(std[0]), unknown_of(space, name))
+        return Marginal(values.reshape(shape), std.reshape(shape), unknown_of(space, name))
+
+
+def _coordinates(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
+    """Return coordinates of points, shape (axes, points), and whether one point is meant."""
+    try:
+        given = np.asarray(points, dtype=float)
+    except (TypeError, ValueError):
+        given = np.zeros((0, 0, 0))
+    one = given.ndim == 0 or (given.ndim == 1 and axes > 1)
+    columns = given.reshape(-1, 1) if axes == 1 and given.ndim < 2 else np.atleast_2d(given)
+    if columns.ndim != 2 or columns.shape[1] != axes:
+        shapes = "(points,)" if axes == 1 else f"({axes},) or (points, {axes})"
+        raise ConfigurationError(
+            f"estimate['{name}'].at: got points {points!r:.60}; expected numbers, shape {shapes}."
+        )
+    return columns.T, one
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,6 +361,43 @@ class Marginal:
     median: Any
     deviation: Any
     unknown: Any
+    _read: Callable[[ArrayLike], Marginal] | None = None
+
+    def at(self, points: ArrayLike) -> Marginal:
+        """Return the marginals of the values of a field at points.
+
+        Parameters
+        ----------
+        points
+            Coordinates of one or more points: on an interval a number or shape (points,), else
+            shape (d,) or (points, d).
+
+        Returns
+        -------
+        marginals
+            Its median, deviation, mean, std and intervals have a number for each point; of a vector
+            field a row of components.
+
+        Raises
+        ------
+        ConfigurationError
+            The unknown is a number, or the estimate was pickled.
+        ObservationError
+            A point outside of the mesh.
+
+        Examples
+        --------
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
+        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
+        >>> estimate = rod.step(0.1, [20.0])
+        >>> estimate["u"].at([0.25, 0.5]).mean.round(3)
+        array([20., 20.])
+        """
+        if self._read is None:
+            raise ConfigurationError("at: only a field has values at points; this is a number.")
+        return self._read(points)
 
     @property
     def mean(self) -> Any:
@@ -387,6 +483,8 @@ class Result(Shown):
         self._ended = False  # a last fit was asked for
         self.smoother: Callable[[], xr.Dataset] | None = None
         self.readings: Callable[[], Array] | None = None  # of all samples, (samples, sensors)
+        # From q and draws of it to the readings that they lead to, and their deviations.
+        self.expected: Callable[[Array, Array], tuple[Array, Array]] | None = None
         self.records: Records = RecordArrays() if records is None else records
         self.layout = layout or layout_of(model, observed, withheld, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
@@ -594,8 +692,23 @@ class Result(Shown):
     def to_inference_data(self, n: int = 1000, seed: int | None = 0) -> xr.DataTree:
         """Return what ArviZ (from 1.0 on) plots and compares: an xarray DataTree.
 
-        Its groups are `posterior`, the draws of `sample`; `prior`, draws of the numbers among the
-        unknowns; and `observed_data`, the readings, if they are known (see `measured`).
+        Its groups:
+
+        - `posterior`: the draws of `sample`. `prior`: draws of the numbers among the unknowns.
+        - `observed_data`: the readings of all sensors, of a result of `Identifier.run`.
+        - `posterior_predictive`: for each draw of the unknowns, draws of the readings of the
+          assimilated sensors, noise included.
+        - `log_likelihood`: `readings` over `reading`, for each draw of the unknowns the log density
+          of each assimilated reading, so that `arviz.loo` compares models by it. A reading that no
+          unknown reaches, as at a known initial state, is left out.
+
+        For the last two all samples are taken again, which takes as long as a run. What a draw
+        leads to is linear about the last estimate: the model from the initial state on, without
+        corrections by the readings. So these are no predictions one step ahead, which are
+        `predicted` and do not depend on a draw. Noise of inputs, errors of the initial state and of
+        the discretisation widen each density. Readings that the gate has refused count as the
+        others. Runs of unknowns that move, and runs that continue an earlier one, have neither
+        group.
 
         Parameters
         ----------
@@ -614,6 +727,12 @@ class Result(Shown):
         if self.readings is not None:
             frame = self.measured
             chains["observed_data"] = xr.Dataset({name: frame[name] for name in frame})
+        if self.expected is not None:
+            last = self._last("to_inference_data")
+            # The same draws as in `sample`, without what the law takes no account of.
+            q, _ = draws(replace(last.belief, rest=None), last.space, n, seed)
+            measured = self.measured[list(self.layout.sensors)]
+            chains |= predictive(measured, *self.expected(last.q, q), seed)
         return xr.DataTree.from_dict(chains)
 
     @property
@@ -708,6 +827,7 @@ class Result(Shown):
             "_last_fields": fields,
             "_complete": True,
             "smoother": None,
+            "expected": None,
         }
         if self.readings is not None:
             own["readings"] = partial(kept, self.readings())

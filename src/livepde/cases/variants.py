@@ -18,8 +18,8 @@ from livepde.cases.remedies import with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.identifier import Sample
-from livepde.plots.dataset import interval_95, modes_told, scalars
-from livepde.records import used_errors
+from livepde.plots.dataset import modes_told
+from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import verdict
 from livepde.runs.summary import channel_errors, rmse

@@ -68,19 +68,22 @@ def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict
     Parameters
     ----------
     journal
-        Has the readings, for the figure `curves` of runs that are not too long.
+        Has the readings, for the first panels of `overview`, and the figure `curves`, of runs that
+        are not too long.
     """
     from livepde import plots
 
     if not dataset.sizes["time"]:
         return {}
-    found: dict[str, Any] = {"overview": lambda: plots.overview(dataset, title=title)}
     kinds = [of for of in ("sensor", "withheld") if of in dataset]
     names = [str(name) for of in kinds for name in dataset[of].values]
-    if journal is not None and names and len(journal) <= MOST_CURVES:
-        kept = journal.readings(names)
-        found["curves"] = lambda: plots.curves(dataset, *kept, title=title)
-    return found
+    if journal is None or not names or len(journal) > MOST_CURVES:
+        return {"overview": lambda: plots.overview(dataset, title=title)}
+    kept = journal.readings(names)
+    return {
+        "overview": lambda: plots.overview(dataset, title=title, measured=kept),
+        "curves": lambda: plots.curves(dataset, *kept, title=title),
+    }
 
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:

@@ -10,8 +10,12 @@ import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from livepde import runs
+from livepde.dashboard.view import with_readings
 from livepde.errors import RunError, optional
+from livepde.plots.dataset import sensor_names
 from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL
 from livepde.runs.exported import into_place
@@ -24,6 +28,7 @@ __all__ = ["page_of", "write_report"]
 
 TEMPLATE, STYLE = "report.html", "assets/page.css"
 MOST_EVENTS = 500
+MOST_READINGS = 100_000  # samples of a run whose readings are drawn
 
 
 def write_report(run: Run, target: Path, *, force: bool = False) -> None:
@@ -57,6 +62,13 @@ def page_of(run: Run) -> str:
     from livepde.dashboard.panels import SECTIONS, panels
 
     data = run.dataset
+    with run.reading() as journal:
+        if journal is not None and len(journal) <= MOST_READINGS and data.sizes["time"]:
+            names = sensor_names(data)
+            known = dict(zip(*journal.readings(names), strict=True))
+            missing = np.full(len(names), np.nan)
+            readings = [known.get(t, missing) for t in data["time"].values.tolist()]
+            data = with_readings(data, np.array(readings))
     if not data.sizes["time"]:
         raise RunError(f"{run.path} holds no estimates yet: there is nothing to report.")
     axis, drawn = when_axis(data), panels(data)

@@ -16,7 +16,8 @@ from livepde.dashboard import cards
 from livepde.dashboard.canvas import unit_of, when_axis
 from livepde.dashboard.page import application, harden, page
 from livepde.dashboard.view import RunView, View
-from livepde.plots.dataset import labelled, scalars
+from livepde.plots.dataset import labelled
+from livepde.records import scalars
 from livepde.runs import run_names
 from livepde.runs.summary import digits
 

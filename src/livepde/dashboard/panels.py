@@ -28,25 +28,27 @@ from livepde.dashboard.canvas import (
     when_axis,
 )
 from livepde.dashboard.field_views import drawn_by, field_profile
+from livepde.dashboard.view import READINGS
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
 from livepde.plots.dataset import (
     MOST_LINES,
-    field_names,
     groups,
-    interval_95,
+    labelled,
     modes_told,
     note,
     prior_left,
-    scalars,
     scored_from,
+    sensor_names,
+    sensor_units,
 )
-from livepde.records import used_errors
+from livepde.records import field_names, interval_95, scalars, used_errors
 from livepde.runs.summary import shown
 
 __all__ = ["SECTIONS", "Panel", "panels"]
 
 SECTIONS = {
+    "measured": "Measured and modelled",
     "estimates": "Estimates",
     "sensors": "Sensors against the model",
     "told": "What the data have told",
@@ -90,7 +92,8 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
     """
     if not data.sizes.get("time"):
         return []
-    found = [*_unknown_panels(data, at), *_field_panels(data, at, cut)]
+    found = [*_measured_panels(data, at), *_unknown_panels(data, at)]
+    found += _field_panels(data, at, cut)
     for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
         if variable in data and data.sizes.get(dimension):
             found.append(_residual_panel(data, variable, dimension, at))
@@ -112,6 +115,73 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
         title = "Which unknowns are told only together"
         found.append(Panel("correlation", "told", title, about, correlation(data)))
     return found
+
+
+def _measured_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
+    """Return a panel for the sensors of each unit, where the readings are known."""
+    if not any(name in data for name in READINGS.values()):
+        return []
+    names, found = sensor_names(data), list[Panel]()
+    units = sensor_units(data, names)
+    for unit in dict.fromkeys(units.values()):
+        shown = [name for name in names if units[name] == unit]
+        about = "Points: readings. Lines: what the model expected of them one step ahead."
+        if any(name in data["withheld"] for name in shown if "withheld" in data):
+            about += " Dashed: withheld sensors, which it never uses."
+        if len(shown) > MOST_LINES:
+            about += f" The first {MOST_LINES} of {len(shown)} sensors."
+        title = f"Measured and modelled{f', {unit}' if len(set(units.values())) > 1 else ''}"
+        figure = measured(data, shown[:MOST_LINES], unit, at)
+        found.append(Panel(f"measured:{unit}", "measured", title, about, figure))
+    return found
+
+
+def measured(
+    data: xr.Dataset, sensors: Sequence[str], unit: str, at: float | None = None
+) -> go.Figure:
+    """Draw the readings of sensors of one unit, and what the model expected of them."""
+    data = _bounded(data)
+    figure, axis = over_time(data, labelled("", unit).strip().strip("[]"), at)
+    t = axis.values(data["time"].values)
+    for error, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+        if error not in data:
+            continue
+        names = [str(name) for name in data[dimension].values]
+        columns = (
+            data[name].transpose("time", dimension).values for name in (READINGS[error], error)
+        )
+        readings, errors = columns
+        for k, name in enumerate(names):
+            if name not in sensors:
+                continue
+            colour = PALETTE[list(sensors).index(name) % len(PALETTE)]
+            withheld = dimension == "withheld"
+            about = {"legendgroup": name, "hovertemplate": "%{y:.4g}"}
+            figure.add_scatter(
+                x=t,
+                y=readings[:, k],
+                mode="markers",
+                marker={"color": colour, "size": 4, "opacity": 0.6},
+                name=text(f"{name}, measured"),
+                showlegend=False,
+                **about,
+            )
+            label = text(f"{name} (withheld)" if withheld else name)
+            dash = "dash" if withheld else None
+            mode = "lines+markers" if len(t) == 1 else "lines"
+            line(
+                figure,
+                t,
+                readings[:, k] - errors[:, k],
+                colour,
+                1.6,
+                dash,
+                name=label,
+                mode=mode,
+                **about,
+            )
+    figure.update_layout(showlegend=True)
+    return figure
 
 
 def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:

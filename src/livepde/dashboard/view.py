@@ -15,16 +15,19 @@ import xarray as xr
 
 from livepde import runs
 from livepde.errors import RunError
+from livepde.linalg import Array
 from livepde.records import Layout, Record
 from livepde.runs import Check, Journal
 from livepde.runs.database import in_use, written
 from livepde.runs.directory import JOURNAL
 from livepde.runs.journal import Event
 
-__all__ = ["RunView", "Spread", "View"]
+__all__ = ["READINGS", "RunView", "Spread", "View", "with_readings"]
 
 T = TypeVar("T")
 
+# Errors of sensors -> name of their readings in the dataset of a view, which no unknown has.
+READINGS = {"innovation": "readings of sensors", "withheld_error": "readings of withheld sensors"}
 ROWS = 2000  # estimates that are kept to be drawn
 NOTABLE = 500  # failed steps and jumps that are kept beside them
 FIELDS = 400  # snapshots
@@ -131,6 +134,24 @@ class RunView:
     problem: str = ""
 
 
+def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
+    """Return a dataset with the readings of its sensors and withheld sensors, `READINGS`.
+
+    Parameters
+    ----------
+    readings
+        Shape (time, sensors), the withheld ones last.
+    """
+    parts = np.split(readings, [data.sizes["sensor"]], axis=1)
+    return data.assign(
+        {
+            name: (data[error].dims, part)
+            for (error, name), part in zip(READINGS.items(), parts, strict=True)
+            if error in data
+        }
+    )
+
+
 class View:
     """The current contents of a run directory, for any number of visitors.
 
@@ -187,6 +208,7 @@ class View:
         self._notable: Spread[Record] = Spread(NOTABLE)
         self._fields: Spread[Record] = Spread(FIELDS)
         self._number = 0
+        self._readings: dict[int, Array] = {}  # of the records that are kept
 
     def _read(self) -> RunView:
         run = runs.open(self.path)
@@ -233,11 +255,15 @@ class View:
         with Journal.open(path) as journal:
             # The last one again: its fields may have been kept after it.
             new = [*islice(journal.after(max(self._number - 1, 0)), AT_ONCE)]
+            readings = dict(journal.values(new[0][0], new[-1][0])) if new else {}
             layout, count = journal.layout, journal.estimated
             events, counts, unwell = journal.events, journal.counts, journal.health
             verdict = journal.verdict
+        names = [*layout.sensors, *(layout.withheld or ())]
         for number, record in new:
             self._add(number, record)
+            values = readings.get(number, {})
+            self._readings[number] = np.array([values.get(name, np.nan) for name in names])
         status = seen.status
         heard = [event.kind for event in events if event.kind in HEARING]
         if status == "running" and not count:
@@ -272,7 +298,10 @@ class View:
         kept = {**dict(self._rows), **dict(self._notable), **dict(self._fields)}
         if not kept:
             return None
-        data = layout.dataset([kept[number] for number in sorted(kept)])
+        numbers = sorted(kept)
+        data = layout.dataset([kept[number] for number in numbers])
+        self._readings = {number: self._readings[number] for number in numbers}
+        data = with_readings(data, np.array([*self._readings.values()]))
         if verdict:
             data.attrs["verdict"] = verdict
         return data

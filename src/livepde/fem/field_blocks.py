@@ -375,6 +375,58 @@ class FieldBlock(Block):
         )
         return found
 
+    def fitted(self, cells: IntArray) -> tuple[Array, Callable[[Array], Array]]:
+        """Return where to evaluate a function that is known in some cells, and its fit.
+
+        Returns
+        -------
+        points
+            Shape (d, points): the nodes of an element of first order, else quadrature points.
+        fit
+            Function that returns coefficients of the cells, shape (size,), 0 elsewhere, from values
+            at the points, shape (components, points): the values at the nodes, else the L2
+            projection on the cells.
+        """
+        used = np.unique(self.element_dofs[:, cells])
+        found = np.zeros(self.size)
+        if self.nodal:
+
+            def at_nodes(values: Array) -> Array:
+                coefficients = found.copy()
+                coefficients[used] = values[0]
+                return coefficients
+
+            return self.doflocs[:, used], at_nodes
+        pieces = [(self.local(piece), piece) for _, piece in self.measure.on(cells).pieces()]
+        places = np.zeros(self.size, dtype=np.int64)
+        places[used] = np.arange(len(used))
+        dofs = [places[local.dofs] for local, _ in pieces]
+        grams = [
+            np.einsum("kiep,kjep->ije", local.part("value") * piece.weights, local.part("value"))
+            for local, piece in pieces
+        ]
+        shape = len(used), len(used)
+        mass = sp.csr_array(shape)
+        for rows, gram in zip(dofs, grams, strict=True):
+            i, j = (np.broadcast_to(axis, gram.shape) for axis in (rows[:, None], rows[None]))
+            mass = mass + sp.csr_array((gram.ravel(), (i.ravel(), j.ravel())), shape=shape)
+        factor = analyse(Pattern.of(mass), symmetric=True).factorise(mass.data)
+
+        def projected(values: Array) -> Array:
+            functional, start = np.zeros(len(used)), 0
+            for (local, piece), rows in zip(pieces, dofs, strict=True):
+                stop = start + piece.weights.size
+                density = values[:, start:stop].reshape(-1, *piece.shape) * piece.weights
+                tested = np.einsum("kep,kiep->ie", density, local.part("value"))
+                np.add.at(functional, rows.ravel(), tested.ravel())
+                start = stop
+            coefficients = found.copy()
+            coefficients[used] = factor.solve(functional)
+            return coefficients
+
+        points = [piece.points.reshape(len(piece.points), -1) for _, piece in pieces]
+        return np.concatenate(points, axis=1), projected
+
     def _mass(self) -> sp.csr_array:
         """Return the mass matrix, shape (size, size)."""
         places = scatter([(self.element_dofs, self.element_dofs)], (self.size, self.size))

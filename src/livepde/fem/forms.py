@@ -301,11 +301,15 @@ class Form(FormMatrices):
                     f"{slot} or a derivative of it as one factor, as in `u * v`."
                 )
 
-    def diffusion(self, u: float, **coefficients: Array) -> Array | None:
-        """Return the factors of u_k v_k in each coordinate k, at points of all elements.
+    def owners(self, slot: str) -> list[tuple[int, str]]:
+        """Return `LocalSpace.owners` of an argument."""
+        return self.terms[0].spaces[slot].owners
 
-        Of the terms on the whole mesh, where the state has the value u and a gradient of length
-        one. None if the state has several components or second derivatives.
+    def factor(self, of: int, tested: int, u: float, **coefficients: Array) -> Array:
+        """Return the factor of component `of` of u and `tested` of v, at points of all elements.
+
+        Of the terms on the whole mesh, where the fields of the state have the value u and all their
+        derivatives are zero. Components are those of `LocalSpace.owners`.
 
         Parameters
         ----------
@@ -317,23 +321,18 @@ class Form(FormMatrices):
             factors: list[Array] = []
             for term in whole.samples():
                 local = term.spaces["u"]
-                if [name for part in local.locals for name, _ in part.parts] != ["value", "grad"]:
-                    return None
                 given = {key: term.spaces[key].values(x) for key, x in coefficients.items()}
-                level = local.zeros()
+                level, raised, test = local.zeros(), local.zeros(), local.zeros()
                 level[~local.derivatives] = u
-                for k in np.flatnonzero(local.derivatives):
-                    unit = local.zeros()
-                    unit[k] = 1.0
-                    with np.errstate(all="ignore"):  # a root of u, say
-                        steep, flat = (
-                            term.evaluate(
-                                {key: {**given, "u": at, "v": unit}[key] for key in self.spaces},
-                                moment,
-                            )[0]
-                            for at in (level + unit, level)
-                        )
-                        factors.append(np.broadcast_to(steep - flat, local.shape).ravel())
+                raised[of] = test[tested] = 1.0
+                with np.errstate(all="ignore"):  # a root of u, say
+                    steep, flat = (
+                        term.evaluate(
+                            {key: {**given, "u": at, "v": test}[key] for key in self.spaces}, moment
+                        )[0]
+                        for at in (level + raised, level)
+                    )
+                    factors.append(np.broadcast_to(steep - flat, local.shape).ravel())
             total = total + np.concatenate(factors)
         return total
 

@@ -56,6 +56,11 @@ class LocalSpace:
             left = columns.stop
         return owners
 
+    @property
+    def owners(self) -> list[tuple[int, str]]:
+        """Number of the block of each component, and of which derivative it is a part."""
+        return [(self.locals.index(local), name) for local, _, name, _ in self._owners]
+
     @cached_property
     def derivatives(self) -> Mask:
         """Mask of the components of fields that are derivatives, shape (components,)."""

@@ -54,6 +54,8 @@ class FleetEstimate:
         The unknowns.
     belief
         Function: number of a member -> its belief under the law.
+    state_space
+        The components of the state; None for an estimate that was pickled.
     """
 
     t: float
@@ -67,6 +69,7 @@ class FleetEstimate:
     held: Mapping[str, Array]
     space: FunctionSpace
     belief: Callable[[int], Belief]
+    state_space: FunctionSpace | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the values themselves, for pickle and copies; as of an `Estimate`."""
@@ -76,6 +79,7 @@ class FleetEstimate:
             "diagnose": partial(kept, self.diagnostics),
             "belief": each.__getitem__,
             "space": self.space.described,
+            "state_space": None,
         }
         return vars(self) | own
 
@@ -128,6 +132,7 @@ class FleetEstimate:
             diagnose=lambda: self.diagnostics.member(k),
             held=tuple(channel for channel, members in self.held.items() if members[k]),
             space=self.space,
+            state_space=self.state_space,
         )
 
 

@@ -129,7 +129,7 @@ class Fleet:
             self.problem = replace(self.problem, initial=None)
         self._work = law.prepare(self.problem)
         self._q0 = [model.initial_parameter(q) for q in q0s]
-        self._u0 = [model.state_space.interpolate(0.0 if u is None else u) for u in u0s]
+        self._u0 = [model.initial_values(0.0 if u is None else u) for u in u0s]
         # Boundary values at t0 that u0 states, shape (members, channels), NaN where it does not.
         self._stated = np.full((len(self.members), len(self.inputs)), np.nan)
         for k, u in enumerate(u0s):
@@ -389,6 +389,7 @@ class Fleet:
             held=held,
             space=self.model.parameter_space,
             belief=lambda k: self._believed(state, k),
+            state_space=self.model.state_space,
         )
 
     @staticmethod

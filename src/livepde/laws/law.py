@@ -466,6 +466,10 @@ class Law(ABC, Generic[Work, State]):
         """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
         return False
 
+    def reading_noise(self, work: Work, state: State) -> Array | None:
+        """Return the standard deviation of the noise of each sensor; None if none is known."""
+        return None
+
     def unsmoothed(self, work: Work) -> str:
         """Return why the law smooths nothing, empty if it has `smoothed`."""
         return f"{type(self).__name__} has no covariance that a smoother could follow"

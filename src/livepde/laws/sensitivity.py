@@ -186,6 +186,10 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def weighs_readings(self) -> bool:
         return True
 
+    def reading_noise(self, work: SensitivityWork, state: SensitivityState) -> Array | None:
+        noise: Array = np.sqrt(state.now.level[0]) * work.filter.noise
+        return noise
+
     def prepare(self, problem: Problem) -> SensitivityWork:
         observed, model = problem.observed, problem.model
         noise = observed.noise

@@ -112,6 +112,7 @@ def advection_diffusion(
         inputs=["dH"] if K is not None else [],
         time_unit="s",
         length_unit="m",
+        formula=ADVECTION_DIFFUSION.written(unknowns),
     )
 
 

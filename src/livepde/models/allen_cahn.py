@@ -46,6 +46,7 @@ def allen_cahn(
         {"D": D, "r": r},
         u0,
         lambda c, u, v: c.D * dot(grad(u), grad(v)) + c.r * (u**3 - u) * v,
+        ALLEN_CAHN.written(),
     )
 
 

@@ -95,6 +95,7 @@ def battery_particle(
         inputs=["I"],
         time_unit="s",
         length_unit="m",
+        formula=BATTERY_PARTICLE.written(),
     )
 
 

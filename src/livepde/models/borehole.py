@@ -63,6 +63,7 @@ def borehole(
             inputs=["Q"],
             time_unit="s",
             length_unit="m",
+            formula=BOREHOLE.written(),
         )
     # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
     return Model(
@@ -77,6 +78,7 @@ def borehole(
         inputs=["Q"],
         time_unit="s",
         length_unit="m",
+        formula=BOREHOLE.written(),
     )
 
 
@@ -233,6 +235,7 @@ def grouted_borehole(
         inputs=["Q"],
         time_unit="s",
         length_unit="m",
+        formula=GROUTED_BOREHOLE.written(),
     )
 
 

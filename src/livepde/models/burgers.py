@@ -46,6 +46,7 @@ def burgers(
         {"advection": advection, "nu": nu},
         u0,
         lambda c, u, v: c.advection * u * grad(u)[0] * v + c.nu * dot(grad(u), grad(v)),
+        BURGERS.written(),
     )
 
 

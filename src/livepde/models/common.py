@@ -33,6 +33,7 @@ def autonomous(
     coefficients: Mapping[str, Number],
     u0: Unknown | None,
     form: Callable[[Any, Any, Any], Any],
+    formula: str,
 ) -> Model:
     """Return u_t + A(u) = 0 with A by a form (c, u, v) of its coefficients c, known or unknown."""
     known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
@@ -42,7 +43,7 @@ def autonomous(
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
         return form(SimpleNamespace(**known, **{k: getattr(q, k) for k in unknown}), u, v)
 
-    return Model(u, {**unknown, **begun}, A=A, initial=initial)
+    return Model(u, {**unknown, **begun}, A=A, initial=initial, formula=formula)
 
 
 def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -143,6 +144,20 @@ class Equation:
     alternatives: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     components: tuple[str, ...] = ()
     dimension: Literal[1, 2] = 1
+
+    def written(self, unknowns: Collection[str] = ()) -> str:
+        """Return the formula without the terms of optional unknowns that a model does not have."""
+        left = [
+            name for name, one in self.unknowns.items() if one.optional and name not in unknowns
+        ]
+        main, comma, rest = self.formula.partition(",  ")
+        # Only terms outside of brackets are left out: of a sum in brackets another term remains.
+        first, *more = re.split(r" ([+-]) (?![^(]*\))", main)
+        parts = zip(more[::2], more[1::2], strict=True)
+        kept = [
+            (sign, term) for sign, term in parts if not set(left) & set(re.findall(r"\w+", term))
+        ]
+        return "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
 
     @property
     def takes_values(self) -> bool:

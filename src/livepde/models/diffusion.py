@@ -181,6 +181,7 @@ def _model(
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
         time_unit="s",
         length_unit="m",
+        formula=(HEAT if name == "heat" else CONDUCTION).written(given),
     )
 
 

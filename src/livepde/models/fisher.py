@@ -57,6 +57,7 @@ def fisher_kpp(
         A=lambda q, u, v, x: q.D * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v,
         time_unit="d",
         length_unit="mm",
+        formula=FISHER_KPP.written(),
     )
 
 
@@ -101,6 +102,7 @@ def porous_fisher(
         ),
         time_unit="d",
         length_unit="mm",
+        formula=POROUS_FISHER.written(),
     )
 
 

@@ -61,6 +61,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         inputs=["Q"],
         time_unit="s",
         length_unit="m",
+        formula=PUMPING_TEST.written(),
     )
 
 
@@ -147,6 +148,7 @@ def groundwater(
         inputs=tuple(sources),
         time_unit="s",
         length_unit="m",
+        formula=GROUNDWATER.written(),
     )
 
 

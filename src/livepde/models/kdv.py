@@ -37,6 +37,7 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
         lambda c, u, v: (
             c.advection * u * grad(u)[0] * v - c.dispersion * hess(u)[0, 0] * grad(v)[0]
         ),
+        KDV.written(),
     )
 
 

@@ -43,6 +43,7 @@ def kuramoto_sivashinsky(
             - c.instability * grad(u)[0] * grad(v)[0]
             + c.damping * hess(u)[0, 0] * hess(v)[0, 0]
         ),
+        KURAMOTO_SIVASHINSKY.written(),
     )
 
 

@@ -48,6 +48,7 @@ def reaction_diffusion(
         A=lambda q, u, v, x: q.q * u * v,
         B=lambda u, v, x: diffusivity(x) * dot(grad(u), grad(v)),
         f=f,
+        formula=REACTION_DIFFUSION.written(),
     )
 
 

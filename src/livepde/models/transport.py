@@ -74,6 +74,7 @@ def advection_dispersion(
         inputs=["c_in"],
         time_unit="h",
         length_unit="cm",
+        formula=ADVECTION_DISPERSION.written(),
     )
 
 
@@ -138,6 +139,7 @@ def mobile_immobile(
         inputs=["c_in"],
         time_unit="h",
         length_unit="cm",
+        formula=MOBILE_IMMOBILE.written(),
     )
 
 

@@ -89,6 +89,7 @@ def wave(
         f={"p": f},
         time_unit="s",
         length_unit="m",
+        formula=WAVE.written(),
     )
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -10,8 +12,11 @@ import scipy.sparse as sp
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Predicate
 from livepde.fem.measure import Measure
-from livepde.linalg import IntArray, Mask
+from livepde.linalg import Array, IntArray, Mask
 from livepde.observation.operator import Observation
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 __all__ = ["Full", "Subdomain"]
 
@@ -68,6 +73,74 @@ class Subdomain(Observation):
             )
         return found
 
+    def sample(self, given: Callable[[Array], Any] | xr.DataArray, state: FunctionSpace) -> Array:
+        """Return the data z of a sample, or of several, from values by coordinates.
+
+        At the nodes of elements of first order; for other elements the L2 projection on omega.
+
+        Parameters
+        ----------
+        given
+            Function of x, shape (d, points), with a value for each point, of a vector field a row
+            for each component; or a `DataArray` over the coordinates `x`, `y`, `z` of the mesh,
+            between which it is linear, and over one dimension more for several samples, as time.
+        state
+            The state of the model, `model.state_space`.
+
+        Returns
+        -------
+        z
+            Shape (sensors,), of a `DataArray` with one dimension more (samples, sensors). A value
+            that is missing is NaN.
+
+        Raises
+        ------
+        ObservationError
+            Values of another shape, or for another part of the domain; infinity; for elements that
+            are not of first order, also NaN.
+
+        Examples
+        --------
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 4), lp.Normal(0.1, std=0.05))
+        >>> omega = lp.Subdomain(lambda x: x[0] < 0.5)
+        >>> omega.sample(lambda x: 10.0 * x[0], model.state_space)
+        array([0. , 2.5, 5. ])
+        """
+        block, _ = state.component(self.of)
+        found = self.selected(block)
+        points, fit = block.fitted(self.elements(block))
+        what = f"{type(self).__name__}.sample"
+        if callable(given):
+            values = np.asarray(given(points), dtype=float)
+            several = False
+        else:
+            values, several = _interpolated(given, points, what)
+        components = len(block.variables("u"))
+        if not several:
+            values = values[None]
+        if components > 1 and (several or values.shape[1:] != (components, points.shape[1])):
+            raise ObservationError(
+                f"{what}: the state is a vector field: give a function of x that returns a row for "
+                f"each of {components} components, shape {(components, points.shape[1])}."
+            )
+        try:
+            wide = (len(values), components, points.shape[1])
+            values = np.broadcast_to(values.reshape(len(values), components, -1), wide)
+        except ValueError:
+            raise ObservationError(
+                f"{what}: the function returns shape {values.shape[1:]} for x of shape "
+                f"{points.shape}; expected one value for each point."
+            ) from None
+        if np.isinf(values).any() or (not block.nodal and np.isnan(values).any()):
+            raise ObservationError(
+                f"{what}: a value is not finite. A missing value may be NaN for elements of first "
+                "order only."
+            )
+        z = np.array([fit(one)[found] for one in values])
+        return z if several else z[0]
+
     def matrix(self, state: FunctionSpace) -> sp.csr_array:
         block, _ = state.component(self.of)
         found = self.selected(block)
@@ -77,6 +150,36 @@ class Subdomain(Observation):
     @property
     def nodal(self) -> bool:
         return True
+
+
+def _interpolated(given: Any, points: Array, what: str) -> tuple[Array, bool]:
+    """Return values of a DataArray at points, (points,) or (samples, points), and which of them."""
+    import xarray as xr
+
+    axes = ["x", "y", "z"][: len(points)]
+    if not isinstance(given, xr.DataArray):
+        raise ObservationError(
+            f"{what}: got {type(given).__name__}; expected a function of x or a DataArray."
+        )
+    more = [dimension for dimension in given.dims if dimension not in axes]
+    if len(more) > 1 or not all(axis in given.indexes for axis in axes):
+        raise ObservationError(
+            f"{what}: the DataArray has the dimensions {list(map(str, given.dims))}; expected the "
+            f"coordinates {axes}, and at most one dimension more."
+        )
+    at = {}
+    for axis, x in zip(axes, points, strict=True):
+        known = given[axis].values
+        low, high = float(known.min()), float(known.max())
+        slack = 1e-9 * (high - low)
+        if x.min() < low - slack or x.max() > high + slack:
+            raise ObservationError(
+                f"{what}: the DataArray has values for {axis} from {low:g} to {high:g}; they are "
+                f"needed from {x.min():g} to {x.max():g}."
+            )
+        at[axis] = xr.DataArray(np.clip(x, low, high), dims="at the points")
+    found = given.interp(at).transpose(*more, "at the points")
+    return np.asarray(found.values, dtype=float), bool(more)
 
 
 def _everywhere(x: object) -> bool:

@@ -8,14 +8,7 @@ changed.
 from __future__ import annotations
 
 from livepde.plots.curves import ensemble, history, loops, profiles
-from livepde.plots.dataset import (
-    NORMAL_95,
-    interval_95,
-    labelled,
-    scored_from,
-    sensor_places,
-    time_scale,
-)
+from livepde.plots.dataset import labelled, scored_from, sensor_places, time_scale
 from livepde.plots.run_figure import (
     RunPlots,
     corner,
@@ -27,6 +20,7 @@ from livepde.plots.run_figure import (
     residuals,
 )
 from livepde.plots.style import GREY, PALETTE, figure
+from livepde.records import NORMAL_95, interval_95
 
 __all__ = [
     "GREY",

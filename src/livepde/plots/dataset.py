@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -10,46 +11,33 @@ from numpy.typing import ArrayLike
 
 from livepde.dates import instants, when
 from livepde.linalg import Array
-from livepde.records import NOTE
+from livepde.records import NOTE, scalars
 
 if TYPE_CHECKING:
     import xarray as xr
 
 __all__ = [
     "MOST_LINES",
-    "NORMAL_95",
     "SensorPlaces",
-    "field_names",
     "groups",
-    "interval_95",
     "labelled",
     "modes_told",
     "note",
     "prior_left",
-    "scalars",
     "scored_from",
+    "sensor_names",
     "sensor_places",
+    "sensor_units",
     "time_label",
     "time_scale",
     "time_text",
     "time_values",
 ]
 
-NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 # Largest number of lines in a panel; more sensors are drawn as one line with their range.
 MOST_LINES = 7
 # Time span from which a unit of the time axis is used, its length in seconds, its name.
 CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
-
-
-def scalars(data: xr.Dataset) -> list[str]:
-    """Return the labels of the scalar unknowns."""
-    return [label for label in str(data.attrs.get("scalars", "")).split("\n") if label]
-
-
-def field_names(data: xr.Dataset) -> list[str]:
-    """Return the names of the unknown fields."""
-    return str(data.attrs.get("fields", "")).split()
 
 
 def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
@@ -92,18 +80,6 @@ def groups(data: xr.Dataset) -> dict[str, list[str]]:
     for label in scalars(data):
         found.setdefault(label.partition("[")[0], []).append(label)
     return found
-
-
-def interval_95(data: xr.Dataset, name: str) -> tuple[Array, Array]:
-    """Return the ends of the 95 % interval of a variable with a standard deviation.
-
-    The ends stored in the dataset are mapped through a transform and lie within bounds; without
-    them the interval is the value +- 1.96 standard deviations.
-    """
-    if f"{name}_low" in data:
-        return data[f"{name}_low"].values, data[f"{name}_high"].values
-    value, half = data[name].values, NORMAL_95 * data[f"{name}_std"].values
-    return value - half, value + half
 
 
 def labelled(name: str, unit: str) -> str:
@@ -154,6 +130,21 @@ def scored_from(data: xr.Dataset) -> int:
         return 0
     first = int(np.searchsorted(data["time"].values, float(start)))
     return first if first < data.sizes["time"] else 0
+
+
+def sensor_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the assimilated and then of the withheld sensors."""
+    return [str(name) for of in ("sensor", "withheld") if of in data for name in data[of].values]
+
+
+def sensor_units(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
+    """Return the unit of each sensor."""
+    units = dict.fromkeys(names, str(data["innovation"].attrs.get("units", "")))
+    for dimension in ("sensor", "withheld"):
+        if f"{dimension}_unit" in data.coords:
+            own = data[f"{dimension}_unit"].values
+            units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
+    return units
 
 
 class SensorPlaces(NamedTuple):

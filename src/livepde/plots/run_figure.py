@@ -14,18 +14,18 @@ from livepde.linalg import Array
 from livepde.plots.curves import profiles
 from livepde.plots.dataset import (
     MOST_LINES,
-    field_names,
     groups,
-    interval_95,
     labelled,
     note,
     scored_from,
+    sensor_names,
     sensor_places,
+    sensor_units,
     time_text,
     time_values,
 )
 from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, panel, time_axis
-from livepde.records import refused_readings, used_errors
+from livepde.records import field_names, interval_95, refused_readings, used_errors
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -51,8 +51,14 @@ RESIDUALS = (  # variable, its dimension, title of its panel
 SLENDER = 6.0  # length over width from which a map has an axis of its own for each
 
 
-def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int = 5) -> Figure:
-    """Draw a run: unknowns, fields, innovations and withheld channels, one panel each.
+def overview(
+    data: xr.Dataset,
+    *,
+    title: str = "",
+    times: Sequence[float] | int = 5,
+    measured: tuple[Array, Array] | None = None,
+) -> Figure:
+    """Draw a run: readings, unknowns, fields, innovations and withheld channels, one panel each.
 
     Parameters
     ----------
@@ -62,6 +68,9 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
         Title above all panels.
     times
         Times at which fields are drawn, or their number (one space dimension; maps show the last).
+    measured
+        Times and readings as for `curves`: the first panels, of the whole width, draw them and what
+        the model expected of them.
 
     Raises
     ------
@@ -71,14 +80,18 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     figure_class()
     if not data.sizes.get("time"):
         raise ConfigurationError("the run holds no samples yet, so there is nothing to draw.")
+    wide = [] if measured is None else _measured_panels(data, *measured)
     panels = _panels(data, times)
     columns = 1 if len(panels) == 1 else 2
-    rows = math.ceil(len(panels) / columns)
+    rows = len(wide) + math.ceil(len(panels) / columns)
     drawn = empty(rows, columns, title)
     grid = drawn.add_gridspec(rows, columns)
+    for row, draw in enumerate(wide):
+        draw(drawn.add_subplot(grid[row, :]))
     for k, draw in enumerate(panels):
         alone = k == len(panels) - 1 and k % columns == 0  # the last one may take the whole row
-        draw(drawn.add_subplot(grid[k // columns, slice(None) if alone else k % columns]))
+        place = len(wide) + k // columns, slice(None) if alone else k % columns
+        draw(drawn.add_subplot(grid[place]))
     return drawn
 
 
@@ -96,15 +109,24 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
         Title above all panels.
     """
     figure_class()
-    names = _sensor_names(data)
-    units = _units_of(data, names)
-    each = list(dict.fromkeys(units.values()))
+    each = _measured_panels(data, t, measured)
     drawn = empty(len(each), 1, title)
     grid = drawn.add_gridspec(len(each), 1)
-    for k, unit in enumerate(each):
-        shown = [name for name in names if units[name] == unit]
-        measured_and_predicted(data, t, measured, sensors=shown, ax=drawn.add_subplot(grid[k, 0]))
+    for k, draw in enumerate(each):
+        draw(drawn.add_subplot(grid[k, 0]))
     return drawn
+
+
+def _measured_panels(data: xr.Dataset, t: Array, measured: Array) -> list[Callable[[Axes], Axes]]:
+    """Return a function for each unit that draws the readings of its sensors on given axes."""
+
+    def of(sensors: list[str]) -> Callable[[Axes], Axes]:
+        return lambda ax: measured_and_predicted(data, t, measured, sensors=sensors, ax=ax)
+
+    names = sensor_names(data)
+    units = sensor_units(data, names)
+    each = dict.fromkeys(units.values())
+    return [of([name for name in names if units[name] == unit]) for unit in each]
 
 
 def measured_and_predicted(
@@ -116,6 +138,8 @@ def measured_and_predicted(
     ax: Axes | None = None,
 ) -> Axes:
     """Draw readings of sensors with one unit, and what the model predicted of them.
+
+    Lines of withheld sensors are dashed: they are predicted after the sample, and never used.
 
     Parameters
     ----------
@@ -131,11 +155,11 @@ def measured_and_predicted(
     ConfigurationError
         There is no such sensor, or the sensors have several units.
     """
-    ax, names = panel(ax), _sensor_names(data)
+    ax, names = panel(ax), sensor_names(data)
     shown = names if sensors is None else list(sensors)
     if unknown := [name for name in shown if name not in names]:
         raise ConfigurationError(f"there is no sensor '{unknown[0]}'; there are {names}.")
-    units = _units_of(data, names)
+    units = sensor_units(data, names)
     several = list(dict.fromkeys(units[name] for name in shown))
     if len(several) > 1:
         raise ConfigurationError(
@@ -151,10 +175,15 @@ def measured_and_predicted(
     for n, name in enumerate(shown[:MOST_LINES]):
         i, colour = names.index(name), PALETTE[n % len(PALETTE)]
         ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
-        ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, label=name)
+        withheld = i >= data.sizes.get("sensor", 0)
+        style: dict[str, Any] = {"label": name}
+        if withheld:
+            style = {"label": f"{name} (withheld)", "linestyle": "--"}
+        ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, **style)
     time_axis(ax, data)
     ax.set_ylabel(labelled("", "".join(several)).strip())
-    ax.set_title("measured (points) and expected one step ahead (lines)")
+    some = f", {MOST_LINES} of {len(shown)} sensors" if len(shown) > MOST_LINES else ""
+    ax.set_title(f"measured (points) and expected one step ahead (lines){some}")
     return finish(ax)
 
 
@@ -292,7 +321,11 @@ class RunPlots:
 
     def __call__(self, **options: Any) -> Figure:
         """Draw all of the run: see `livepde.plots.overview`."""
-        return overview(self._result.dataset(), **options)
+        data = self._result.dataset()
+        if self._result.readings is not None:
+            readings = data["time"].values, self._result.readings()
+            options = {"measured": readings, **options}
+        return overview(data, **options)
 
     def measured_and_predicted(
         self, *, sensors: Sequence[str] | None = None, ax: Axes | None = None
@@ -319,22 +352,6 @@ class RunPlots:
     ) -> Any:
         """Draw `n` draws of the numbers against each other; returns the matrix of axes."""
         return corner(self._result.sample(n, seed), names, axes=axes)
-
-
-def _sensor_names(data: xr.Dataset) -> list[str]:
-    """Return the names of the assimilated and then of the withheld sensors."""
-    return [str(name) for _, of, _ in RESIDUALS if of in data for name in data[of].values]
-
-
-def _units_of(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
-    """Return the unit of each sensor."""
-    common = str(data["innovation"].attrs.get("units", ""))
-    units = dict.fromkeys(names, common)
-    for dimension in ("sensor", "withheld"):
-        if f"{dimension}_unit" in data.coords:
-            own = data[f"{dimension}_unit"].values
-            units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
-    return units
 
 
 def _panels(data: xr.Dataset, times: Sequence[float] | int) -> list[Callable[[Axes], Axes]]:

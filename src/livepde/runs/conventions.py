@@ -13,7 +13,7 @@ import numpy as np
 import xarray as xr
 
 from livepde.dates import since
-from livepde.plots.dataset import field_names, interval_95, scalars
+from livepde.records import field_names, interval_95, scalars
 from livepde.runs.directory import plain
 
 __all__ = ["DIFFERENCES", "bounded", "cf", "free_names", "kinds_of", "oriented", "udunits"]
@@ -40,8 +40,7 @@ LONG_NAMES = {
     "correlation": "correlation of the last estimates",
 }
 DIFFERENCES = ("innovation", "withheld_error")
-# CF: an axis Z is vertical, and must say whether it grows up or down, which a mesh does not know.
-AXES = {"time": "T", "snapshot": "T", "x": "X", "y": "Y"}
+CLOCKS = ("time", "snapshot")
 SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "°C": "degC",
     "°F": "degF",
@@ -190,12 +189,14 @@ def _name_lists(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
 
 
 def _clock_attrs(clock: str, origin: str | None) -> dict[str, str]:
-    """Return the CF attributes of times in a unit, counted from a date where the run has one."""
-    attrs = {"standard_name": "time"} if clock else {}
+    """Return the CF attributes of times in a unit, counted from a date where the run has one.
+
+    Without a date they are no time coordinate of CF, which counts from one: they have a unit only.
+    """
     counted = since(clock, origin)
     if not counted:
-        return attrs | _unit_attrs("time", clock)
-    return attrs | counted | {"units_metadata": "leap_seconds: none"}
+        return _unit_attrs("time", clock)
+    return {"standard_name": "time", "axis": "T", **counted, "units_metadata": "leap_seconds: none"}
 
 
 def _unit_attrs(name: str, own: str) -> dict[str, str]:
@@ -223,12 +224,10 @@ def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
         if base != name and base in data:
             attrs["long_name"] = text.format(base)
             attrs.setdefault("units", "")
-    if name in AXES:
-        attrs["axis"] = AXES[name]
     if name in data.coords:
         variable.encoding["_FillValue"] = None  # a coordinate is never missing
     own = attrs.pop("units", None)
-    if AXES.get(name) == "T":
+    if name in CLOCKS:
         attrs |= clock
     elif own is not None:
         attrs |= _unit_attrs(name, str(own))

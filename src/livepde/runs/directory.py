@@ -496,7 +496,8 @@ def _to_netcdf(data: xr.Dataset, path: Path) -> None:
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
     kept.attrs = {key: plain(value) for key, value in data.attrs.items()}
-    kept.to_netcdf(path, engine="scipy")
+    whole = {name: {"_FillValue": None} for name in kept.dims if name in kept.coords}  # CF: no gaps
+    kept.to_netcdf(path, engine="scipy", encoding=whole)
 
 
 def _digest(record: Mapping[str, Any]) -> str:

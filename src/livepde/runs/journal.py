@@ -532,6 +532,11 @@ class Journal:
         values = np.array([row for _, row in rows]).reshape(len(rows), len(names))
         return np.array([t for t, _ in rows]), values
 
+    def values(self, first: int, last: int) -> Iterator[tuple[int, dict[str, float]]]:
+        """Iterate over numbers and values of the samples from one to another."""
+        for one in self._samples("WHERE id BETWEEN ? AND ? ORDER BY id", first, last):
+            yield one.id, one.values
+
     def _number_at(self, t: float) -> int:
         """Return the number of the first sample not earlier than a time, by bisection."""
         # Times are sorted but have no index, so bisection by the primary key is the short way.

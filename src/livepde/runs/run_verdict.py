@@ -15,8 +15,8 @@ from livepde.laws.equation_tests import rested
 from livepde.laws.pauses import pauses
 from livepde.laws.step_ledger import step_findings
 from livepde.linalg import Array
-from livepde.plots.dataset import field_names, note, prior_left, scalars
-from livepde.records import STATUS_CODES
+from livepde.plots.dataset import note, prior_left
+from livepde.records import STATUS_CODES, field_names, scalars
 from livepde.runs.outcome import Table
 from livepde.runs.summary import digits, jumps, shown
 from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor

@@ -12,15 +12,8 @@ import numpy as np
 from livepde.dates import when
 from livepde.diagnostics.identifiability import TRADED, InformationGain
 from livepde.frames import estimates, model_errors, relative_error
-from livepde.plots.dataset import (
-    NORMAL_95,
-    field_names,
-    modes_told,
-    note,
-    prior_left,
-    scalars,
-)
-from livepde.records import refused_readings, used_errors
+from livepde.plots.dataset import modes_told, note, prior_left
+from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
 from livepde.runs.outcome import Bound, Check, Sense, Table
 from livepde.runs.thermal_resistance import resistance
