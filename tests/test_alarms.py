@@ -72,7 +72,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     t = float(when.removeprefix("t = ").removesuffix(" s"))
     assert JUMP < t <= JUMP + 30 * 20.0
     (sentence,) = [note for note in said["notes"] if note.startswith("Jump at")]
-    assert "since then alpha from" in sentence
+    assert "Since then alpha has changed from" in sentence
     opened = runs.open(tmp_path / "run")
     assert [table.title for table in opened.summary()].count("Jumps") == 1
     lines = [
@@ -134,7 +134,7 @@ def test_what_has_moved_between_two_alarms():
     assert second.moved == {}
     told = said(dataset([4, 7]))
     assert told[0].startswith("Jump at t = 5 s: ")
-    assert "no number has changed for good" in told[1]
+    assert "No number changed permanently" in told[1]
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_many_jumps_are_counted_and_dates_are_dates():
     data.attrs["origin"] = "2025-04-01 12:00:00"
     told = said(data)
     assert told[0].startswith("Jump at 2025-04-01 12:00:03: ")
-    assert told[-1].startswith("2 more jumps")
+    assert told[-1].startswith("2 more jumps were detected")
 
 
 def test_what_settles_is_not_looked_at():

@@ -134,7 +134,7 @@ def test_init_check_run_report(here):
     assert "181 samples" in output
     assert "model: ok" in output
     assert "observation: ok" in output
-    assert "hardly identified" not in output
+    assert "not identifiable" not in output
     assert {p.name for p in here.iterdir()} == {"mine"}  # nothing is written
 
     code, output = call("run", "mine/case.toml")
@@ -220,7 +220,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
     path.write_text(text)
     code, output = call("check", rod)
     assert code == 0
-    assert "hardly identified" in output
+    assert "not identifiable" in output
 
 
 @pytest.mark.slow

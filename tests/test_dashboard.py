@@ -326,7 +326,7 @@ def test_a_finished_run_without_a_journal(tmp_path):
     said = str(cards.verdict(seen))
     assert "Expected rmse <= 0.1, but it is 0.5." in said
     assert "The case says so." in said
-    assert "Not judged: whether the model holds was not tested" in said
+    assert "Not judged: the model was not tested" in said
     alone = replace(seen, checks=[], doubts=[text for text in seen.doubts if "Not judged" in text])
     level, text = cards.gravest(alone)
     assert (level, text.partition(": ")[0]) == ("warn", "Not judged")

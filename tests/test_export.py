@@ -470,7 +470,7 @@ def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
     ("value", "doubts", "said"),
     [
         (0.05, [], "Nothing speaks against the estimates"),
-        (0.05, ["The model does not explain the data."], "The model does not explain the data"),
+        (0.05, ["Model misfit."], "Model misfit"),
         (0.5, [], "Expected error <= 0.1, but it is 0.5"),
     ],
 )

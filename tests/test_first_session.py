@@ -144,7 +144,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert sum(old != new for old, new in zip(before, after, strict=True)) == len(EDITS) == 3
     told = shell.ok("livepde", "check", "mine/case.toml")
     assert "Data: 121 samples from 2026-03-02 07:00:00" in told
-    assert "hardly" not in told
+    assert "not identifiable" not in told
     assert "ok  livepde run mine/case.toml" in told
 
     # The run finds his rod, and says where its results are and how to look at them.

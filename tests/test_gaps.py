@@ -317,9 +317,8 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
         writer, (_, driven) = run_batch(prepared, folder, write, stack, quiet=True)
         _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
-        "Channel left: 1 values far off those before and after were refused as spikes; 3 gaps were "
-        "interpolated between the values before and after; 1 missing values were not between known "
-        "ones: the last value was held." in notes
+        "Input left: 1 spikes were rejected, 3 missing values were interpolated, 1 missing values "
+        "were replaced by the last one." in notes
     )
     found = runs.open(folder).dataset
     alpha, std = float(found["alpha"][-1]), float(found["alpha_std"][-1])

@@ -181,7 +181,7 @@ def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, cap
 def test_check_tells_of_data_that_tell_nothing(home, monkeypatch, capsys):
     rest()
     _, out, _ = livepde(("check", "mine/case.toml"), monkeypatch, capsys)
-    assert "Note: alpha: these data can tell hardly anything. Longer data" in out
+    assert "Note: `alpha` is not identifiable from these data. Use longer data" in out
 
 
 def test_the_page_has_these_mistakes_and_no_others():

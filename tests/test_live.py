@@ -686,8 +686,7 @@ def test_health_and_metrics(tmp_path):
     health = json.loads(ask("/health"))
     assert health.pop("seconds") > 0.0
     assert health.pop("findings")[0] == (
-        "Not judged: whether the model holds was not tested (innovations: there are 4 samples, 20 "
-        "are needed)."
+        "Not judged: the model was not tested (innovations: 4 samples, at least 20 required)."
     )
     assert health == {
         "ok": True,

@@ -134,7 +134,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     """Print the information on the unknowns that the sensors give; return sentences on it."""
     from livepde.cases.preview import MOST_SAMPLES, preview
     from livepde.runs import Table
-    from livepde.verdict import TELLING
+    from livepde.verdict.sentences import LONGER_DATA
 
     found = preview(prepared, prepared.stream)
     late = {item.name: item.left for item in found.last}
@@ -146,21 +146,22 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             _percent(item.left),
             *([_percent(late[item.name])] if item.name in late else []),
             item.unit,
-            "hardly identified" if item.hardly else "",
+            "not identifiable" if item.hardly else "",
         )
         for item in found.unknowns
     ]
     if rows:
         more = [f"left by the last {MOST_SAMPLES}"] if late else []
         columns = ("unknown", "prior std. dev.", "after", "left", *more, "unit", "")
-        title = f"What {'the first ' if late else ''}{found.samples} samples can tell, at best"
+        which = f"the first {found.samples}" if late else str(found.samples)
+        title = f"Smallest standard deviations that {which} samples allow"
         print_table(console, Table(title, columns, rows))
-    hardly = [
-        f"{item.name}: these data can tell hardly anything. {TELLING}"
+    unidentified = [
+        f"`{item.name}` is not identifiable from these data. {LONGER_DATA}"
         for item in found.unknowns
         if item.hardly
     ]
-    return [*hardly, *found.sentences]
+    return [*unidentified, *found.sentences]
 
 
 def _percent(share: float) -> str:

@@ -37,11 +37,11 @@ __all__ = [
 LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
 REMEDIES = {
     "ok": "",
-    "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
+    "not_converged": "Reduce `dt_max`, the gain or the damping.",
     "not_finite": "Check the sample, the bounds of the unknowns, and the gain.",
-    "departed": "Check the model and the sensors, give the unknowns a std that allows for such "
-    "values, or give a number for gain.",
-    "singular": "Check the model's forms at the current estimate, or take a smaller dt_max.",
+    "departed": "Check the model and the sensors. If such values are possible, increase the "
+    "standard deviations of the priors, or set a number for `gain`.",
+    "singular": "Check the model's forms at the current estimate, or reduce `dt_max`.",
 }
 
 

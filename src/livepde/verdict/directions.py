@@ -44,6 +44,8 @@ class ScoreDirection:
         Coordinate of a position.
     least, most
         Bounds of the amount in its unit: a sensor is inside the body, and not beyond the next one.
+    at
+        Coordinate of the sensor along the axis; NaN if it is not a position.
     """
 
     kind: str
@@ -53,6 +55,7 @@ class ScoreDirection:
     axis: int = 0
     least: float = -np.inf
     most: float = np.inf
+    at: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +227,7 @@ def _within_reach(
         sensor, k = number % len(at), one.axis
         least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
         most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
-        bounded.append(replace(one, least=least, most=most))
+        bounded.append(replace(one, least=least, most=most, at=float(at[sensor, k])))
     return bounded
 
 
