@@ -100,7 +100,10 @@ def test_few_samples_are_not_judged_and_none_neither():
     model = rod(lp.Normal(0.2, 0.1))
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=0.0)
     z = np.zeros(identifier.observed.size)
-    for rows, why in (([(0.1, z), (0.2, z)], "there are 2 samples"), ([], "no law has judged")):
+    for rows, why in (
+        ([(0.1, z), (0.2, z)], "2 samples, at least 20 required"),
+        ([], "no law has tested"),
+    ):
         result = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=0.0).run(rows)
         (said,) = doubts(result.to_xarray())
         assert said.startswith("Not judged: ")

@@ -149,7 +149,7 @@ def test_inputs_that_no_state_has_are_named():
 def test_an_initial_state_that_is_left_out_states_no_boundary_value(u0: Any):
     """Zero is the default state. It says nothing of a boundary: its first value is held."""
     who = identifier(u0)
-    start, names = (0.0, []) if u0 == 0.0 else (1.0, [f"Channel T {UNSTATED}"])
+    start, names = (0.0, []) if u0 == 0.0 else (1.0, [f"Input T {UNSTATED}"])
     expected = differences(start, 1.0, 0.0, 0.1)
     assert seen(who, 0.1, {"T": 1.0}) == pytest.approx(expected, abs=0.02)
     assert notes(who.estimate()) == names
