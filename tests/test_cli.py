@@ -305,7 +305,7 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     assert call("run", rod, "--out", "cut", "--resume")[0] == 0
     xr.testing.assert_identical(runs.open("cut").dataset, whole)
     assert len(runs.open("cut").record["resumed"]) == 1
-    assert "--resume needs --out" in bad("run", rod, "--resume")
+    assert "--resume requires --out" in bad("run", rod, "--resume")
     assert "another case or other settings" in bad(
         "run", rod, "--out", "cut", "--resume", "--set", "law.noise=1 K"
     )

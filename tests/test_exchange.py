@@ -664,7 +664,7 @@ def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     assert "Written: own.fmu (2 inputs, 5 outputs)" in done.stdout
     done = run.invoke(app, ["fmu", "own.py:build", "--set", "law.noise=1"])
     assert isinstance(done.exception, lp.errors.ConfigurationError)
-    assert "--set belongs to a case" in str(done.exception)
+    assert "--set requires a case file" in str(done.exception)
 
 
 def test_units_of_the_si():

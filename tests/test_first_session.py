@@ -152,7 +152,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert re.search(r"alpha +6\.\d+e-05", told)
     assert "Note:" not in told
     assert "failed" not in told
-    assert "Look at it: livepde watch runs/mine" in told
+    assert "To view it: livepde watch runs/mine" in told
     assert (home / "runs" / "mine" / "run.json").is_file()
 
     # The page shows it in the browser, until Ctrl-C.

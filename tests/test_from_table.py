@@ -393,7 +393,7 @@ def test_options_for_what_the_table_does_not_tell(here):
     assert "# standard deviation of a single reading" in text
     for option in (["--skip", "0"], ["--time-format", "%d"], ["--set", "title=x"]):
         error = runner.invoke(app, ["init", "other", *option]).exception
-        assert f"{option[0]} belongs to a table of your own" in str(error)
+        assert f"{option[0]} requires --data FILE" in str(error)
 
 
 def test_each_place_that_is_left_open_is_named(here):
@@ -426,7 +426,7 @@ def test_an_equation_belongs_to_a_table(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
     runner = CliRunner()
     for arguments, told in (
-        (["--equation", "heat"], "--equation belongs to a table of your own: add --data"),
+        (["--equation", "heat"], "--equation requires --data"),
         (["--data", "my.csv", "--equation", "heet"], "no equation 'heet'; did you mean 'heat'?"),
         (["--data", "my.csv", "--equation", "own.py:rod"], "write 'own.py:rod' into the case."),
     ):

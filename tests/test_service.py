@@ -274,10 +274,13 @@ def test_estimates_as_lines_of_json(here):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--speed", "2"), "--speed belongs to a run beside a process"),
+        (("--speed", "2"), "--speed requires --realtime"),
         (("--realtime", "--speed", "0"), "a speed > 0; got 0"),
         (("--realtime", "--speed", "nan"), "a speed > 0; got nan"),
-        (("--realtime", "--speed", "2", "--data", "-"), "replays a finished file"),
+        (
+            ("--realtime", "--speed", "2", "--data", "-"),
+            "only valid for the replay of a complete file",
+        ),
     ],
 )
 def test_a_speed_of_nothing_is_refused(here, arguments, told):
@@ -427,7 +430,7 @@ def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):
 @pytest.mark.parametrize("option", [("--listen", "9100"), ("--watch", "8050"), ("--estimates",)])
 def test_what_belongs_to_a_live_run(here, option):
     Path("rows.csv").write_text(HEADER + table(row(0)))
-    assert "add --realtime" in bad("run", case('file = "rows.csv"'), *option)
+    assert "requires --realtime" in bad("run", case('file = "rows.csv"'), *option)
 
 
 def test_a_password_comes_from_the_environment(here, monkeypatch):
