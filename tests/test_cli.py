@@ -190,7 +190,7 @@ def test_a_failed_check_is_exit_code_1_with_json(rod):
 def test_nothing_is_written_over(rod, here):
     call("run", rod, "--out", "out")
     before = {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()}
-    assert "already holds a run" in bad("run", rod, "--out", "out")
+    assert "already contains a run" in bad("run", rod, "--out", "out")
     assert {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()} == before
     assert "is there already" in bad("init", "rod")
 

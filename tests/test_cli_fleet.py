@@ -106,7 +106,7 @@ def test_goes_on_with_what_is_there(here):
     Path("rods.csv").write_text("name,data\nplain,\n")
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--json"]
     _, first = call(*arguments)
-    with pytest.raises(RunError, match="already holds a run"):
+    with pytest.raises(RunError, match="already contains a run"):
         call(*arguments)
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
     _, second = call(*arguments, "--resume")

@@ -452,7 +452,9 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             wait(page, lambda p: "95 % interval" in text(p, ".card"))
             assert text(page, "h1") == "A rod"
             assert "running" in text(page, "#chip")
-            assert "Estimates alpha, loss from 1 sensor; 1 more is withheld" in text(page, "main")
+            assert "Estimates alpha, loss from 1 sensor, validated with 1 more" in text(
+                page, "main"
+            )
             assert "m²/s" in text(page, ".card")
 
             seen, drawn = count(page), wait(page, lambda p: profile(p, "State u"))

@@ -609,7 +609,7 @@ def test_nothing_is_written_over_unasked(rod, tmp_path, name):
     target = tmp_path / name
     export(rod, target)
     other = made(tmp_path / "other", count=3)
-    with pytest.raises(RunError, match=f"{name} exists: name another file, or add --force"):
+    with pytest.raises(RunError, match=f"{name} exists. Choose another file, or add --force"):
         call("export", other.path, tmp_path / "new.csv", target)
     assert not (tmp_path / "new.csv").exists()
     assert call("export", other.path, target, "--force")[0] == 0
@@ -643,7 +643,7 @@ def test_a_folder_that_is_no_store_stays(rod, tmp_path):
     [
         (["a.xlsx"], r"there is no format '\.xlsx'; expected one of \.nc, "),
         (["nowhere/a.nc"], "cannot be written: No such file or directory"),
-        (["a.nc", "--at", "60"], r"holds all times; a time is chosen for \.vtu and \.vtk"),
+        (["a.nc", "--at", "60"], r"contains all times; a time is only chosen for \.vtu and \.vtk"),
         (["a.vtu", "--at", "noon"], "--at: got 'noon'"),
         (["a.vtu", "--at", "3 m"], "--at: 'm' cannot be converted to 's'"),
     ],

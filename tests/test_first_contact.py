@@ -32,7 +32,7 @@ def identifier(**options) -> lp.Identifier:
 
 @cache
 def measured() -> pd.DataFrame:
-    """Return what a logger has written: seconds, and a column that is no channel."""
+    """Return what a logger has written: seconds, and a column that is not a channel."""
     t = 0.125 * np.arange(24)  # exact in dates, too
 
     def ends(when: float) -> dict[str, float]:
@@ -169,7 +169,7 @@ def test_units_of_columns():
 
 
 def test_a_column_that_is_no_channel_is_ignored_unless_strict():
-    with pytest.raises(lp.errors.SampleError, match="column 'battery_V' is no channel"):
+    with pytest.raises(lp.errors.SampleError, match="column 'battery_V' is not a channel"):
         identifier().run(measured(), strict=True)
     assert same(identifier().run(measured().drop(columns="battery_V"), strict=True))
 
@@ -178,7 +178,7 @@ def test_a_column_that_is_no_channel_is_ignored_unless_strict():
     ("wrong", "message"),
     [
         (lambda table: table.rename(columns={"T_30": "T30"}), "no column 'T_30'; did you mean"),
-        (lambda table: table.assign(T_30="warm"), "column 'T_30' does not hold numbers only"),
+        (lambda table: table.assign(T_30="warm"), "column 'T_30' must contain numbers only"),
         (lambda table: table.iloc[::-1], "the time is earlier than the one before"),
         (lambda table: table.iloc[:0], "holds no samples"),
         (lambda table: table[["T_30", "T_30", "T_60", "T_left"]], "two columns are called 'T_30'"),
@@ -192,7 +192,7 @@ def test_a_table_that_cannot_be_used_is_one_sentence(wrong, message):
 
 
 def test_options_of_a_table_that_do_not_fit():
-    with pytest.raises(lp.errors.ConfigurationError, match="columns: there is no channel 'T_3'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="columns: there is not a channel 'T_3'"):
         identifier().run(measured(), columns={"T_3": "T_30"})
     with pytest.raises(lp.errors.ConfigurationError, match="strict describes a table or a file"):
         identifier().run([], strict=True)
@@ -257,7 +257,7 @@ def test_files(tmp_path):
     assert same(identifier().run(str(tmp_path / "rows.jsonl")), 1e-6)
     with pytest.raises(lp.errors.DataError, match=r"no file .*number.csv'; did you mean"):
         identifier().run(tmp_path / "number.csv")
-    with pytest.raises(lp.errors.SampleError, match="'battery_V' is no channel"):
+    with pytest.raises(lp.errors.SampleError, match="'battery_V' is not a channel"):
         identifier().run(tmp_path / "rows.jsonl", strict=True)
 
 

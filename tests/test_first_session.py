@@ -180,7 +180,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert "runs/mine-2" in shell.ok("livepde", "run", "mine/case.toml")
     refused = shell("livepde", "run", "mine/case.toml", "--out", "runs/mine")
     assert refused.returncode == 2
-    assert "runs/mine already holds a run" in refused.stderr
+    assert "runs/mine already contains a run" in refused.stderr
 
     # For the same table he might have begun with a case of its own, and found the same.
     assert "replace each '?'" in shell.ok("livepde", "init", "own", "--data", "mine/rod.csv")

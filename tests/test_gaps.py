@@ -335,7 +335,7 @@ def test_a_channel_may_keep_its_gaps_and_spikes(tmp_path):
 
 @pytest.mark.parametrize("key", ['missing = "interpolate"', 'spikes = "keep"'])
 def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
-    with pytest.raises(lp.errors.CaseError, match="belong to boundary and input channels"):
+    with pytest.raises(lp.errors.CaseError, match="require a boundary or input channel"):
         cases.load(plant(tmp_path, sensor=f", {key}"))
 
 

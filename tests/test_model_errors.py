@@ -407,7 +407,7 @@ def test_a_later_estimate_has_an_interval_as_much_wider_as_before():
 def test_other_findings_keep_their_severity():
     held = Finding("held", "do not trust", "The unknowns were held.")
     assert Verdict.of([held]).with_errors(errors(0.01, 1.0)).level == "do not trust"
-    unit = Cause("unit", "T", "the values of sensor T are in degF", 0.99)
+    unit = Cause("unit", "T", "T may be in degF instead of degC", 0.99)
     gross = Finding("misfit", "do not trust", "Model misfit.", causes=(unit,))
     assert Verdict.of([gross]).with_errors(errors(0.01, 1.0)).level == "do not trust"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from string import Formatter
 from types import SimpleNamespace
@@ -25,6 +26,12 @@ LEVEL_OF_A_FORMAT = 6
 """Digits that a sentence has at most."""
 
 
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a file, which several tests look at."""
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def docstrings(tree: ast.AST) -> set[int]:
     """Return the strings that are documentation, by identity."""
     found = set()
@@ -34,9 +41,11 @@ def docstrings(tree: ast.AST) -> set[int]:
     return found
 
 
-def sentences(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield line and text of the strings with more than one word; numbers in them are 'N'."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
+@cache
+def sentences(path: Path) -> list[tuple[int, str]]:
+    """Return line and text of the strings with more than one word; numbers in them are 'N'."""
+    found = []
+    tree = parsed(path)
     left_out = docstrings(tree)
     inside = {
         id(part)
@@ -56,12 +65,13 @@ def sentences(path: Path) -> Iterator[tuple[int, str]]:
         else:
             continue
         if " " in text.strip():
-            yield node.lineno, text
+            found.append((node.lineno, text))
+    return found
 
 
 def formats(path: Path) -> Iterator[tuple[int, str]]:
     """Yield line and text of the formats of numbers within sentences."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.FormattedValue) and isinstance(node.format_spec, ast.JoinedStr):
             parts = node.format_spec.values
             if all(isinstance(part, ast.Constant) for part in parts):
@@ -95,6 +105,43 @@ def test_no_number_has_more_than_six_digits():
     assert not wrong
 
 
+PHRASES = {
+    r"\b(tells?|told|says?|said|speaks?|spoke)\b": "report, show, return, indicate",
+    r"\b(goes?|going|gone|went) on\b": "continue, resume",
+    r"\bstands?\b": "is, contains, is defined",
+    r"\bof (its|their|your) own\b": "its own",
+    r"\b(in|out)side of\b": "inside, outside",
+    r"\bin the place of\b": "instead of",
+    r"\b(hardly|anew|at hand|for ever|aside|well again)\b": "barely, again, available, skipped",
+    r"\bmend(s|ed|ing)?\b": "fix, correct, repair",
+    r"\b(unwell|visitors?|strangers?)\b": "unhealthy, client",
+    r"\bbeside\b": "next to, online, in addition to",
+    r"\bbelongs? to\b": "requires, is part of",
+    r"(?<!there )(?<!\bit )\bis no\b": "is not a",
+    r"\bheard\b": "received",
+}
+"""Phrase that sentences do not use -> what they use instead."""
+EXEMPT = {
+    "reproduce": "sentences that the gallery quotes",
+    "journal.py": "names of columns of the database",
+}
+"""File or folder whose sentences are not looked at -> why."""
+
+
+@pytest.mark.slow
+def test_sentences_are_plain_english():
+    phrases = {re.compile(form, re.IGNORECASE): advice for form, advice in PHRASES.items()}
+    wrong = [
+        f"{path.name}:{line}: {found[0]!r}, better: {advice}"
+        for path in FILES
+        if not EXEMPT.keys() & {path.name, path.parent.name}
+        for line, text in sentences(path)
+        for form, advice in phrases.items()
+        if (found := form.search(text))
+    ]
+    assert not wrong
+
+
 def test_the_scan_sees_what_it_looks_for(tmp_path):
     path = tmp_path / "one.py"
     path.write_text('"""A deviation."""\nraise ValueError(f"the deviation is {x:.9g}")\n')
@@ -116,7 +163,7 @@ def placeholders(sentence: Sentence) -> set[str]:
 def filled() -> Iterator[tuple[str, str, set[str]]]:
     """Yield place, key and the values that the source fills in, for each key in a literal."""
     for path in FILES:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             match node:
                 case ast.Call(
                     func=ast.Attribute(
@@ -131,6 +178,7 @@ def filled() -> Iterator[tuple[str, str, set[str]]]:
                             yield f"{table} {path.name}:{node.lineno}", part.value, values
 
 
+@pytest.mark.slow
 def test_sentences_of_findings_get_the_values_that_they_need():
     tables = {"FINDINGS": FINDINGS, "LIKELY": LIKELY}
     found = list(filled())
@@ -140,12 +188,13 @@ def test_sentences_of_findings_get_the_values_that_they_need():
         assert needed <= values, (place, key, needed - values)
 
 
+@pytest.mark.slow
 def test_every_sentence_of_a_finding_is_used():
     constants = {
         node.value
         for path in FILES
         if path.name != "sentences.py"
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(path))
         if isinstance(node, ast.Constant) and isinstance(node.value, str)
     }
     assert not {*FINDINGS, *LIKELY} - constants

@@ -257,7 +257,7 @@ def test_what_constants_refuse(monkeypatch):
     with pytest.raises(ConfigurationError, match="at least one state"):
         dg.constants(spaces, np.zeros(1), [])
     monkeypatch.setattr(constants_module, "LARGEST_DENSE_BASIS", 3)
-    with pytest.raises(ConfigurationError, match="Take a coarser mesh"):
+    with pytest.raises(ConfigurationError, match="Use a coarser mesh"):
         dg.constants(spaces, np.zeros(1), [np.zeros(model.X.dim)])
 
 

@@ -618,7 +618,7 @@ class Model(Shown):
         q[self.latent.fixed] = 0.0
         lower, upper = self.latent.bounds
         if np.any(q < lower) or np.any(q > upper):
-            raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
+            raise ModelError("q0 is outside the bounds of a scalar unknown.")
         return q
 
 

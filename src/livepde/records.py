@@ -64,7 +64,7 @@ NUMBER_ENDS = {
 FIELD_ENDS = {
     **STATE_ENDS,
     **INTERVAL_ENDS,
-    "_modes": "the number of modes told",
+    "_modes": "the number of determined modes",
     "_left_out": "the share of modes left out",
 }
 
@@ -110,7 +110,7 @@ class Snapshot:
         n = head.get("correlation")
         numbers = np.frombuffer(body)
         if len(numbers) != sum(sizes) + (n or 0) ** 2:
-            raise ValueError("fields of another size than they say")
+            raise ValueError("fields of another size than declared")
         *parts, rest = np.split(numbers, np.cumsum(sizes))
         return cls(
             dict(zip(head["profiles"], parts, strict=True)),
@@ -555,7 +555,7 @@ class Layout:
             data[name] = (("snapshot", "vertex"), values, attrs)
         for name, (_, count) in kept[-1].told.items():
             told = np.array([snapshot.told[name][0] for snapshot in kept])
-            about = {"long_name": "modes that the data have told of", "of": count}
+            about = {"long_name": "modes that the data determine", "of": count}
             data[f"{name}_modes"] = ("snapshot", told, about)
             left = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
             about = {"long_name": "share of modes that the law leaves out in the variance of"}

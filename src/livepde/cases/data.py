@@ -105,7 +105,7 @@ def _zone(case: CaseContent) -> tzinfo:
     try:
         return ZoneInfo(name)
     except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
-        text = f"there is no time zone '{name}'; expected a name as Europe/Berlin."
+        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
         raise case.error("data.zone", text) from None
 
 
@@ -257,7 +257,7 @@ def _owner(
 def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
     """Return the names of the columns of one of several files."""
     if path.suffix in (".parquet", *JSON_LINES):
-        raise case.error("data.file", f"{path} is no CSV file; only these are joined.")
+        raise case.error("data.file", f"{path} is not a CSV file; only CSV files can be joined.")
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
@@ -411,7 +411,7 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
         raise case.error("data.assimilate_from", text)
     stamp = clock.stamp(value)
     if stamp is None:
-        text = f"got '{value}'; expected a date as 2025-04-01 12:00."
+        text = f"got '{value}'; expected a date such as 2025-04-01 12:00."
         raise case.error("data.assimilate_from", text)
     return (stamp - since_1970(origin)) * clock.second
 
@@ -453,7 +453,7 @@ def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) 
 def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
     spec = case.spec.data
     if spec.follow and not path.exists():
-        LOG.warning("there is no file '%s' yet: waits for it", path)
+        LOG.warning("there is no file '%s' yet: waiting for it", path)
     return Follow(
         path,
         separator=spec.separator,

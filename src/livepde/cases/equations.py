@@ -33,7 +33,7 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
         if name not in EQUATIONS:
             raise CaseError(
                 f"{where}: equation: there is no equation '{name}'; "
-                f"{did_you_mean(name, EQUATIONS)} An own one is 'file.py:function'."
+                f"{did_you_mean(name, EQUATIONS)} For your own equation, use 'file.py:function'."
             )
         return EQUATIONS[name]
     expected = "(mesh, unknowns, dirichlet, **options) -> livepde.Model"
@@ -150,7 +150,7 @@ def _no_code(path: Path, source: str, folder: Path) -> str:
     """Return a sentence on a missing code file, with a hint if the working directory has it."""
     if Path(source).is_file():
         there = beside(Path(source), folder).as_posix()
-        return f"there is no file '{path}', beside the case; did you mean '{there}'?"
+        return f"there is no file '{path}', next to the case; did you mean '{there}'?"
     return str(no_file(path))
 
 

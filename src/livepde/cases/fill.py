@@ -33,7 +33,7 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
         expected = apply(read_toml(text, where), {key: value}, where)
         text = _with(text, key_path(key, where), value)
         if _without_empty(read_toml(text, where)) != _without_empty(expected):
-            raise CaseError(f"{where}: {key}: cannot be set here; edit the file in its place.")
+            raise CaseError(f"{where}: {key}: cannot be set here; edit the file instead.")
     if settings:
         spec_of(read_toml(text, where), where)
     return text

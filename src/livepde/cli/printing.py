@@ -35,9 +35,7 @@ __all__ = [
 
 MOST_CURVES = 100_000  # samples of a run whose readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
-FIGURES_MISSING = (
-    "No figures: Matplotlib is not installed. To install it: pip install 'livepde[plots]'."
-)
+FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plots]'."
 
 
 def terminal(*, err: bool = False) -> Console:

@@ -228,8 +228,8 @@ class Spaces:
         if X.dim > LARGEST_DENSE_BASIS:
             raise ConfigurationError(
                 f"Spaces: {X.dim} unknowns; for sensors other than a Subdomain the constants are "
-                f"computed densely up to {LARGEST_DENSE_BASIS}. Take a coarser mesh: they belong "
-                "to the problem and change little."
+                f"computed densely up to {LARGEST_DENSE_BASIS}. Use a coarser mesh: the constants "
+                "barely depend on it."
             )
         free = np.flatnonzero(X.free)
         left, sizes, _ = np.linalg.svd(R.toarray()[np.ix_(free, free)])

@@ -407,7 +407,7 @@ class FieldBlock(Block):
         names = self.field.element.dofnames or []
         axes = [k for k in range(3) if f"u^{k + 1}" in names]
         if not (self.vector and axes):
-            what = "has no components" if self.vector else "is no vector"
+            what = "has no components" if self.vector else "is not a vector"
             raise SpaceError(
                 f"{where} has a value for each component, and the field {what}: give a number."
             )
@@ -573,7 +573,7 @@ class FieldBlock(Block):
             )
         if (lost := self._outside(points)) is not None:
             raise ObservationError(
-                f"{what} {lost} at {points[:, lost].tolist()} lies outside of the mesh, which "
+                f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
         return self._evaluated(np.clip(points.T, low, high).T)

@@ -117,7 +117,7 @@ def _moved(nodes: Array, through: Sequence[float]) -> Array:
     if not inside or len(set(nearest)) < len(nearest) or 0 in nearest:
         raise SpaceError(
             f"interval: through={list(through)} needs points between {nodes[0]:g} and "
-            f"{nodes[-1]:g}, each with an inner node of its own nearby: take more cells."
+            f"{nodes[-1]:g}, each near its own inner node: use more cells."
         )
     moved[nearest] = through
     return moved

@@ -244,7 +244,7 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
     except (Exception, SystemExit) as error:
         raise SpaceError(
             f"read_mesh: '{path}' cannot be read ({str(error) or type(error).__name__}): "
-            "check that its ending tells its format, or save it again as Gmsh 4.1 (.msh)."
+            "check that its extension matches its format, or save it as Gmsh 4.1 (.msh)."
         ) from error
     try:
         mesh: Mesh = from_meshio(read, ignore_orientation=True)

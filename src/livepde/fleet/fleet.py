@@ -179,7 +179,7 @@ class Fleet:
         if len(value) != len(self.members):
             raise ConfigurationError(
                 f"{what}: a list of {len(value)} for {len(self.members)} members; give one for "
-                "each, or one value for all that is no list."
+                "each, or a single value for all."
             )
         return value
 

@@ -515,7 +515,7 @@ class Law(ABC, Generic[Work, State]):
 
     def unjudged(self) -> Verdict:
         """Return the verdict where no innovation is judged."""
-        why = f"innovations: {type(self).__name__} says nothing of their size"
+        why = f"innovations: {type(self).__name__} does not test their size"
         return Verdict.of((), (why,), judged=False)
 
 

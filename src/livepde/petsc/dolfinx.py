@@ -280,7 +280,7 @@ class DolfinxModel:
         first = np.min(owners, axis=0)
         if (first == comm.size).any():
             lost = np.flatnonzero(first == comm.size)[0]
-            raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside of the mesh.")
+            raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside the mesh.")
         G = petsc_module().Mat().createAIJ(((None, len(x)), self.create_u().getSizes()), comm=comm)
         G.setUp()
         # How many shape functions a row has depends on the element, so none are preallocated.

@@ -33,8 +33,8 @@ __all__ = [
 
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
-COMMA = "if that is a decimal comma, say decimal = ','."
-NO_POINT = "with decimal = ',' a point is none of decimals."
+COMMA = "if that is a decimal comma, set decimal = ','."
+NO_POINT = "with decimal = ',', a point is not a decimal mark."
 FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
 MOST = 0.8  # share of cells that a format of dates has to fit
 ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
@@ -128,7 +128,9 @@ class Clock:
         if dates:
             stamp = self.stamp(value)
             if stamp is None:
-                raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
+                raise SampleError(
+                    f"{what}: got {value!r}; the times are dates, such as 2025-04-01."
+                )
             return stamp * self.second
         if isinstance(value, str | date):
             raise SampleError(f"{what}: got {str(value)!r}; the times are numbers, not dates.")
@@ -314,9 +316,9 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
         return "expected a number, as in the other rows."
     if clock.format:
         return f"expected a date as time_format has it, {clock.format!r}."
-    expected = "expected a date and time as 2025-04-01 12:00"
+    expected = "expected a date and time such as 2025-04-01 12:00"
     format = guessed_format(cell) if isinstance(cell, str) else ""
-    return expected + (f"; say time_format, perhaps {format!r}." if format else ".")
+    return expected + (f"; set time_format, perhaps {format!r}." if format else ".")
 
 
 def _day_after(value: Any) -> date | None:
