@@ -205,7 +205,7 @@ def test_layers_with_priors_of_their_own(rod):
         ("{ prior = 1 }", "the key '{}.over' is missing"),
         ("{ over = [0, 1], priro = 1 }", "no key '{}.priro'; did you mean 'prior'"),
         ('{ over = [0, 1], prior = "1 m" }', "{}.prior: 'm' cannot be converted"),
-        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 lies outside"),
+        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 is outside"),
         ("3", "{}: got 3"),
     ],
 )  # fmt: skip
@@ -504,7 +504,7 @@ def test_a_unit_where_a_function_has_none(rod):
     path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
     path.with_name("mine.py").write_text("def rod(mesh, unknowns, dirichlet):\n    pass\n")
     with pytest.raises(
-        lp.errors.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
+        lp.errors.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* add `unknowns\.alpha\.unit`"
     ):
         cases.load(path, allow_code=True)
 
@@ -1071,7 +1071,7 @@ def test_semicolons(rod):
     path = rod()
     data = path.with_name("rod.csv")
     data.write_text(data.read_text().replace(",", ";"))
-    with pytest.raises(lp.errors.DataError, match="say separator = ';'"):
+    with pytest.raises(lp.errors.DataError, match="set separator = ';'"):
         cases.load(path).prepare()
     prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
     assert len(prepared.stream) == 91
@@ -1155,9 +1155,9 @@ def test_keys_are_taken_away(rod):
 @pytest.mark.parametrize(
     ("key", "value", "named"),
     [
-        ("law.kidn", None, "there is not a key 'law.kidn' to remove; did you mean 'kind'?"),
-        ("law.niose", 1, "there is not a key 'law.niose'; did you mean 'noise'?"),
-        ("lwa.noise", 1, "there is not a key 'lwa'; did you mean 'law'?"),
+        ("law.kidn", None, "there is no key 'law.kidn' to remove; did you mean 'kind'?"),
+        ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
+        ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
         ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
         ("law..noise", 1, "'law..noise' is not a key"),
@@ -1243,7 +1243,7 @@ def test_variants(rod):
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("seeds", "sedes", "there is not a key 'variants[0].sedes'; did you mean 'seeds'?"),
+        ("seeds", "sedes", "there is no key 'variants[0].sedes'; did you mean 'seeds'?"),
         ("seeds = 3", 'seeds = 3\n[[variants]]\nname = "noisier"', "two have the name 'noisier'"),
         ('name = "noisier"', "", "the key 'variants[0].name' is missing"),
         ('rmse = "<= 1"', "rmse = 1", "variants[0].expect.rmse: got 1"),

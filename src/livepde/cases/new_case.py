@@ -510,7 +510,7 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
         raise RunError(f"{folder} is a file: 'livepde init DIR --data {folder}' takes a table.")
     for path in (folder / name for name in names):
         if path.exists():
-            raise RunError(f"{path} is there already: choose another folder, nothing was written.")
+            raise RunError(f"{path} exists. Choose another folder. Nothing was written.")
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:
