@@ -192,7 +192,7 @@ def test_nothing_is_written_over(rod, here):
     before = {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()}
     assert "already contains a run" in bad("run", rod, "--out", "out")
     assert {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()} == before
-    assert "is there already" in bad("init", "rod")
+    assert "exists. Choose another folder" in bad("init", "rod")
 
 
 def test_a_case_that_is_refused_leaves_nothing(rod, here):

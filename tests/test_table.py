@@ -68,8 +68,8 @@ def test_what_counts_as_missing(csv, missing):
         ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, set decimal = ','"),
         ('t,a,b\n"0,5",1,1\n"0,6",1,1\n', "got '0,5'; if that is a decimal comma"),
         ("t,a,b\n1.4.2025 9:05,1,1\n", "set time_format, perhaps '%d.%m.%Y %H:%M'"),
-        ("t;a;b\n0;1;1\n", "3 with ';': say separator = ';'."),
-        ("t;a;b\n0;1,5;1\n", "3 with ';': say separator = ';' and decimal = ','."),
+        ("t;a;b\n0;1;1\n", "3 with ';': set separator = ';'."),
+        ("t;a;b\n0;1,5;1\n", "3 with ';': set separator = ';' and decimal = ','."),
         ("t,a,b\n", "no rows"),
         ("", "cannot be read"),
     ],
@@ -99,10 +99,10 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
         with pytest.raises(DataError) as error:
             read_csv(path, COLUMNS, Clock("Uhr ü"))
         assert str(error.value).endswith(
-            f"in row 1): say encoding = '{encoding}', separator = ';', decimal = ',' and "
+            f"in row 1): set encoding = '{encoding}', separator = ';', decimal = ',' and "
             "time_format = '%d.%m.%Y %H:%M'; or save it as 'CSV UTF-8'."
         )
-        with pytest.raises(DataError, match=f": say encoding = '{encoding}'; or save it"):
+        with pytest.raises(DataError, match=f": set encoding = '{encoding}', or save it"):
             read_csv(path, COMMAS, clock, **how)
         how["encoding"] = encoding
     table = read_csv(path, COMMAS, clock, **how)
