@@ -100,7 +100,7 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
             read_csv(path, COLUMNS, Clock("Uhr ü"))
         assert str(error.value).endswith(
             f"in row 1): set encoding = '{encoding}', separator = ';', decimal = ',' and "
-            "time_format = '%d.%m.%Y %H:%M'; or save it as 'CSV UTF-8'."
+            "time_format = '%d.%m.%Y %H:%M', or save it as 'CSV UTF-8'."
         )
         with pytest.raises(DataError, match=f": set encoding = '{encoding}', or save it"):
             read_csv(path, COMMAS, clock, **how)
@@ -212,7 +212,7 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
         (
             "1,5",
             "1.234",
-            "row 2, column 'a': got '1.234'; with decimal = ',' a point is not a decimal",
+            "row 2, column 'a': got '1.234'; with decimal = ',', a point is not a decimal",
         ),
         ("1,5", "1.234,5", "row 2, column 'a': got '1.234,5'; expected a number"),
         ("01.04.2025 12:30", "31.02.2025 12:30", "as time_format has it, '%d.%m.%Y %H:%M'"),
@@ -254,7 +254,7 @@ def test_a_day_includes_its_hours_also_if_it_has_25(night, stop):
 @pytest.mark.parametrize("minutes", [30, 60])
 def test_an_hour_that_comes_twice_is_told(night, minutes):
     path = night(minutes, offset=False)
-    told = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30"
+    told = "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30"
     with pytest.raises(TimeOrderError, match=told):
         read_csv(path, COLUMNS, Clock("t", zone=GERMAN.zone))
     header, *rows = path.read_text().splitlines()
