@@ -94,8 +94,10 @@ def taken(folder: str) -> None:
 
 def messages() -> dict[str, str]:
     """Return mistake -> message, as the page has them in the first two columns of its tables."""
-    rows = re.findall(r"^\| ([^|]+?) \| `([^|]+?)` \|", PAGE.read_text(), flags=re.MULTILINE)
-    return dict(rows)
+    # A message with backticks stands between two of them, as Markdown has it.
+    form = r"^\| ([^|]+?) \| (`+) ?([^|]+?) ?\2 \|"
+    rows = re.findall(form, PAGE.read_text(), flags=re.MULTILINE)
+    return {mistake: message for mistake, _, message in rows}
 
 
 @pytest.fixture
@@ -142,7 +144,7 @@ def test_a_file_of_a_run_leads_to_the_run(home, monkeypatch, capsys):
     taken("runs/mine")
     code, _, told = livepde(("report", "runs/mine/run.json"), monkeypatch, capsys)
     assert code == 2
-    assert told.endswith("run.json holds no run (it is a file); did you mean 'runs/mine'?\n")
+    assert told.endswith("run.json contains no run (it is a file); did you mean 'runs/mine'?\n")
 
 
 @pytest.mark.parametrize("command", [("watch", "old"), (*RUN, "--realtime", "--watch", "8050")])
