@@ -469,7 +469,7 @@ def test_a_process_that_nothing_drives_is_noted(here, more, driven):
     if "unknowns.source.std" in more:
         case.write_text(case.read_text() + "[unknowns.source]\nprior = 0\nstd = 1\n")
     case = cases.load(case, settings={**WALL, **more})
-    told = "nothing drives the process"
+    told = "source or input drives the process"
     assert any(told in note for note in case.notes) is not driven
 
 

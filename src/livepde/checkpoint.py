@@ -57,7 +57,7 @@ def _gather(value: Any, prefix: str, leaves: dict[str, Any]) -> None:
 
 @lru_cache(maxsize=256)
 def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
-    """Return name, axis that grows, and whether it begins anew of each field of a dataclass."""
+    """Return name, axis that grows, and whether it restarts, of each field of a dataclass."""
     if not is_dataclass(kind):
         return None
     return tuple(

@@ -115,7 +115,7 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with dates, and with its numbers on axes of their own."""
+    """Return the dataset of a run with dates, and with its numbers on separate axes."""
     from livepde.plots.dataset import field_names, interval_95, scalars
 
     found: dict[str, Any] = {}

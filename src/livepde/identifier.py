@@ -230,7 +230,7 @@ class Identifier(Shown):
         return other
 
     def placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
-        """Return an identifier of the same parts that stands elsewhere; for `Fleet.identifier`.
+        """Return an identifier of the same parts in another state; for `Fleet.identifier`.
 
         Parameters
         ----------
@@ -295,7 +295,7 @@ class Identifier(Shown):
         return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
-        """Return an identifier that goes on by itself; model, law and matrices are shared."""
+        """Return an identifier that continues independently; model, law and matrices are shared."""
         other = copy.copy(self)
         other._state, other._z = copy.deepcopy((self._state, self._z), memo)
         return other
@@ -1013,7 +1013,7 @@ class Identifier(Shown):
 
 
 def _check_parts(*parts: object) -> None:
-    """Refuse what is no model, observation and law, in this order."""
+    """Refuse what is not a model, an observation and a law, in this order."""
     for part, kind in zip(parts, (Model, Observation, Law), strict=True):
         if not isinstance(part, kind):
             remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
@@ -1024,7 +1024,7 @@ def _check_parts(*parts: object) -> None:
 
 
 def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
-    """Refuse an initial time that is not finite, and an initial state that is said twice or not."""
+    """Refuse an initial time that is not finite, and an initial state given twice or not at all."""
     if not np.isfinite(t0):
         raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
     for name, given in uncertain.items():

@@ -258,7 +258,7 @@ class Model(Shown):
         return Form(name, integrands, spaces, mesh, order, nonlinear, derivative, inputs, parameter)
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
-        """Return the same process with more unknowns, which its forms do not see: of sensors, say.
+        """Return the same process with more unknowns, such as those of sensors, not in its forms.
 
         Raises
         ------
@@ -303,7 +303,7 @@ class Model(Shown):
         return Model(self.state, self.parameter, **parts, **self._units)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
-        """Return the same process with constants in the place of some of its inputs.
+        """Return the same process with constants instead of some of its inputs.
 
         Raises
         ------
@@ -382,7 +382,7 @@ class Model(Shown):
         )
 
     def _check_names(self) -> None:
-        """Refuse names that a run's dataset could not tell apart."""
+        """Refuse names that a run's dataset could not distinguish."""
         state, parameter = self.state_space, self.parameter_space
         axes = "xyz"[: self.mesh.dim()]
         clashes = name_clashes(
@@ -587,7 +587,7 @@ class Model(Shown):
         return self.impose(self.state_space.interpolate(u0), moment)
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
-        """Return coefficients of the initial state that belongs to a latent parameter."""
+        """Return coefficients of the initial state of a latent parameter."""
         if self.form_initial is None:
             return self.impose(np.zeros(self.X.dim), moment)
         boundary = self.impose(np.zeros(self.X.dim), moment)

@@ -584,7 +584,7 @@ def _layouts() -> TypeAdapter[Layout]:
 
 
 def bare(name: str) -> str:
-    """Return the name of the unknown that a variable belongs to."""
+    """Return the name of the unknown of a variable."""
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
@@ -625,7 +625,7 @@ def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
 def name_clashes(
     own: Iterable[str], state: Iterable[str], numbers: Iterable[str], fields: Iterable[str]
 ) -> list[str]:
-    """Return a sentence for each name that would stand for two things in a run's dataset.
+    """Return a sentence for each name that would have two meanings in a run's dataset.
 
     Parameters
     ----------
@@ -653,7 +653,7 @@ def name_clashes(
 
 
 def _uses(name: str, kind: str, ends: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Iterate over the variables that belong to one of a model's quantities, and their meanings."""
+    """Iterate over the variables of one of a model's quantities, and their meanings."""
     yield name, f"{kind} '{name}'"
     if name.startswith(NOTE):
         yield name, "a note of the law"

@@ -338,7 +338,7 @@ class Marginal:
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
-    """Return findings on scalar unknowns that are hardly identified, or end at a bound."""
+    """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
     for label, row in space.labels.items():
         unknown, value = unknown_of(space, label), float(belief.q[row])
         lower, upper = map(float, unknown.prior.bounds)

@@ -271,7 +271,7 @@ class Case(CaseContent):
 
     @property
     def source(self) -> str:
-        """Source of the references: a publication, say."""
+        """Source of the references, such as a publication."""
         given = self.spec.reference.get("source", "")
         return given if isinstance(given, str) and "source" not in self.references else ""
 

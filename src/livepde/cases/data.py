@@ -176,7 +176,7 @@ def _all_read(
 
 
 def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
-    """Refuse times in two columns of a source that is no CSV file."""
+    """Refuse times in two columns of a source that is not a CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."
@@ -184,7 +184,7 @@ def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
 
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
-    """Return the data of a file, whose ending tells its format."""
+    """Return the data of a file; its extension gives the format."""
     rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing}
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, **rows)

@@ -100,7 +100,7 @@ def own_code(what: str) -> Iterator[None]:
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
-    """Import the object that a case names, from a module or from a file beside the case.
+    """Import the object that a case names, from a module or a file in the folder of the case.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
 
 
 def check_options(function: Any, given: Iterable[str], where: str) -> None:
-    """Refuse an option that a function does not take; the first argument is no option."""
+    """Refuse an option that a function does not have; the first argument is not an option."""
     _, *known = inspect.signature(function).parameters.values()
     if any(item.kind is inspect.Parameter.VAR_KEYWORD for item in known):
         return

@@ -40,7 +40,7 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
 
 
 def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document without its empty tables, which are there with a head of their own only."""
+    """Return a document without its empty tables, which consist of a head only."""
     return {name: value for name, value in document.items() if value != {}}
 
 

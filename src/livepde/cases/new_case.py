@@ -136,7 +136,7 @@ class FoundChannel:
 
 
 def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
-    """Return the text of a case in `folder` that equation and table tell; the rest is open."""
+    """Return the text of a case in `folder`, from equation and table; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
     # Noise is a standard deviation, a difference of temperatures: in K.
@@ -233,7 +233,7 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
 
 
 def _missing(table: Measured) -> list[float]:
-    """Return the values that stand for no reading in some column, and are usual in no other."""
+    """Return the values that are placeholders in some column, and usual in no other."""
     columns = table.columns.values()
     found = {one.value for values in columns for one in sentinels(values)}
 

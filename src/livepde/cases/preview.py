@@ -58,7 +58,7 @@ class Identified:
 
     @property
     def hardly(self) -> bool:
-        """True if the sensors provide hardly any information on it."""
+        """True if the sensors do not identify it."""
         return self.left > FLAT
 
 

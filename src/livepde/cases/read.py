@@ -374,7 +374,7 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
 
 
 def settings_in(text: str) -> tuple[str, ...]:
-    """Return the settings in a text that separates them by semicolons outside of quotes.
+    """Return the settings in a text that separates them by semicolons outside quotes.
 
     >>> settings_in('data.separator=";"; law.jumps=true')
     ('data.separator=";"', 'law.jumps=true')
@@ -421,7 +421,7 @@ def toml_key(name: str) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value on one line, with blanks inside of the braces of an inline table."""
+    """Return a value on one line, with blanks inside the braces of an inline table."""
     if isinstance(value, Mapping):
         items = ", ".join(toml_line(key, item) for key, item in value.items())
         return f"{{ {items} }}" if items else "{}"

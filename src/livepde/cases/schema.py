@@ -88,7 +88,7 @@ BOUNDS: dict[str, Any] = {
 
 
 def _short(key: str) -> BeforeValidator:
-    """Return the reading of a value that is no table as a table with this key only."""
+    """Return the reading of a value that is not a table as a table with this key only."""
     return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
@@ -344,7 +344,7 @@ class DataSpec(Spec):
 
     @property
     def live(self) -> bool:
-        """Whether the source goes on."""
+        """Whether the source is live."""
         return self.follow or self.mqtt is not None or self.opcua is not None
 
 
@@ -380,7 +380,7 @@ class EvolutionSpec(Spec):
 
 
 class PriorSpec(Spec):
-    """Keys of the prior of an unknown, also of a region that has one of its own."""
+    """Keys of the prior of an unknown, or of a region with its own prior."""
 
     prior: Quantity | None = None
     std: Quantity | None = None
@@ -419,7 +419,7 @@ class UnknownSpec(PriorSpec):
         return self
 
     def at(self, region: RegionSpec) -> UnknownSpec | None:
-        """Return the prior of the unknown in a region; None if it has none of its own."""
+        """Return the prior of the unknown in a region; None if the region has no prior."""
         own = {key: getattr(region, key) for key in region.model_fields_set - {"over"}}
         return self.model_copy(update=own) if own else None
 

@@ -185,7 +185,7 @@ def equations(
 
 
 def _entries(found: Equation) -> list[tuple[str, ...]]:
-    """Return what a case says about an equation: table, key, meaning, unit and default of each."""
+    """Return the case keys of an equation: table, key, meaning, unit and default of each."""
     unit = found.state.unit
     rows: list[tuple[str, ...]] = [("state", "u", found.state.text, unit, "")]
     for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):

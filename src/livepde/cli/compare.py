@@ -133,7 +133,7 @@ def _of_run(
 def _all(
     run: Callable[[Variant], VariantRun], variants: Sequence[Variant], jobs: int, quiet: bool
 ) -> list[VariantRun]:
-    """Return how the runs of variants ended, in their order; each in a process of its own."""
+    """Return how the runs of variants ended, in their order; each in its own process."""
     from livepde.progress import watched
 
     def apart(variant: Variant) -> VariantRun:

@@ -102,7 +102,7 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
 
 
 def _fine(lines: Array) -> list[float] | None:
-    """Return where a mesh is fine, if its domain goes on far beyond."""
+    """Return where a mesh is fine, if its domain extends far beyond."""
     low, high = np.quantile(lines, [FINE, 1.0 - FINE]).tolist()
     return [low, high] if np.ptp(lines) > OUT * (high - low) else None
 

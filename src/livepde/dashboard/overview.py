@@ -56,7 +56,7 @@ class PerRun(Mapping[str, T]):
 
 
 def overview_page(folder: Path) -> WSGIApplication:
-    """Return the page of a folder of runs, a fleet's say: a table, and the page of each run.
+    """Return the page of a folder of runs, such as a fleet's: a table, and the page of each run.
 
     Parameters
     ----------

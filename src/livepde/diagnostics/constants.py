@@ -89,7 +89,7 @@ class Spaces:
 
     @cached_property
     def hidden_part(self) -> Part:
-        """Spaces V^ and VX^: functions outside of omega, or the range of P."""
+        """Spaces V^ and VX^: functions outside omega, or the range of P."""
         return self._parts[1]
 
     def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:

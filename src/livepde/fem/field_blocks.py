@@ -533,7 +533,7 @@ class FieldBlock(Block):
         return self._outside(point[:, None]) is None
 
     def _outside(self, points: Array) -> int | None:
-        """Return the index of the first point, of shape (d, k), outside of the mesh; or None."""
+        """Return the index of the first point, of shape (d, k), outside the mesh; or None."""
         low, high = (corner[:, None] for corner in self.box)
         # Points on the boundary may lie outside by rounding; `probe` clips them to the bounding
         # box.

@@ -204,7 +204,7 @@ class _Declared:
 
 
 def _expected(given: Any) -> str:
-    """Return what to write in the place of something that is no prior."""
+    """Return what to write instead of something that is not a prior."""
     number = f"{given}" if isinstance(given, int | float) else "mean"
     return f"write Normal({number}, std), or LogNormal or LogitNormal with a median and a std"
 
@@ -367,7 +367,7 @@ class Scalar(_Declared):
 
 @dataclass(frozen=True, eq=False)
 class Piecewise(_Declared):
-    """One unknown number for each named region, with a common prior or priors of their own.
+    """One unknown number for each named region, with a common prior or its own.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ class Piecewise(_Declared):
 
 @dataclass(frozen=True, eq=False)
 class Scalars(_Declared):
-    """One unknown number for each name, with a common prior: an offset of each sensor, say.
+    """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
     Forms and sensors see a mapping, q.offset["T_10"].
 

@@ -241,7 +241,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form composed with q = V T(a): latent coefficients in the place of q."""
+    """A form composed with q = V T(a): latent coefficients instead of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form

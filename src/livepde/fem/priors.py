@@ -43,7 +43,7 @@ class Transform(ABC):
 
     @abstractmethod
     def inverse(self, q: Array) -> Array:
-        """Return the latent value of q; not finite where q lies outside of the range of T."""
+        """Return the latent value of q; not finite where q lies outside the range of T."""
 
     def shifted(self, q: Array, std: Array, z: float) -> Array:
         """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).

@@ -407,7 +407,7 @@ class Fleet:
         return replace(estimate, read=read, belief=belief)
 
     def identifier(self, member: str | int) -> Identifier:
-        """Return an identifier that goes on from the state of a member, by name or number.
+        """Return an identifier that continues from the state of a member, by name or number.
 
         Steps of this identifier do not change the fleet.
         """
@@ -426,7 +426,7 @@ class Fleet:
         return engine.start(self._q0[:1], self._u0[:1], moments)
 
     def subset(self, which: IntArray, state: Any, samples: int) -> Fleet:
-        """Return a fleet of some members, which stand where they do here; for `Shard`.
+        """Return a fleet of some members in their present states; for `Shard`.
 
         Parameters
         ----------
@@ -662,7 +662,7 @@ def _check_positive(name: str, noise: Array) -> None:
 
 
 def _numbers(what: str, values: ArrayLike) -> Array:
-    """Return an array of floats of its own."""
+    """Return a new array of floats."""
     try:
         if np.asarray(values).dtype.kind in "USb":
             raise TypeError

@@ -104,7 +104,7 @@ class EquationLedger:
 
     @property
     def lasting(self) -> float:
-        """Part of the equation error that goes on, over what q and the process do; at least 0."""
+        """Persistent part of the equation error, over what q and the process do; at least 0."""
         product, square, terms = self.sums.tolist()
         surely = product - DEVIATIONS * math.sqrt(square)
         return math.sqrt(max(surely, 0.0) / terms) if terms > 0.0 else 0.0
@@ -196,7 +196,7 @@ class EquationTests:
 
 
 def rested(count: int, when: str = "") -> Finding:
-    """Return the note that q was held because nothing excited it; `when`: ", last at noon", say."""
+    """Return the note that q was held because nothing excited it; `when` as in ", last at noon"."""
     text, _ = FINDINGS["rest"].filled(count=count, when=when)
     return Finding("rest", "note", text, "unknowns", float(count))
 

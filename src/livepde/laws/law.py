@@ -243,7 +243,7 @@ class Belief:
         return None if self.u_factor is None else _deviation(self.u_factor)
 
     def deviation(self, rows: Any, part: slice) -> Array | None:
-        """Return the standard deviation of rows @ q[part] for a matrix, that of point values, say.
+        """Return the standard deviation of rows @ q[part] for a matrix, such as of point values.
 
         Where a row has several entries the rest counts as if it were fully correlated.
         """
@@ -299,7 +299,7 @@ def _deviation(factor: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Report of a step, beside the new state.
+    """Report of a step, in addition to the new state.
 
     Attributes
     ----------
@@ -459,11 +459,11 @@ class Law(ABC, Generic[Work, State]):
         return None
 
     def diagnosed(self, work: Work, state: State) -> Diagnostics[float]:
-        """Return what is known of the estimate beside it between two samples."""
+        """Return what is known of the estimate besides itself between two samples."""
         return Diagnostics()
 
     def weighs_readings(self) -> bool:
-        """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
+        """Return whether a reading may have its own noise (`Interval.noise`); here not."""
         return False
 
     def unsmoothed(self, work: Work) -> str:

@@ -255,7 +255,7 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
-    """Return where the estimates of one member stand."""
+    """Return the data on the estimates of one member, for its verdict."""
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
     _, C = reported_factors(filter_, x)

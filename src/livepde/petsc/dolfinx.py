@@ -272,7 +272,7 @@ class DolfinxModel:
         return matrix
 
     def _readings(self, points: Any) -> Any:
-        """Return G: each point belongs to the lowest rank that has a cell with it."""
+        """Return G: each point is on the lowest rank that has a cell with it."""
         x, comm = np.zeros((len(points), 3)), self.mesh.comm
         x[:, : np.shape(points)[1]] = points
         rows = self.api.readings(self.V, x)

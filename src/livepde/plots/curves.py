@@ -189,7 +189,7 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
 
 
 def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
-    """Draw one quantity of a closed loop, and what belongs to it, over times of shape (times,)."""
+    """Draw one quantity of a closed loop, with limits and targets, over times of shape (times,)."""
     for end, (meaning, style, colour) in LOOP_LINES.items():
         if f"{name}_{end}" in data:
             said = ax.get_legend_handles_labels()[1]

@@ -154,7 +154,7 @@ def cf(
 
 
 def bounded(data: xr.Dataset) -> xr.Dataset:
-    """Return a copy with the 95 % interval of each scalar beside its standard deviation."""
+    """Return a copy with the 95 % interval of each scalar next to its standard deviation."""
     found = {}
     for name, variable in data.data_vars.items():
         found[name] = variable.copy(deep=False)

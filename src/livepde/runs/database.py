@@ -118,7 +118,7 @@ def _connect(path: Path, options: str) -> sqlite3.Connection:
 
 
 def log_of(path: Path) -> Path:
-    """Return the write-ahead log beside a journal; it need not be there."""
+    """Return the write-ahead log of a journal; it need not exist."""
     return path.with_name(path.name + "-wal")
 
 

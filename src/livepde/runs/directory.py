@@ -95,7 +95,7 @@ def _only_begun(path: Path, case: str) -> bool:
 
 
 def _nearest(folder: Path) -> str:
-    """Return a hint on the nearest run directory: below the folder, beside it, or in runs/."""
+    """Return a hint on the nearest run directory: below the folder, next to it, or in runs/."""
     if folder.is_file():  # a case, or a file of a run
         folder = folder.parent
     near = difflib.get_close_matches(folder.name, run_names(folder.parent), n=1)
@@ -297,7 +297,7 @@ class Run:
 
     @property
     def notes(self) -> list[str]:
-        """Notes of the run: warnings and remarks beside its numbers."""
+        """Notes of the run: warnings and remarks in addition to its numbers."""
         return [str(note) for note in self.record.get("notes", [])]
 
     @property
@@ -482,7 +482,7 @@ def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[s
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file; it appears whole or not at all, and in the place of a link."""
+    """Write a text file; it appears whole or not at all, and replaces a link."""
     write_bytes(path, text.encode())
 
 

@@ -79,7 +79,7 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
 
 
 def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
-    """Write a file or folder beside its target, and move it there when it is complete.
+    """Write a file or folder next to its target, and move it there when it is complete.
 
     Parameters
     ----------
@@ -174,12 +174,12 @@ def _over_time(run: Run) -> pd.DataFrame:
 
 
 def _series(run: Run, path: Path, at: float | None) -> None:
-    """Write the fields of all times as XDMF, with their numbers in an HDF5 file beside it."""
+    """Write the fields of all times as XDMF, with their numbers in an HDF5 file next to it."""
     import h5py  # type: ignore[import-untyped]
     from meshio.xdmf import TimeSeriesWriter
 
     class Writer(TimeSeriesWriter):  # type: ignore[misc]
-        """Keeps the HDF5 file beside the XDMF file, not in the current folder."""
+        """Keeps the HDF5 file next to the XDMF file, not in the current folder."""
 
         def __enter__(self) -> Any:
             self.h5_filename = str(self.filename.with_suffix(".h5"))

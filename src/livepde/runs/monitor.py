@@ -119,7 +119,7 @@ class _Health:
 
 
 class Monitor:
-    """Serves /livez, /readyz, /health and /metrics from threads of its own.
+    """Serves /livez, /readyz, /health and /metrics from its own threads.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
     else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes

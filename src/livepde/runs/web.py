@@ -93,7 +93,7 @@ class Address:
 
 
 class Server:
-    """A WSGI application, served from threads of its own.
+    """A WSGI application, served from its own threads.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class Server:
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
-    """Return an application with our headers, and a cookie for visitors with the token."""
+    """Return an application with our headers, and a cookie for clients with the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
         if why := _why_not(environ, address):
@@ -189,7 +189,7 @@ def _host(environ: Mapping[str, Any]) -> str:
 
 
 def _known(environ: Mapping[str, Any]) -> list[str]:
-    """Return the tokens that a visitor has sent with the request."""
+    """Return the tokens that a client has sent with the request."""
     found = [str(environ.get("HTTP_AUTHORIZATION", "")).removeprefix("Bearer ").strip()]
     try:
         cookie = SimpleCookie(str(environ.get("HTTP_COOKIE", "")))

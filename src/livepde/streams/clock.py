@@ -169,7 +169,7 @@ def read_times(
 def with_second_passes(
     times: Array, cells: Sequence[Any], clock: Clock, repeats: Callable[[int, int], bool]
 ) -> Array:
-    """Return times of dates whose hours that clocks show twice are told apart.
+    """Return times of dates; hours that clocks show twice are distinguished.
 
     A date without a zone of its own that is not later than those before it belongs to the second
     pass of such an hour, unless its row repeats an earlier one.
@@ -198,7 +198,7 @@ def with_second_passes(
 
 
 def is_naive(cell: Any, clock: Clock) -> bool:
-    """Return whether a cell is a date without a zone of its own."""
+    """Return whether a cell is a date without a zone."""
     try:
         cell = _parsed(cell, clock.format)
     except ValueError:
@@ -264,12 +264,12 @@ def _stamps(cells: Sequence[str], form: str) -> Array:
 
 
 def _are_even(steps: Array) -> bool:
-    """Return whether the longest of several steps is hardly longer than their median."""
+    """Return whether the longest of several steps is barely longer than their median."""
     return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
 
 
 def _known_formats() -> Iterator[str]:
-    """Yield the formats of dates that loggers and spreadsheets write, beside ISO."""
+    """Yield the formats of dates that loggers and spreadsheets write, except ISO."""
     for mark, hour in product("/-. ", HOURS):
         for order in ORDERS if mark != "." else POINTED:
             yield order.replace("-", mark) + hour
@@ -290,7 +290,7 @@ def guessed_format(text: str) -> str:
 
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
-    """Return whether times are dates: the first tells; if it is neither, those before, or most."""
+    """Return whether times are dates: by the first; if it is neither, by those before, or most."""
 
     def number(cell: Any) -> bool:
         return number_of(cell, clock.decimal) is not None

@@ -424,7 +424,7 @@ def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[s
 
 
 def _not_text(path: Path, separator: str, encoding: str, clock: Clock, skip: int) -> DataError:
-    """Return an error about a file that is no text in this encoding."""
+    """Return an error about a file that is not text in this encoding."""
     content, row, byte = path.read_bytes(), 1, ""
     try:
         content.decode(encoding)

@@ -260,7 +260,7 @@ class Reading:
         return tabulated(times, values, columns, self._clock(time, unit), where="data")
 
     def _file(self, path: Path) -> DataTable:
-        """Return the samples of a file, whose ending tells its format."""
+        """Return the samples of a file; its extension gives the format."""
         where = str(path)
         if path.suffix in JSON_LINES:
             names = _first_keys(path)

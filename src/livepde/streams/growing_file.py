@@ -106,7 +106,7 @@ class _Content:
 
     @classmethod
     def open(cls, path: Path) -> _Content | None:
-        """Open a file, None if there is none; raises `DataError` for what is no file."""
+        """Open a file, None if there is none; raises `DataError` for what is not a file."""
         try:
             # To open a pipe without a writer would hold the program up.
             if not stat.S_ISREG(path.stat().st_mode):
@@ -474,7 +474,7 @@ class GrowingFile:
         return found
 
     def _folder(self) -> list[Path]:
-        """Return the files beside this one, the oldest first."""
+        """Return the other files in the folder of this one, the oldest first."""
         found = []
         with os.scandir(self.path.parent) as entries:
             for entry in islice(entries, SIBLINGS):

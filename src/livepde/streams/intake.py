@@ -578,7 +578,7 @@ class Intake:
         return t - (self.origin or 0.0) * self.clock.second, again
 
     def _moment(self, t: float) -> float | None:
-        """Return the moment that a time belongs to, None if its sample was released."""
+        """Return the moment of a time, None if its sample was released."""
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
@@ -665,7 +665,7 @@ class Intake:
             }
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
-        """Return whether a sample has no value of a channel; noise belongs to a reading."""
+        """Return whether a sample has no value of a channel; noise requires a reading."""
         if self.policy.habit(channel).between == "hold" and self._recent:  # it holds until the next
             return False
         of = self.columns[channel].noise_of

@@ -98,7 +98,7 @@ class Broker:
         return client
 
     def connect(self, client: Client) -> None:
-        """Connect, and go on reconnecting in a thread of its own when the broker goes away."""
+        """Connect; if the connection is lost, reconnect in a separate thread."""
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
@@ -347,7 +347,7 @@ class MqttSource(_Peer, RowSource):
 
     @property
     def done(self) -> bool:
-        """A broker never says that nothing more will come."""
+        """A broker never reports the end of its messages."""
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
@@ -399,7 +399,7 @@ class MqttSource(_Peer, RowSource):
 
 
 class MqttSink(_Peer):
-    """Publishes estimates: one JSON object for each sample, and each number to a topic of its own.
+    """Publishes estimates: one JSON object for each sample, and each number to its own topic.
 
     Never waits for the broker: while it is away the newest estimates are kept and the others
     counted.

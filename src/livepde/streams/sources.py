@@ -322,7 +322,7 @@ class Follow(RowSource):
 
 
 class Lines(RowSource):
-    """JSON lines from standard input, or whatever gives lines; read in a thread of its own."""
+    """JSON lines from standard input, or another iterable of lines; read in its own thread."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._queue: queue.Queue[str | bytes | None] = queue.Queue(BATCH)

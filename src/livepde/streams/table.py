@@ -557,7 +557,7 @@ def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
 def check_columns(
     where: str, needed: Iterable[str], known: list[str], *, told: bool = True
 ) -> None:
-    """Raise `SampleError` if a column is not there; with `told` the error names those there are."""
+    """Raise `SampleError` if a column is missing; with `told` the error names the existing ones."""
     for name in needed:
         if name not in known:
             ending = hint(name, known) if told else "."

@@ -242,7 +242,7 @@ def _past(at: Position) -> Finding:
 
 
 def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
-    """Return window and number of the directions that tell something, the best first, each once.
+    """Return window and number of the directions with evidence, the best first, each once.
 
     Windows of different length are compared by the share of the whole run's evidence.
     """

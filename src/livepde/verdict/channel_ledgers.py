@@ -1,4 +1,4 @@
-"""Running sums over channels beside the filter: inputs in gaps, and sensors that are withheld."""
+"""Running sums over channels outside the filter: inputs in gaps, and validation sensors."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ class WithheldLedger:
         return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
 
     def _unit(self, k: int, name: str) -> Cause | None:
-        """Return the cause that a sensor has another unit, if its values say so."""
+        """Return the cause that a sensor has another unit, if its values indicate that."""
         count, _, _, _, errors, p, pp, pz, _ = self.sums[:, k]
         mean_p, mean_z = p / count, (errors + p) / count
         spread = pp / count - mean_p**2

@@ -167,7 +167,7 @@ class Dictionary:
         self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
-        """Append directions, and note where they stand."""
+        """Append directions, and note their places."""
         start = len(self.directions)
         self.directions += directions
         self.parts[part] = slice(start, len(self.directions))

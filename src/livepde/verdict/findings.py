@@ -118,7 +118,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Finding:
-    """One result of a test that speaks against the estimates.
+    """One result of a test against the estimates.
 
     Attributes
     ----------

@@ -38,7 +38,7 @@ Other = TypeVar("Other")
 
 @dataclass(frozen=True, eq=False)
 class Shifts(Generic[Number]):
-    """Shifts of the unknown numbers by errors that are followed beside the filter.
+    """Shifts of the unknown numbers by errors that are estimated online.
 
     Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
     members.
