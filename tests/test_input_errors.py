@@ -93,11 +93,13 @@ def taken(folder: str) -> None:
 
 
 def messages() -> dict[str, str]:
-    """Return mistake -> message, as the page has them in the first two columns of its tables."""
-    # A message with backticks stands between two of them, as Markdown has it.
-    form = r"^\| ([^|]+?) \| (`+) ?([^|]+?) ?\2 \|"
-    rows = re.findall(form, PAGE.read_text(), flags=re.MULTILINE)
-    return {mistake: message for mistake, _, message in rows}
+    """Return mistake -> message, as the page has them in the first two columns of its tables.
+
+    A message with names in backticks has two of them, and a space, at each end.
+    """
+    row = r"^\| ([^|]+?) \| (?:`` ([^|]+?) ``|`([^|`]+)`) \|"
+    rows = re.findall(row, PAGE.read_text(), flags=re.MULTILINE)
+    return {mistake: named or plain for mistake, named, plain in rows}
 
 
 @pytest.fixture
