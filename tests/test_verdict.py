@@ -528,6 +528,12 @@ def test_a_verdict_of_an_earlier_version_that_tested_nothing_is_not_judged():
     assert Verdict.from_dict(old).level == "trusted"
 
 
+def test_a_run_of_an_earlier_version_names_the_discretisation_once():
+    old = Finding("discretisation", "note", "The discretisation has shifted them.", evidence=3.0)
+    (new,) = discretised(Shifts(3.0, {"mesh": 3.0}))
+    assert Verdict.of([old]).with_findings([new]).findings == (new,)
+
+
 def test_a_finding_of_later_data_takes_the_place_of_an_earlier_one():
     """A page reads the verdict of some samples ago, and the shares that are left now."""
     earlier = Verdict.of([flat("a", 0.92), flat("b", 0.95)], [], [])
