@@ -351,7 +351,7 @@ def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
 def test_watch_needs_a_run(tmp_path):
     result = CliRunner().invoke(cli.app, ["watch", str(tmp_path / "none")])
     assert isinstance(result.exception, lp.errors.RunError)
-    assert "holds no run" in str(result.exception)
+    assert "contains no run" in str(result.exception)
 
 
 @pytest.mark.slow

@@ -180,7 +180,7 @@ def test_a_column_that_is_no_channel_is_ignored_unless_strict():
         (lambda table: table.rename(columns={"T_30": "T30"}), "no column 'T_30'; did you mean"),
         (lambda table: table.assign(T_30="warm"), "column 'T_30' must contain numbers only"),
         (lambda table: table.iloc[::-1], "the time is earlier than the one before"),
-        (lambda table: table.iloc[:0], "holds no samples"),
+        (lambda table: table.iloc[:0], "contains no samples"),
         (lambda table: table[["T_30", "T_30", "T_60", "T_left"]], "two columns are called 'T_30'"),
     ],
 )
@@ -192,7 +192,7 @@ def test_a_table_that_cannot_be_used_is_one_sentence(wrong, message):
 
 
 def test_options_of_a_table_that_do_not_fit():
-    with pytest.raises(lp.errors.ConfigurationError, match="columns: there is not a channel 'T_3'"):
+    with pytest.raises(lp.errors.ConfigurationError, match="columns: there is no channel 'T_3'"):
         identifier().run(measured(), columns={"T_3": "T_30"})
     with pytest.raises(lp.errors.ConfigurationError, match="strict describes a table or a file"):
         identifier().run([], strict=True)
@@ -464,7 +464,7 @@ def test_a_law_without_covariance_has_no_draws():
             of()
     assert np.isnan(result.summary().loc["alpha", "low"])
     empty = whole.run([])
-    with pytest.raises(lp.errors.ConfigurationError, match="holds no samples"):
+    with pytest.raises(lp.errors.ConfigurationError, match="contains no samples"):
         empty.covariance()
     assert len(empty.summary()) == len(empty.to_dataframe()) == 0
 

@@ -297,7 +297,7 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Points([[0.2, 0.3]]), "dimension 2; the mesh has 1"),
         (plane, lambda: lp.Points([[0.2, np.nan]]), "lies outside"),
         (model, lambda: lp.Averages({}), "at least one region"),
-        (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' holds no part"),
+        (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' contains no part"),
         (model, lambda: lp.observation.Matrix(np.eye(5)), "5 columns; the state has 13"),
         (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),

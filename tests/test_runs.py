@@ -251,7 +251,7 @@ def test_checkpoint_continues(tmp_path):
 
 @pytest.mark.slow
 def test_runs_that_cannot_be_opened(tmp_path, driven):
-    with pytest.raises(lp.errors.RunError, match="holds no run"):
+    with pytest.raises(lp.errors.RunError, match="contains no run"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(lp.errors.RunError, match="is damaged"):

@@ -614,7 +614,7 @@ def test_the_page_of_a_run_without_any_measurement():
     identifier = lp.Identifier(model, lp.Points([0.4]), lp.GradientLaw(), u0=1.0)
     found = dg.theory_report(identifier, [(t, [np.nan]) for t in (0.1, 0.2, 0.3)])
     assert found.constants is None
-    assert any("no sample of the run holds a measurement" in note for note in found.notes)
+    assert any("no sample of the run contains a measurement" in note for note in found.notes)
 
 
 @pytest.mark.long

@@ -655,7 +655,7 @@ class Result(Shown):
     def _last(self, what: str) -> Estimate:
         """Return the last estimate."""
         if self.last is None:
-            raise ConfigurationError(f"{what}: the run holds no samples yet.")
+            raise ConfigurationError(f"{what}: the run contains no samples yet.")
         return self.last
 
     def dataset(self) -> xr.Dataset:

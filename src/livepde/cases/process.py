@@ -271,7 +271,7 @@ def _without_cells(case: CaseContent, given: Any, key: str) -> CaseError:
     spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
     limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
     ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
-    text = f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}."
+    text = f"{spans} {unit} contains no cell of the mesh, which spans {ends} {unit}."
     return case.error(key, text)
 
 
@@ -546,5 +546,5 @@ def _place(case: CaseContent, mesh: Any, over: Any, name: str) -> Any:
         return subdomain(case, mesh, over, key)
     place = inside(case, over, len(mesh.p), key)
     if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
-        raise case.error(key, "holds no cell of the mesh.")
+        raise case.error(key, "contains no cell of the mesh.")
     return place

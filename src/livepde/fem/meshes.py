@@ -251,7 +251,7 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
     except Exception as error:
         kinds = sorted(read.cells_dict) or "none"
         raise SpaceError(
-            f"read_mesh: '{path}' holds no mesh that livepde can use; its cells are {kinds}, "
+            f"read_mesh: '{path}' contains no mesh that livepde can use; its cells are {kinds}, "
             "expected lines, triangles, quadrilaterals, tetrahedra or hexahedra."
         ) from error
     total = sum(len(block.data) for block in read.cells if block.dim == mesh.dim())

@@ -252,7 +252,7 @@ class Averages(Observation):
             local = block.local(piece)
             np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))
         if size <= 0:
-            raise ObservationError(f"Averages: region '{name}' holds no part of the mesh.")
+            raise ObservationError(f"Averages: region '{name}' contains no part of the mesh.")
         return row / size
 
 

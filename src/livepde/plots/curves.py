@@ -37,7 +37,7 @@ def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
     """
     available = data["snapshot"].values
     if not len(available):
-        raise ConfigurationError("the dataset holds no snapshots: run with at least one sample.")
+        raise ConfigurationError("the dataset contains no snapshots: run with at least one sample.")
     if isinstance(times, int):
         spread = np.linspace(0, 1, min(times, len(available))) ** 2 * (len(available) - 1)
         return [int(k) for k in np.unique(spread.round())]

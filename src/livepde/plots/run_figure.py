@@ -70,7 +70,7 @@ def overview(data: xr.Dataset, *, title: str = "", times: Sequence[float] | int 
     """
     figure_class()
     if not data.sizes.get("time"):
-        raise ConfigurationError("the run holds no samples yet, so there is nothing to draw.")
+        raise ConfigurationError("the run contains no samples yet, so there is nothing to draw.")
     panels = _panels(data, times)
     columns = 1 if len(panels) == 1 else 2
     rows = math.ceil(len(panels) / columns)
