@@ -1065,7 +1065,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     RunWriter.create(path, command=["x"], title="A run", **options)
     monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     (path / "run.json.0.partial").mkdir()
-    with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; make room"):
+    with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; free disk space"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 

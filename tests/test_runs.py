@@ -268,7 +268,7 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
     run = runs.open(tmp_path)
     assert run.title == tmp_path.name
     assert run.checks == []
-    with pytest.raises(lp.errors.RunError, match="holds no estimates; its status is 'running'"):
+    with pytest.raises(lp.errors.RunError, match="contains no estimates; its status is 'running'"):
         _ = run.dataset
     (tmp_path / "estimates.nc").write_text("not netCDF")
     with pytest.raises(lp.errors.RunError, match="is damaged"):

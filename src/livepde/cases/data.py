@@ -64,7 +64,7 @@ __all__ = [
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
 UNSET = (
-    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
+    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that contains "
     "the measurements."
 )
 PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
