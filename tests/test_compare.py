@@ -173,7 +173,7 @@ def test_an_unknown_that_depends_on_the_variant_is_named():
     notes = " ".join(conclusions(base, [other]))
     assert "k depends on the variant: its interval in 'other' does not overlap" in notes
     assert "c depends" not in notes
-    assert "speak against 'other'" in notes
+    assert "contradict 'other'" in notes
     assert "All variants agree" in " ".join(
         conclusions(base, [replace(other, estimates={"c": near})])
     )
