@@ -72,7 +72,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
     t = float(when.removeprefix("t = ").removesuffix(" s"))
     assert JUMP < t <= JUMP + 30 * 20.0
     (sentence,) = [note for note in said["notes"] if note.startswith("Jump at")]
-    assert "since then alpha from" in sentence
+    assert "Since then alpha has changed from" in sentence
     opened = runs.open(tmp_path / "run")
     assert [table.title for table in opened.summary()].count("Jumps") == 1
     lines = [
@@ -134,7 +134,7 @@ def test_what_has_moved_between_two_alarms():
     assert second.moved == {}
     told = said(dataset([4, 7]))
     assert told[0].startswith("Jump at t = 5 s: ")
-    assert "no number has changed for good" in told[1]
+    assert "No number changed permanently" in told[1]
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_many_jumps_are_counted_and_dates_are_dates():
     data.attrs["origin"] = "2025-04-01 12:00:00"
     told = said(data)
     assert told[0].startswith("Jump at 2025-04-01 12:00:03: ")
-    assert told[-1].startswith("2 more jumps")
+    assert told[-1].startswith("2 more jumps were detected")
 
 
 def test_what_settles_is_not_looked_at():
@@ -214,19 +214,22 @@ def test_shares_over_time_end_where_identifiability_says():
 def test_the_table_says_pinned_flat_traded_off_and_at_a_bound():
     def states(unknowns: dict[str, Any], rate: Any) -> dict[str, str]:
         data, _ = learned(unknowns, rate)
-        (table,) = [t for t in tables(data) if t.title == "What the data have told"]
+        (table,) = [t for t in tables(data) if t.title == "Identifiability"]
         return {row[0]: row[2] for row in table.rows}
 
     two = {"a": lp.Normal(0.0, 1.0), "b": lp.Normal(0.0, 1.0)}
-    assert states(two, lambda q: q.a) == {"a": "pinned", "b": "flat"}
+    assert states(two, lambda q: q.a) == {"a": "well determined", "b": "not identifiable"}
     traded = states(two, lambda q: q.a - q.b)
-    assert traded == {"a": "partly, traded off with b", "b": "partly, traded off with a"}
+    assert traded == {
+        "a": "partly determined, correlated with b",
+        "b": "partly determined, correlated with a",
+    }
     bound = {"a": lp.Normal(0.5, 1.0, bounds=(0.2, 2.0))}
     assert states(bound, lambda q: q.a) == {"a": "at its bound"}
     walk = {"a": lp.Scalar(lp.Normal(0.0, 1.0), evolution=lp.RandomWalk(5.0))}
-    assert states(walk, lambda q: 0.0 * q.a) == {"a": "moves"}
+    assert states(walk, lambda q: 0.0 * q.a) == {"a": "changes with time"}
     field = {"f": lp.Field(MESH, ElementLineP1(), inner="H1")}
-    assert states(field, lambda q: q.f)["f"].endswith("of 8 modes told")
+    assert states(field, lambda q: q.f)["f"].endswith("of 8 modes determined")
 
 
 def test_a_law_without_covariance_says_nothing_of_it():
@@ -238,7 +241,7 @@ def test_a_law_without_covariance_says_nothing_of_it():
     identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(), u0=1.0)
     data = identifier.run([(0.1, np.ones(5)), (0.2, np.ones(5))]).to_xarray()
     assert np.isnan(data["a_left"].values).all()
-    assert "What the data have told" not in [table.title for table in tables(data)]
+    assert "Identifiability" not in [table.title for table in tables(data)]
 
 
 @pytest.mark.study

@@ -119,5 +119,5 @@ def test_both_unknowns_are_identified_from_the_potential(refit: Any, of: str):
 
 def test_the_gradient_law_needs_a_mass_everywhere():
     potential = lp.Points([0.2, 0.6], of="phi")
-    with pytest.raises(lp.errors.LawError, match="no mass term, so that M is no inner product"):
+    with pytest.raises(lp.errors.LawError, match="no mass term, so M is not an inner product"):
         lp.Identifier(electrolyte(), potential, lp.GradientLaw())

@@ -59,5 +59,5 @@ def test_an_offset_needs_an_equation_with_fluxes_and_a_boundary_of_its_own(tmp_p
         cases.load(path, settings=own)
     with pytest.raises(CaseError, match="has a condition already"):
         cases.load(path, settings={**offset, "boundary.left.flux": 1.0})
-    with pytest.raises(CaseError, match="belongs to sensors"):
+    with pytest.raises(CaseError, match="requires role = 'sensor'"):
         cases.load(path, settings={"channels.T_left.gain": 0.1})

@@ -142,7 +142,7 @@ def test_sensors_that_one_cell_does_not_tell_apart_are_named(rod):
 def test_template_is_not_written_over(tmp_path):
     write_template(tmp_path)
     (tmp_path / "case.toml").unlink()
-    with pytest.raises(lp.errors.RunError, match="nothing was written"):
+    with pytest.raises(lp.errors.RunError, match="Nothing was written"):
         write_template(tmp_path)
     assert not (tmp_path / "case.toml").exists()
     (tmp_path / "file").write_text("")
@@ -205,7 +205,7 @@ def test_layers_with_priors_of_their_own(rod):
         ("{ prior = 1 }", "the key '{}.over' is missing"),
         ("{ over = [0, 1], priro = 1 }", "no key '{}.priro'; did you mean 'prior'"),
         ('{ over = [0, 1], prior = "1 m" }', "{}.prior: 'm' cannot be converted"),
-        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 lies outside"),
+        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 is outside"),
         ("3", "{}: got 3"),
     ],
 )  # fmt: skip
@@ -222,7 +222,7 @@ def test_nodes_move_to_the_ends_of_layers_and_sources(rod, spacing):
     more = [("from = 0", "from = 0.001"), ("a = [0,", "a = [0.001,")]
     path = rod(LAYERS, ("cells = 40 ", cells), ("[channels]", heated), *more)
     case = cases.load(path)
-    assert not any("inside of a cell" in note for note in case.notes)
+    assert not any("inside a cell" in note for note in case.notes)
     nodes = case.mesh.p[0]
     assert len(nodes) == 40
     for edge in (0.05, 0.2, 0.333):
@@ -234,9 +234,9 @@ def test_nodes_move_to_the_ends_of_layers_and_sources(rod, spacing):
 def test_layers_that_end_inside_of_a_cell_get_one_note(rod):
     mesh = 'from = 0\nto = "40 cm"\ncells = 40'
     path = rod(LAYERS, (mesh, "nodes = [0, 0.1, 0.19, 0.3, 0.4]\n#"))
-    notes = [note for note in cases.load(path).notes if "inside of a cell" in note]
+    notes = [note for note in cases.load(path).notes if "inside a cell" in note]
     assert notes == [
-        "Layer 'a' of alpha, layer 'b' of alpha end inside of a cell: add the ends to mesh.nodes."
+        "Layer 'a' of alpha, layer 'b' of alpha end inside a cell. Add the ends to `mesh.nodes`."
     ]
 
 
@@ -495,7 +495,7 @@ def test_code_where_the_user_is_and_not_the_case(rod, monkeypatch):
     monkeypatch.chdir(path.parents[1])
     Path("mine.py").write_text("")
     with pytest.raises(
-        lp.errors.CaseError, match=r"beside the case; did you mean '\.\./mine\.py'\?"
+        lp.errors.CaseError, match=r"next to the case; did you mean '\.\./mine\.py'\?"
     ):
         cases.load(path, allow_code=True)
 
@@ -504,7 +504,7 @@ def test_a_unit_where_a_function_has_none(rod):
     path = rod(('equation = "heat"  ', 'equation = "mine.py:rod"  '))
     path.with_name("mine.py").write_text("def rod(mesh, unknowns, dirichlet):\n    pass\n")
     with pytest.raises(
-        lp.errors.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* say unknowns\.alpha\.unit"
+        lp.errors.CaseError, match=r"prior: got '5e-5 m\^2/s'; .* add `unknowns\.alpha\.unit`"
     ):
         cases.load(path, allow_code=True)
 
@@ -523,16 +523,16 @@ REFUSED = [
     ('to = "40 cm"', "to = -1", "needs from < to"),
     ('to = "40 cm"', "to = [1]", "mesh.to: got [1]"),
     ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m/s"', "unknowns.alpha.prior"),
-    ("bounds = [", 'transform = "log"\nbounds = [', "alpha: transform='log' knows no upper bound"),
+    ("bounds = [", 'transform = "log"\nbounds = [', "alpha: transform='log' has no upper bound"),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "logit"', "needs two finite bounds"),
     (
         'prior = "5e-5 m^2/s"',
         'prior = 1e-6\ntransform = "logit"',
-        "alpha: prior 1e-06 is not inside of what transform='logit' allows",
+        "alpha: prior 1e-06 is outside the range of transform='logit'",
     ),
     ('prior = "5e-5 m^2/s"', "prior = true", "unknowns.alpha.prior: got True"),
     ('prior = "5e-5 m^2/s"', "", "the key 'unknowns.alpha.prior' is missing"),
-    ('prior = "5e-5 m^2/s"', "prior = 1.0", "prior 1 lies outside of the bounds [1e-06, 0.001]"),
+    ('prior = "5e-5 m^2/s"', "prior = 1.0", "prior 1 is outside the bounds [1e-06, 0.001]"),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', "bounds = [2, 1]", "got [2, 1] m^2/s; needs the low"),
     ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m2/s"', "'m2' is not a unit that is known; write pow"),
     ('to = "40 cm"', 'to = "0,4 m"', "mesh.to: got '0,4 m'; decimals need a point."),
@@ -556,11 +556,11 @@ REFUSED = [
     (DRIFT, "jumps = { unknowns = { a = 1 } }", "got {'a': 1}; expected a list."),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', "bounds = [3]", "bounds: got [3]; expected more ent"),
     ('std = "3e-5 m^2/s"', "std = 0.0", "unknowns.alpha.std: got 0.0; expected more than 0"),
-    ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field takes no regions"),
-    ('bounds = ["1e-6', 'length = 1\nbounds = ["1e-6', "length belongs to a field"),
+    ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field has no regions"),
+    ('bounds = ["1e-6', 'length = 1\nbounds = ["1e-6', "length requires field = true"),
     ("bounds = [", "regions = { a = [0, 0.3] }\nbounds = [", "lies in 0 layers"),
     ("bounds = [", "regions = { a = [0, 0.3], b = [0.2, 0.4] }\nbounds = [", "lies in 2 layers"),
-    ("bounds = [", "regions = { a = [3, 4] }\nbounds = [", "holds no cell"),
+    ("bounds = [", "regions = { a = [3, 4] }\nbounds = [", "contains no cell"),
     ("bounds = [", "regions = { a = [4, 3] }\nbounds = [", "needs the lower one first"),
     ("[unknowns.alpha]", "[unknowns.alhpa]", "did you mean 'alpha'?"),
     ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
@@ -577,7 +577,7 @@ REFUSED = [
     ('role = "withheld"', 'role = "witheld"', "did you mean 'withheld'?"),
     ('column = "T_20"', 'colunm = "T_20"', "did you mean 'column'?"),
     ('column = "T_20"', 'column = "T_20", columns = ["T_10"]', "expected column = name"),
-    ('at = "20 cm"', 'at = "20 m"', "20 m lies outside of the mesh"),
+    ('at = "20 cm"', 'at = "20 m"', "20 m lies outside the mesh"),
     ('at = "20 cm"', "at = [0.1, 0.1]", "got 2 coordinates; needs 1"),
     ('at = "20 cm"', 'quantity = "fluid"', "has no quantity 'fluid'"),
     (', at = "20 cm"', "", "expected one of: at = position"),
@@ -594,11 +594,11 @@ REFUSED = [
     ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
     ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
     ('at = "10 cm"', 'over = "lft"', "the mesh has no part 'lft'; did you mean 'left'?"),
-    ('at = "20 cm"', 'at = 0.2, offset = 1', "offset belongs to sensors that are assimilated"),
-    ('at = "left"', 'at = "left", of = "u"', "of belongs to sensors"),
+    ('at = "20 cm"', 'at = 0.2, offset = 1', "offset requires role = 'sensor'"),
+    ('at = "left"', 'at = "left", of = "u"', "of requires a sensor"),
     ('at = "20 cm"', "each = [0, 0.4, 5]", "each needs column = a name with {}"),
     ('noise = "0.05 K" }', 'noise = "0.05 K", correlated = { tim = 3 } }', "did you mean 'time'?"),
-    ('role = "sensor"', 'role = "withheld"', "no sensor to learn from"),
+    ('role = "sensor"', 'role = "withheld"', "there is no sensor. Add"),
     ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
     ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
     ('rmse = "<= 0.15"', 'rmse = "<= 1-2"', "expect.rmse"),
@@ -738,8 +738,8 @@ def test_nodes(rod):
         ("nodes = [0, 0.4, 0.3]", "mesh.nodes: line: needs at least two increasing nodes"),
         ("nodes = [0]", "mesh.nodes"),
         ("nodes = [0, 0.4]\ncells = 3", "mesh: expected from and to"),
-        ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing belongs to an interval with cells"),
-        ('nodes = [0, 0.4]\nunit = "mm"', "unit belongs to a file"),
+        ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing requires an interval with cells"),
+        ('nodes = [0, 0.4]\nunit = "mm"', "unit requires file"),
         ("from = 0\nto = 1", "mesh: expected from and to"),
         (
             "x = [0, 1, 2]\ny = [0, 1]\ncells = [2, 2]",
@@ -773,7 +773,7 @@ channels.a = { role = "sensor", column = "a", at = [0.5, 0.5] }
         ("{ a = [0, 1, 0, 1] }", "lies in 0 regions"),
         ("{ a = [0, 1, 0, 1], b = [0, 2, 0, 1] }", "lies in 2 regions"),
         ("{ a = [0, 1] }", "expected [x0, x1, y0, y1]"),
-        ("{ a = [5, 6, 0, 1] }", "holds no cell of the mesh, which spans 0 to 2 x 0 to 1"),
+        ("{ a = [5, 6, 0, 1] }", "contains no cell of the mesh, which spans 0 to 2 x 0 to 1"),
         ('{ a = "steel" }', "no subdomain 'steel'; it has none: name them in its file"),
     ],
 )
@@ -1033,12 +1033,12 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
         ("return ", "return 3 #", "returned int; expected times and a mapping"),
         ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
         ("rod.csv", "none.csv", "there is no file"),
-        ('frame["time_s"]', "[]", "holds no samples"),
+        ('frame["time_s"]', "[]", "contains no samples"),
         ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is earlier"),
         ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (91,); there are 90 times"),
         ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
         ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
-        ("frame[key] + noise * rng", "['a'] * 91 or rng", "does not hold numbers only"),
+        ("frame[key] + noise * rng", "['a'] * 91 or rng", "must contain numbers only"),
     ],
 )
 def test_readers_that_fail(rod, monkeypatch, old, new, named):
@@ -1057,7 +1057,7 @@ def test_readers_that_fail(rod, monkeypatch, old, new, named):
     ("old", "new", "named"),
     [
         ('time = "time_s"', "", "time is missing"),
-        ("time_unit", "options = { a = 1 }\ntime_unit", "options belong to a reader"),
+        ("time_unit", "options = { a = 1 }\ntime_unit", "options require a reader"),
         ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
         ("time_unit", 'separator = "::"\ntime_unit', "data.separator"),
     ],
@@ -1071,7 +1071,7 @@ def test_semicolons(rod):
     path = rod()
     data = path.with_name("rod.csv")
     data.write_text(data.read_text().replace(",", ";"))
-    with pytest.raises(lp.errors.DataError, match="say separator = ';'"):
+    with pytest.raises(lp.errors.DataError, match="set separator = ';'"):
         cases.load(path).prepare()
     prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
     assert len(prepared.stream) == 91
@@ -1155,12 +1155,12 @@ def test_keys_are_taken_away(rod):
 @pytest.mark.parametrize(
     ("key", "value", "named"),
     [
-        ("law.kidn", None, "there is no key 'law.kidn' to take away; did you mean 'kind'?"),
+        ("law.kidn", None, "there is no key 'law.kidn' to remove; did you mean 'kind'?"),
         ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
         ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
         ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
-        ("law..noise", 1, "'law..noise' is no key"),
+        ("law..noise", 1, "'law..noise' is not a key"),
         ("law.noise", "2 m", "law.noise: 'm' cannot be converted"),
     ],
 )

@@ -134,7 +134,7 @@ def test_init_check_run_report(here):
     assert "181 samples" in output
     assert "model: ok" in output
     assert "observation: ok" in output
-    assert "hardly identified" not in output
+    assert "not identifiable" not in output
     assert {p.name for p in here.iterdir()} == {"mine"}  # nothing is written
 
     code, output = call("run", "mine/case.toml")
@@ -190,9 +190,9 @@ def test_a_failed_check_is_exit_code_1_with_json(rod):
 def test_nothing_is_written_over(rod, here):
     call("run", rod, "--out", "out")
     before = {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()}
-    assert "already holds a run" in bad("run", rod, "--out", "out")
+    assert "already contains a run" in bad("run", rod, "--out", "out")
     assert {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()} == before
-    assert "is there already" in bad("init", "rod")
+    assert "exists. Choose another folder" in bad("init", "rod")
 
 
 def test_a_case_that_is_refused_leaves_nothing(rod, here):
@@ -220,7 +220,7 @@ def test_check_tells_what_can_hardly_be_identified(rod):
     path.write_text(text)
     code, output = call("check", rod)
     assert code == 0
-    assert "hardly identified" in output
+    assert "not identifiable" in output
 
 
 @pytest.mark.slow
@@ -305,7 +305,7 @@ def test_resume_goes_on_where_a_run_was_killed(rod, here):
     assert call("run", rod, "--out", "cut", "--resume")[0] == 0
     xr.testing.assert_identical(runs.open("cut").dataset, whole)
     assert len(runs.open("cut").record["resumed"]) == 1
-    assert "--resume needs --out" in bad("run", rod, "--resume")
+    assert "--resume requires --out" in bad("run", rod, "--resume")
     assert "another case or other settings" in bad(
         "run", rod, "--out", "cut", "--resume", "--set", "law.noise=1 K"
     )

@@ -106,7 +106,7 @@ def test_goes_on_with_what_is_there(here):
     Path("rods.csv").write_text("name,data\nplain,\n")
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv", "--out", "rods", "--json"]
     _, first = call(*arguments)
-    with pytest.raises(RunError, match="already holds a run"):
+    with pytest.raises(RunError, match="already contains a run"):
         call(*arguments)
     Path("rods.csv").write_text("name,data\nplain,\nwarm,rod/warm.csv\n")
     _, second = call(*arguments, "--resume")
@@ -132,8 +132,8 @@ def test_in_several_processes(here):
         ("name\n", "no rows"),
         ("name,data\na,rod/warm.csv,\n", "more cells than its header"),
         ("name\na\na\n", "'a' is taken"),
-        ("name\n../a\n", "does not do for a folder"),
-        ("name,data\n,rod.csv\n", "does not do for a folder"),
+        ("name\n../a\n", "is not valid as a folder name"),
+        ("name,data\n,rod.csv\n", "is not valid as a folder name"),
         ("", "Cannot read the members"),
     ],
 )
@@ -146,7 +146,7 @@ def test_bad_tables(here, table, match):
 
 def test_bad_options(here):
     arguments = ["fleet", "rod/case.toml", "--members", "rods.csv"]
-    with pytest.raises(ConfigurationError, match="--resume needs --out"):
+    with pytest.raises(ConfigurationError, match="--resume requires --out"):
         call(*arguments, "--resume")
     with pytest.raises(ConfigurationError, match="--jobs 0"):
         call(*arguments, "--jobs", "0")
@@ -250,7 +250,7 @@ def test_members_that_are_alike_step_together(alike):
     assert code == 1  # the case expects more than so few samples can tell
     assert json.loads(output)["notes"][0] == "Of 3 members 3 were stepped together."
     _, output = call(*FIRST, "apart", "--separately", "--json")
-    assert "3 separately: as --separately says (3)" in json.loads(output)["notes"][0]
+    assert "3 separately: --separately (3)" in json.loads(output)["notes"][0]
     for name in "abc":
         equal(Path("rods") / name, Path("apart") / name)
     left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
@@ -308,7 +308,7 @@ def test_a_killed_worker_is_replaced_and_told():
     output, errors = process.communicate(timeout=PATIENCE)
     assert "Traceback" not in errors
     (told,) = (note for note in json.loads(output)["notes"] if "worker process died" in note)
-    assert told.endswith("members open: they went on from their run directories.")
+    assert told.endswith("members unfinished. They were resumed from their run directories.")
     assert pd.read_csv("two/fleet.csv")["status"].tolist() == ["finished"] * 4
     for name in "abcd":
         mine, wanted = (runs.open(Path(folder) / name) for folder in ("two", "one"))
@@ -458,7 +458,7 @@ def test_what_waits_is_written_from_time_to_time(alike, monkeypatch):
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("waiting", "how"),
-    [(500, "3 separately: they had begun before (3)."), (10**9, "3 were stepped together.")],
+    [(500, "3 separately: resumed runs (3)."), (10**9, "3 were stepped together.")],
 )
 def test_goes_on_after_a_kill(alike, monkeypatch, waiting, how):
     """Separately from what was written, or together where nothing was."""

@@ -27,6 +27,7 @@ from livepde.cases.variants import (
 )
 from livepde.errors import CaseError
 from livepde.verdict import Cause, Finding, Verdict
+from livepde.verdict.sentences import estimating
 
 OFFSET = 0.5  # K
 FREED = "offset: channels.T_10.offset='1 K'"
@@ -172,7 +173,7 @@ def test_an_unknown_that_depends_on_the_variant_is_named():
     notes = " ".join(conclusions(base, [other]))
     assert "k depends on the variant: its interval in 'other' does not overlap" in notes
     assert "c depends" not in notes
-    assert "speak against 'other'" in notes
+    assert "contradict 'other'" in notes
     assert "All variants agree" in " ".join(
         conclusions(base, [replace(other, estimates={"c": near})])
     )
@@ -282,6 +283,18 @@ def test_an_offset_takes_the_prior_that_other_sensors_state(tmp_path):
     verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
     (found,) = with_settings(prepared, verdict).findings[0].causes
     assert found.setting == 'channels.T_30.offset="0.3 K"'
+    line = 'add `offset = "0.3 K"` to `[channels.T_30]`'
+    assert found.remedy == f"To test this, estimate an offset: {line}."
+
+
+def test_an_offset_that_is_estimated_already_is_not_recommended(tmp_path):
+    stated = {"channels.T_10.offset": "0.3 K"}
+    prepared = cases.load(short_rod(tmp_path), settings=stated).prepare()
+    remedy, setting = estimating("offset", "T_10", '"1 K"'), "channels.T_10.offset=1"
+    cause = Cause("offset", "T_10", "", remedy=remedy, setting=setting, size=0.5)
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    (found,) = with_settings(prepared, verdict).findings[0].causes
+    assert (found.setting, found.remedy) == ("", "Check the offset and the position of T_10.")
 
 
 @pytest.mark.long

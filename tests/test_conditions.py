@@ -187,7 +187,7 @@ def test_conditions_of_a_case_are_numbers_and_channels_too(tmp_path: Path) -> No
         ('"J" }', '"k" }', "'k' is the conductivity"),
         ('"J" }', '"5 K" }', "boundary.left.flux"),
         ("left =", "lft =", "no boundary 'lft'"),
-        ('{ flux = "J" }', '{ transfer = "J" }', "transfer and ambient belong together"),
+        ('{ flux = "J" }', '{ transfer = "J" }', "transfer and ambient require each other"),
         ('{ flux = "J" }', '{ value = 1, flux = "J" }', "expected a value, or flux"),
         ("left =", "right =", "'right' has a value"),
         ('"conduction"', '"burgers"', "takes no fluxes"),
@@ -211,7 +211,7 @@ def test_sensors_from_a_table_of_positions(tmp_path: Path) -> None:
     }
     assert places["T2"].column == "T2"
     for text, found in (
-        ("name,x\nT1,0.005\nT1,0.05\n", "row 3: the name 'T1' stands there twice"),
+        ("name,x\nT1,0.005\nT1,0.05\n", "row 3: the name 'T1' occurs twice"),
         ("sensor,x\nT1,0.005\n", "expected name, x"),
         ("name,x\nT1,far\n", "row 2"),
         ("name,x\n,0.005\n", "row 2: the name is missing"),

@@ -339,11 +339,11 @@ def test_a_finished_run_without_a_journal(tmp_path):
     said = str(cards.verdict(seen))
     assert "Expected rmse <= 0.1, but it is 0.5." in said
     assert "The case says so." in said
-    assert "Not judged: whether the model holds was not tested" in said
+    assert "Not judged: the model was not tested" in said
     alone = replace(seen, checks=[], doubts=[text for text in seen.doubts if "Not judged" in text])
     level, text = cards.gravest(alone)
     assert (level, text.partition(": ")[0]) == ("warn", "Not judged")
-    assert "Nothing looks wrong" not in str(cards.verdict(alone))
+    assert "No problems detected" not in str(cards.verdict(alone))
 
 
 def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
@@ -364,7 +364,7 @@ def test_a_damaged_run_is_a_sentence(tmp_path, monkeypatch):
 def test_watch_needs_a_run(tmp_path):
     result = CliRunner().invoke(cli.app, ["watch", str(tmp_path / "none")])
     assert isinstance(result.exception, lp.errors.RunError)
-    assert "holds no run" in str(result.exception)
+    assert "contains no run" in str(result.exception)
 
 
 @pytest.mark.slow
@@ -462,10 +462,12 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
             time.sleep(0.1)
         with served(folder) as url, chromium() as page:
             page.get(url)
-            wait(page, lambda p: "95 % sure" in text(p, ".card"))
+            wait(page, lambda p: "95 % interval" in text(p, ".card"))
             assert text(page, "h1") == "A rod"
             assert "running" in text(page, "#chip")
-            assert "Estimates alpha, loss from 1 sensor; 1 more is withheld" in text(page, "main")
+            assert "Estimates alpha, loss from 1 sensor, validated with 1 more" in text(
+                page, "main"
+            )
             assert "m²/s" in text(page, ".card")
 
             seen, drawn = count(page), wait(page, lambda p: profile(p, "State u"))
@@ -482,18 +484,18 @@ def test_the_page_follows_a_run_and_looks_back(tmp_path):
                 there = np.allclose(profile(p, "State u") or np.inf, past)
                 return there and text(p, ".card .value").startswith(number)
 
-            wait(page, lambda p: text(p, "#shown") == "looking back: 2025-04-01 00:00:00")
+            wait(page, lambda p: text(p, "#shown") == "history: 2025-04-01 00:00:00")
             wait(page, back)
             seen = count(page)
             wait(page, lambda p: count(p) > seen + 5)  # the run goes on, the page stays there
-            wait(page, lambda p: "looking back" in text(p, "#shown") and back(p))
+            wait(page, lambda p: "history" in text(p, "#shown") and back(p))
 
             page.find_element(By.ID, "newest").click()
             wait(page, lambda p: text(p, "#shown").startswith("newest"))
             wait(page, lambda p: not back(p))
 
             child.send_signal(signal.SIGKILL)
-            wait(page, lambda p: "stopped without an end" in text(p, "#chip"))
+            wait(page, lambda p: "stopped unexpectedly" in text(p, "#chip"))
             wait(page, lambda p: "--resume" in text(p, "#verdict"))
     finally:
         child.kill()
@@ -511,7 +513,7 @@ def test_text_from_files_is_shown_as_text(tmp_path):
     rewrite_layout(tmp_path / JOURNAL, sensors=[HOSTILE])
     with served(tmp_path) as url, chromium(390) as page:
         page.get(url)
-        wait(page, lambda p: "95 % sure" in text(p, ".card"))
+        wait(page, lambda p: "95 % interval" in text(p, ".card"))
         wait(page, lambda p: HOSTILE in text(p, "#tables-events td"))
         assert text(page, "h1") == HOSTILE
         wait(page, lambda p: HOSTILE in text(p, "#tables-sensors td"))

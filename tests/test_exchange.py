@@ -404,7 +404,7 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
     assert [found[f"q[{k}]_std"] for k in range(1, 8)] == estimate.q_std.tolist()
     large = of_code("own:build", lambda: build(1200))
     assert [item.name for item in large.outputs()] == ["estimate_time", "a_model", "b_model"]
-    assert large.notes == ["The field q is no output: it has 1201 vertices, more than 1000."]
+    assert large.notes == ["The field q is not an output: it has 1201 vertices, more than 1000."]
 
 
 @pytest.mark.long
@@ -533,7 +533,7 @@ def test_bad_input_is_one_sentence(rod, tmp_path, monkeypatch):
     Path("there.fmu").write_text("")
     for source, options, error, words in [
         (rod, {"target": "a.zip"}, lp.errors.ConfigurationError, "ends with .fmu"),
-        (rod, {"target": "there.fmu"}, lp.errors.RunError, "exists: name another file"),
+        (rod, {"target": "there.fmu"}, lp.errors.RunError, "exists. Choose another file"),
         (
             rod,
             {"target": "a.fmu", "fmi": 1},
@@ -664,7 +664,7 @@ def test_the_command_writes_compares_and_tells(rod, tmp_path, monkeypatch):
     assert "Written: own.fmu (2 inputs, 5 outputs)" in done.stdout
     done = run.invoke(app, ["fmu", "own.py:build", "--set", "law.noise=1"])
     assert isinstance(done.exception, lp.errors.ConfigurationError)
-    assert "--set belongs to a case" in str(done.exception)
+    assert "--set requires a case file" in str(done.exception)
 
 
 def test_units_of_the_si():

@@ -509,8 +509,8 @@ def test_a_copied_case_that_is_no_text_is_shown_as_far_as_it_is(tmp_path):
 @pytest.mark.parametrize(
     ("value", "doubts", "said"),
     [
-        (0.05, [], "Nothing speaks against the estimates"),
-        (0.05, ["The model does not explain the data."], "The model does not explain the data"),
+        (0.05, [], "No problems detected"),
+        (0.05, ["Model misfit."], "Model misfit"),
         (0.5, [], "Expected error <= 0.1, but it is 0.5"),
     ],
 )
@@ -524,7 +524,7 @@ def test_a_report_says_first_whether_anything_is_wrong(tmp_path, monkeypatch, va
     page = Page(tmp_path / "run.html")
     assert page.text.index(said) < page.text.index("a note") < page.text.index("Estimates")
     assert ("FAILED" in page.text) == (value > 0.1)
-    assert ("Nothing speaks against" in page.text) == (value <= 0.1 and not doubts)
+    assert ("No problems detected" in page.text) == (value <= 0.1 and not doubts)
 
 
 @pytest.mark.slow
@@ -650,7 +650,7 @@ def test_nothing_is_written_over_unasked(rod, tmp_path, name):
     target = tmp_path / name
     export(rod, target)
     other = made(tmp_path / "other", count=3)
-    with pytest.raises(RunError, match=f"{name} exists: name another file, or add --force"):
+    with pytest.raises(RunError, match=f"{name} exists. Choose another file, or add --force"):
         call("export", other.path, tmp_path / "new.csv", target)
     assert not (tmp_path / "new.csv").exists()
     assert call("export", other.path, target, "--force")[0] == 0
@@ -684,7 +684,7 @@ def test_a_folder_that_is_no_store_stays(rod, tmp_path):
     [
         (["a.xlsx"], r"there is no format '\.xlsx'; expected one of \.nc, "),
         (["nowhere/a.nc"], "cannot be written: No such file or directory"),
-        (["a.nc", "--at", "60"], r"holds all times; a time is chosen for \.vtu and \.vtk"),
+        (["a.nc", "--at", "60"], r"contains all times; a time is only chosen for \.vtu and \.vtk"),
         (["a.vtu", "--at", "noon"], "--at: got 'noon'"),
         (["a.vtu", "--at", "3 m"], "--at: 'm' cannot be converted to 's'"),
     ],

@@ -32,7 +32,7 @@ from livepde.stepping import Advance, simulate
 from livepde.verdict import Cause, Verdict
 
 SOURCE = Path(lp.__file__).parent
-ISSUE = ("Finding", "_said")  # calls with the kind of a finding as their first argument
+ISSUE = ("Finding", "_each")  # calls with the kind of a finding as their first argument
 
 
 def issued() -> set[str]:

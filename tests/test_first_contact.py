@@ -32,7 +32,7 @@ def identifier(**options) -> lp.Identifier:
 
 @cache
 def measured() -> pd.DataFrame:
-    """Return what a logger has written: seconds, and a column that is no channel."""
+    """Return what a logger has written: seconds, and a column that is not a channel."""
     t = 0.125 * np.arange(24)  # exact in dates, too
 
     def ends(when: float) -> dict[str, float]:
@@ -169,7 +169,7 @@ def test_units_of_columns():
 
 
 def test_a_column_that_is_no_channel_is_ignored_unless_strict():
-    with pytest.raises(lp.errors.SampleError, match="column 'battery_V' is no channel"):
+    with pytest.raises(lp.errors.SampleError, match="column 'battery_V' is not a channel"):
         identifier().run(measured(), strict=True)
     assert same(identifier().run(measured().drop(columns="battery_V"), strict=True))
 
@@ -178,9 +178,9 @@ def test_a_column_that_is_no_channel_is_ignored_unless_strict():
     ("wrong", "message"),
     [
         (lambda table: table.rename(columns={"T_30": "T30"}), "no column 'T_30'; did you mean"),
-        (lambda table: table.assign(T_30="warm"), "column 'T_30' does not hold numbers only"),
+        (lambda table: table.assign(T_30="warm"), "column 'T_30' must contain numbers only"),
         (lambda table: table.iloc[::-1], "the time is earlier than the one before"),
-        (lambda table: table.iloc[:0], "holds no samples"),
+        (lambda table: table.iloc[:0], "contains no samples"),
         (lambda table: table[["T_30", "T_30", "T_60", "T_left"]], "two columns are called 'T_30'"),
     ],
 )
@@ -257,7 +257,7 @@ def test_files(tmp_path):
     assert same(identifier().run(str(tmp_path / "rows.jsonl")), 1e-6)
     with pytest.raises(lp.errors.DataError, match=r"no file .*number.csv'; did you mean"):
         identifier().run(tmp_path / "number.csv")
-    with pytest.raises(lp.errors.SampleError, match="'battery_V' is no channel"):
+    with pytest.raises(lp.errors.SampleError, match="'battery_V' is not a channel"):
         identifier().run(tmp_path / "rows.jsonl", strict=True)
 
 
@@ -513,7 +513,7 @@ def test_a_law_without_covariance_has_no_draws():
             of()
     assert np.isnan(result.summary().loc["alpha", "low"])
     empty = whole.run([])
-    with pytest.raises(lp.errors.ConfigurationError, match="holds no samples"):
+    with pytest.raises(lp.errors.ConfigurationError, match="contains no samples"):
         empty.covariance()
     assert len(empty.summary()) == len(empty.to_dataframe()) == 0
 

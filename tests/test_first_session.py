@@ -144,7 +144,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert sum(old != new for old, new in zip(before, after, strict=True)) == len(EDITS) == 3
     told = shell.ok("livepde", "check", "mine/case.toml")
     assert "Data: 121 samples from 2026-03-02 07:00:00" in told
-    assert "hardly" not in told
+    assert "not identifiable" not in told
     assert "ok  livepde run mine/case.toml" in told
 
     # The run finds his rod, and says where its results are and how to look at them.
@@ -152,7 +152,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert re.search(r"alpha +6\.\d+e-05", told)
     assert "Note:" not in told
     assert "failed" not in told
-    assert "Look at it: livepde watch runs/mine" in told
+    assert "To view it: livepde watch runs/mine" in told
     assert (home / "runs" / "mine" / "run.json").is_file()
 
     # The page shows it in the browser, until Ctrl-C.
@@ -180,7 +180,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     assert "runs/mine-2" in shell.ok("livepde", "run", "mine/case.toml")
     refused = shell("livepde", "run", "mine/case.toml", "--out", "runs/mine")
     assert refused.returncode == 2
-    assert "runs/mine already holds a run" in refused.stderr
+    assert "runs/mine already contains a run" in refused.stderr
 
     # For the same table he might have begun with a case of its own, and found the same.
     assert "replace each '?'" in shell.ok("livepde", "init", "own", "--data", "mine/rod.csv")

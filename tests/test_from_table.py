@@ -62,7 +62,7 @@ def test_a_table_of_a_german_excel(here, encoding):
         "# 3 rows from 2025-04-01 12:00:00 to 2025-04-01 12:30:00 UTC, 900 s apart (median)" in text
     )
     assert "# without numbers: Bemerkung" in text
-    assert "20.5 to 21.5, 1 missing, place as its name says" in text
+    assert "20.5 to 21.5, 1 missing, position from the name" in text
 
 
 @pytest.mark.parametrize(
@@ -91,15 +91,18 @@ def test_the_column_with_a_unit_of_time_goes_before_one_that_counts(here):
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("0,20,20\n10,21,20\n", "has no header: begin it with a line of names"),
+        ("0,20,20\n10,21,20\n", "has no header. Add a first line with the names"),
         ("2025-04-01 12:00,20\n2025-04-01 13:00,21\n", "has no header"),
         ("T\n20\n21\n", "has one column, 'T'; expected times and measurements"),
-        ("time_s,T_1\n", "holds no rows beside its header."),
-        ("", "holds no rows beside its header."),
-        ("time,T_1\na,b\ns,K\nc,d\n0,20\n", "row 2: holds no numbers; the header is one line"),
-        ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column holds times: expected dates, or numbers"),
+        ("time_s,T_1\n", "has no rows below its header."),
+        ("", "has no rows below its header."),
+        (
+            "time,T_1\na,b\ns,K\nc,d\n0,20\n",
+            "row 2: contains no numbers. If the header has two lines",
+        ),
+        ("T_1,T_2\n20,20\n20,21\n19,20\n", "no column contains times: expected dates, or numbers"),
         (",T\n2025-04-01,20\n2025-04-02,20\n", "Column 1 has no name: give it one."),
-        ("time_s,note\n0,a\n1,b\n", "beside the times, 'time_s', no column holds numbers"),
+        ("time_s,note\n0,a\n1,b\n", "no column but the times, 'time_s', contains numbers"),
         ("at,T\n12:00,20\n12:10,20\n", "'at' has times of day: add a column of days."),
         ("time_s,T\n0,20\n20,20\n10,20\n", "row 4, column 'time_s': the time is earlier"),
         ("time_s,T\n0,20\n20,ERR\n40,20\n", "row 3, column 'T': got 'ERR'"),
@@ -115,7 +118,7 @@ def test_a_table_that_cannot_be_used_is_one_sentence(here, text, told):
 
 def test_only_tables_with_a_header(here):
     Path("my.jsonl").write_text('{"time": 0}')
-    with pytest.raises(lp.errors.DataError, match=r"my\.jsonl: a case is begun from a CSV file"):
+    with pytest.raises(lp.errors.DataError, match=r"my\.jsonl: expected a CSV file"):
         write_template(Path("mine"), Path("my.jsonl"))
     with pytest.raises(lp.errors.DataError, match=r"there is no file 'my\.csv'"):
         write_template(Path("mine"), Path("my.csv"))
@@ -144,7 +147,7 @@ def test_what_loggers_write_for_no_value_is_missing(here):
 def test_an_order_of_day_and_month_that_cannot_be_known_is_refused(here, first, second, told):
     with pytest.raises(lp.errors.DataError, match=re.escape(told)) as error:
         begun(f"time,T\n{first},20\n{second},20\n")
-    assert f"the order of day, month and year in '{first}' cannot be known" in str(error.value)
+    assert f"the order of day, month and year in '{first}' is ambiguous" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -216,7 +219,7 @@ def test_title_lines_before_the_header(here):
     Path("my.csv").write_text(title + table.replace("21,5", "ERR"))
     with pytest.raises(lp.errors.DataError, match="row 6, column 'T_5cm': got 'ERR'"):
         case.prepare()
-    with pytest.raises(lp.errors.DataError, match="line 1 is no header, but a title: say skip = 3"):
+    with pytest.raises(lp.errors.DataError, match="line 1 is a title, not a header: set skip = 3"):
         cases.load("mine/case.toml", settings={**filled, "data.skip": 0}).prepare()
 
 
@@ -273,7 +276,7 @@ def test_graded_meshes_where_the_equation_wants_them(here, name):
     filled |= {f"unknowns.k.{key}": "1e-4 m/s" for key in ("prior", "std")}
     filled |= {f"unknowns.Ss.{key}": "1e-5 1/m" for key in ("prior", "std")}
     filled |= {"channels.a.at": "9 m", "inputs.Q": "36 m^3/h"}
-    told = "where 'pumping_test' changes most: mesh.spacing = 'geometric'"
+    told = "where 'pumping_test' changes most. Set `mesh.spacing = 'geometric'`"
     for spacing, expected in (("geometric", False), ("uniform", True)):
         case = cases.load("mine/case.toml", settings={**filled, "mesh.spacing": spacing})
         assert any(told in note for note in case.notes) is expected
@@ -368,14 +371,14 @@ def test_options_for_what_the_table_does_not_tell(here):
     runner = CliRunner()
     begin = ["init", "mine", "--data", "my.csv"]
     error = runner.invoke(app, begin).exception
-    assert "cannot be known: say --time-format" in str(error)  # of the second title, or labels
+    assert "is ambiguous: set --time-format" in str(error)  # of the second title, or labels
     error = runner.invoke(app, [*begin, "--skip", "1"]).exception
-    assert "cannot be known: say --time-format, '%d/%m/%Y %H:%M' (2026-02-03" in str(error)
+    assert "is ambiguous: set --time-format, '%d/%m/%Y %H:%M' (2026-02-03" in str(error)
     begin += ["--skip", "1", "--time-format", "%m/%d/%Y %H:%M"]
     for key, told in {
         "law.nose": "there is no key 'law.nose'; did you mean 'noise'?",
         "channels.X.at": "the case has no 'channels.X'",
-        "a b": "'a b' is no key",
+        "a b": "'a b' is not a key",
         "title.x": "title: got {'x': 1}; expected text in quotes",
     }.items():
         error = runner.invoke(app, [*begin, "--set", f"{key}=1"]).exception
@@ -393,7 +396,7 @@ def test_options_for_what_the_table_does_not_tell(here):
     assert "# standard deviation of a single reading" in text
     for option in (["--skip", "0"], ["--time-format", "%d"], ["--set", "title=x"]):
         error = runner.invoke(app, ["init", "other", *option]).exception
-        assert f"{option[0]} belongs to a table of your own" in str(error)
+        assert f"{option[0]} requires --data FILE" in str(error)
 
 
 def test_each_place_that_is_left_open_is_named(here):
@@ -426,7 +429,7 @@ def test_an_equation_belongs_to_a_table(here):
     Path("my.csv").write_text("time_s,T\n0,20\n")
     runner = CliRunner()
     for arguments, told in (
-        (["--equation", "heat"], "--equation belongs to a table of your own: add --data"),
+        (["--equation", "heat"], "--equation requires --data"),
         (["--data", "my.csv", "--equation", "heet"], "no equation 'heet'; did you mean 'heat'?"),
         (["--data", "my.csv", "--equation", "own.py:rod"], "write 'own.py:rod' into the case."),
     ):
@@ -466,7 +469,7 @@ def test_a_process_that_nothing_drives_is_noted(here, more, driven):
     if "unknowns.source.std" in more:
         case.write_text(case.read_text() + "[unknowns.source]\nprior = 0\nstd = 1\n")
     case = cases.load(case, settings={**WALL, **more})
-    told = "nothing drives the process"
+    told = "source or input drives the process"
     assert any(told in note for note in case.notes) is not driven
 
 
@@ -629,7 +632,7 @@ def test_tables_that_cannot_be_joined(here, files, channel, told):
 
 def test_several_tables_are_not_followed(here):
     CliRunner().invoke(app, ["init", "mine", *two_tables()])
-    with pytest.raises(lp.errors.CaseError, match="follow belongs to one file that grows"):
+    with pytest.raises(lp.errors.CaseError, match="follow requires a single file that grows"):
         cases.load("mine/case.toml", settings={**FILES, "data.follow": True})
     case = cases.load("mine/case.toml", settings=FILES)
     with pytest.raises(lp.errors.CaseError, match="a process is followed in one: name it"):
@@ -640,7 +643,7 @@ def test_several_tables_are_not_followed(here):
     ("text", "told"),
     [
         ("time_s,T_5cm\n0,20\n", "the column 'T_5cm' is in another table, too: rename one"),
-        ("time,Q\n2026-03-02 08:00,5\n", "are dates in one and numbers in the other"),
+        ("time,Q\n2026-03-02 08:00,5\n", "has dates as times, the other has numbers"),
     ],
 )
 def test_tables_that_init_refuses(here, text, told):

@@ -317,9 +317,8 @@ def test_a_finished_file_is_interpolated_and_the_run_says_so(tmp_path):
         writer, (_, driven) = run_batch(prepared, folder, write, stack, quiet=True)
         _, _, _, notes = concluded(prepared, prepared.identifier, driven, writer, draw=False)
     assert (
-        "Channel left: 1 values far off those before and after were refused as spikes; 3 gaps were "
-        "interpolated between the values before and after; 1 missing values were not between known "
-        "ones: the last value was held." in notes
+        "Input left: 1 spikes were rejected, 3 missing values were interpolated, 1 missing values "
+        "were replaced by the last one." in notes
     )
     found = runs.open(folder).dataset
     alpha, std = float(found["alpha"][-1]), float(found["alpha_std"][-1])
@@ -336,7 +335,7 @@ def test_a_channel_may_keep_its_gaps_and_spikes(tmp_path):
 
 @pytest.mark.parametrize("key", ['missing = "interpolate"', 'spikes = "keep"'])
 def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
-    with pytest.raises(lp.errors.CaseError, match="belong to boundary and input channels"):
+    with pytest.raises(lp.errors.CaseError, match="require a boundary or input channel"):
         cases.load(plant(tmp_path, sensor=f", {key}"))
 
 

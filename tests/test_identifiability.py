@@ -55,7 +55,7 @@ def test_two_that_only_their_difference_shows_are_named_whatever_their_units(sca
     ((a, b, r),) = found.pairs
     assert (a, b) == ("a", "b")
     assert r == pytest.approx(1.0, abs=1e-3)
-    assert found.sentences[0].startswith("a and b are traded off against each other")
+    assert found.sentences[0].startswith("a and b are correlated (")
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_three_of_which_only_a_sum_shows():
     assert found.pairs == ()
     (direction,) = found.directions
     assert np.abs(list(direction.weights.values())) == pytest.approx(3 * [3**-0.5], abs=1e-3)
-    assert "Of a, b, c the data pin the combination" in found.sentences[0]
+    assert "Of a, b, c, the data identify only the combination" in found.sentences[0]
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_modes_of_a_field_and_a_number_that_stands_for_its_mean():
     assert 0 < pinned < count
     assert 0 < flat < count
     assert alone.sentences == [
-        f"q: of 8 modes the data pin {pinned}; {flat} are as the prior left them."
+        f"q: the data determine {pinned} of 8 modes well, and leave {flat} at their prior."
     ]
     more = report({"q": field}, lambda q: q.q, points=(0.1, 0.3, 0.5, 0.7, 0.9))
     assert more.unknowns[0].left < alone.unknowns[0].left

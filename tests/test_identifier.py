@@ -436,13 +436,13 @@ def test_numbers_where_something_else_is_expected():
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ((SENSORS, rod(), lp.SensitivityLaw()), "place of the model stands Points"),
-        ((rod(), lp.SensitivityLaw(), SENSORS), "place of the observation stands Sensitivity"),
+        ((SENSORS, rod(), lp.SensitivityLaw()), "as model, got Points"),
+        ((rod(), lp.SensitivityLaw(), SENSORS), "as observation, got Sensitivity"),
         (
             (rod(), SENSORS, lp.SensitivityLaw),
-            "place of the law stands .*Law'>: call it",
+            "as law, got .*Law'>: call it",
         ),
-        ((rod(), SENSORS, "gradient"), "place of the law stands 'gradient'"),
+        ((rod(), SENSORS, "gradient"), "as law, got 'gradient'"),
     ],
 )
 def test_what_is_no_part_of_an_identifier_is_said(parts, words):

@@ -146,7 +146,7 @@ def test_a_file_of_a_run_leads_to_the_run(home, monkeypatch, capsys):
     taken("runs/mine")
     code, _, told = livepde(("report", "runs/mine/run.json"), monkeypatch, capsys)
     assert code == 2
-    assert told.endswith("run.json holds no run (it is a file); did you mean 'runs/mine'?\n")
+    assert told.endswith("run.json contains no run (it is a file); did you mean 'runs/mine'?\n")
 
 
 @pytest.mark.parametrize("command", [("watch", "old"), (*RUN, "--realtime", "--watch", "8050")])
@@ -185,7 +185,7 @@ def test_what_is_no_mistake_gets_a_note(mistake, prepare, home, monkeypatch, cap
 def test_check_tells_of_data_that_tell_nothing(home, monkeypatch, capsys):
     rest()
     _, out, _ = livepde(("check", "mine/case.toml"), monkeypatch, capsys)
-    assert "Note: alpha: these data can tell hardly anything. Longer data" in out
+    assert "Note: `alpha` is not identifiable from these data. Use longer data" in out
 
 
 def test_the_page_has_these_mistakes_and_no_others():

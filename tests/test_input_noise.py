@@ -212,7 +212,7 @@ def test_a_wrong_start_does_not_end_in_the_unknowns(law):
     [
         ({"input_noise": {"rigth": 0.1}}, "the model has no channel 'rigth'"),
         ({"input_noise": {"left": 0.0}}, "must be a positive number"),
-        ({"u0_from": {"T_9": 1.0}, "u0": 0.0}, "'T_9' is no assimilated sensor"),
+        ({"u0_from": {"T_9": 1.0}, "u0": 0.0}, "'T_9' is neither an assimilated sensor"),
         ({"u0_from": {"T_1": 1.0}}, "give u0, too"),
     ],
 )

@@ -323,7 +323,7 @@ def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path)
     run = started(full, 150)
     limit_pages(run.journal, 20)
     with pytest.raises(
-        lp.errors.RunError, match=r"full.*What was written before is safe; make room"
+        lp.errors.RunError, match=r"full.*Earlier results are safe. To continue, free disk space"
     ):
         run.run()
     with pytest.raises(lp.errors.RunError, match="full"):  # it takes nothing more
@@ -453,11 +453,12 @@ def test_a_disk_that_does_not_come_back_is_no_health_until_the_run_is_stopped(
     said: list[dict] = []
     run = live(tmp_path, Leaving(rows(40)), patient=True, stopping=Stopping())
     with pytest.raises(
-        lp.errors.RunError, match=r"What was written before is safe; make room or mend"
+        lp.errors.RunError,
+        match=r"Earlier results are safe. To continue, free disk space or repair",
     ):
         run.run()
     run.journal.close()
-    why = "the journal cannot be written (disk I/O error): make room or mend the disk"
+    why = "the journal cannot be written (disk I/O error): free disk space or repair the disk"
     assert [(health["ok"], health["why"]) for health in said] == [(False, why)] * 3
     away.clear()
     with Journal.open(tmp_path / NAME) as kept:
@@ -493,7 +494,7 @@ def test_a_file_that_may_not_grow(tmp_path):
             timeout=PATIENCE,
         )
         assert not found.stderr
-        assert "make room" in found.stdout
+        assert "free disk space" in found.stdout
     again = started(full, 400)
     again.resume()
     again.run()
@@ -630,7 +631,7 @@ def test_a_journal_that_is_held_is_not_read_as_if_nobody_wrote(tmp_path, monkeyp
         holder.execute("PRAGMA journal_mode = DELETE")
         holder.execute("BEGIN EXCLUSIVE")
         with pytest.raises(
-            lp.errors.RunError, match=r"locked.*stop the other program that holds it"
+            lp.errors.RunError, match=r"locked.*stop the other program that uses it"
         ):
             Journal.open(path)
 
@@ -1047,7 +1048,7 @@ def test_a_folder_whose_making_was_ended_is_made_again(tmp_path):
         (folder / "run.json.partial").write_text("{")
         create()
         assert (folder / "case.toml").read_text() == "abc = 1\n"
-        with pytest.raises(lp.errors.RunError, match="already holds a run"):
+        with pytest.raises(lp.errors.RunError, match="already contains a run"):
             create()
         shutil.rmtree(folder)
     for name, text in (("case.toml", "other"), ("mine.txt", "")):
@@ -1064,7 +1065,7 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     RunWriter.create(path, command=["x"], title="A run", **options)
     monkeypatch.setattr("livepde.atomic_write.secrets.token_hex", lambda size: "0")
     (path / "run.json.0.partial").mkdir()
-    with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; make room"):
+    with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; free disk space"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
 
 

@@ -280,7 +280,7 @@ def test_a_clock_that_is_wrong_for_long_does_not_hold_a_run_up(tmp_path, wrong_r
         assert len(run.journal) == 48
         # The right rows are late now, and the remedy is stated.
         assert run.journal.counts["late", "a"] == 12
-        assert "state its correction with intake.shift" in run.health["why"]
+        assert "specify its correction with `intake.shift`" in run.health["why"]
 
 
 @pytest.mark.slow
@@ -482,7 +482,7 @@ def test_rows_that_come_and_are_all_refused_are_no_health(tmp_path):
     (kind, why), *rest = health_of(run)
     assert kind == "unwell"
     assert re.match(
-        "rows come and none is taken; the last one: late: t = -[0-9]+ is not later", why
+        "rows arrive, but none is accepted; the last one: late: t = -[0-9]+ is not later", why
     )
     assert [kind for kind, _ in rest] == ["well"]
     assert run.health["ok"]
@@ -569,7 +569,7 @@ def test_a_run_whose_directory_is_gone_is_not_well(tmp_path):
     run = live(tmp_path, Vanishing(rows(10)))
     run.run()
     assert not run.health["ok"]
-    assert run.why.startswith("the journal's file is no longer the one in the run directory")
+    assert run.why.startswith("the journal in the run directory was replaced")
     assert run.journal.health == run.why
     (tmp_path / "journal.sqlite").write_text("another")
     assert not run.health["ok"]
@@ -596,7 +596,7 @@ def test_steps_that_fail_are_no_health_and_the_stream_goes_on(tmp_path):
         told = [e.message for e in run.journal.events if e.kind == "aside"]
         assert len(told) == 3
         assert type(error).__name__ in told[0]
-        assert health_of(run)[0][1].startswith("the last steps have failed; the last one: t = 0.5")
+        assert health_of(run)[0][1].startswith("the last steps failed; the last one: t = 0.5")
         assert run.health["ok"]
 
 
@@ -686,8 +686,7 @@ def test_health_and_metrics(tmp_path):
     health = json.loads(ask("/health"))
     assert health.pop("seconds") > 0.0
     assert health.pop("findings")[0] == (
-        "Not judged: whether the model holds was not tested (innovations: there are 4 samples, 20 "
-        "are needed)."
+        "Not judged: the model was not tested (innovations: 4 samples, at least 20 required)."
     )
     assert health == {
         "ok": True,
@@ -737,7 +736,7 @@ def test_two_columns_of_one_name_are_told(tmp_path):
     source = Follow(path)
     first, *rest = source.poll(0.0)
     source.close()
-    assert first.broken == "two columns are called 'a', and none of them is taken: rename one"
+    assert first.broken == "two columns are called 'a', and neither is used: rename one"
     assert [row.values["t"] for row in rest] == ["0", "1"]
     assert all("a" not in row.values for row in rest)
 

@@ -163,7 +163,7 @@ def test_clear_errors(tmp_path, gmsh, monkeypatch):
     with pytest.raises(lp.errors.SpaceError, match="several kinds"):
         lp.read_mesh(tmp_path / "mixed.vtk")
     meshio.Mesh(points, [("vertex", [[0]])]).write(tmp_path / "points.vtk")
-    with pytest.raises(lp.errors.SpaceError, match="holds no mesh"):
+    with pytest.raises(lp.errors.SpaceError, match="contains no mesh"):
         lp.read_mesh(tmp_path / "points.vtk")
     monkeypatch.setitem(__import__("sys").modules, "meshio", None)
     with pytest.raises(lp.errors.SpaceError, match=r"pip install 'livepde\[mesh\]'"):

@@ -120,7 +120,7 @@ def test_initial_parameter():
     np.testing.assert_allclose(q[1:-1], 1 + mesh.p[0, 1:-1], atol=1e-12)
     bounded = lp.Model(lp.Field(mesh, ElementLineP1()), lp.Normal(1.0, bounds=(0.0, 2.0)), product)
     assert bounded.initial_parameter() == [1.0]
-    with pytest.raises(lp.errors.ModelError, match="outside of the bounds"):
+    with pytest.raises(lp.errors.ModelError, match="outside the bounds"):
         bounded.initial_parameter(3.0)
 
 

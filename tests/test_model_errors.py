@@ -369,10 +369,8 @@ def errors(effect: float, wider: float, misfit: float = 1.0, of_signal: float = 
     ],
 )
 def test_the_level_follows_from_fit_and_effect(of, doubted, level):
-    cause = Cause("source", "", "a source is missing in the model", 0.8)
-    misfit = Finding(
-        "misfit", "do not trust", "The model does not explain the data.", causes=(cause,)
-    )
+    cause = Cause("source", "", "a source may be missing in the model", 0.8)
+    misfit = Finding("misfit", "do not trust", "Model misfit.", causes=(cause,))
     verdict = Verdict.of([misfit] if doubted else []).with_errors(of)
     assert verdict.level == level
     # Once more, after a file, and with more findings, it is the same.
@@ -386,7 +384,7 @@ def test_the_level_follows_from_fit_and_effect(of, doubted, level):
 
 def test_a_doubted_run_without_unknowns_of_the_model_is_not_trusted():
     offset = Allowed("T.offset", "K", 0.0, -0.1, 0.1, -0.1, 0.1, 1.0, of_sensor=True)
-    misfit = Finding("misfit", "do not trust", "The model does not explain the data.")
+    misfit = Finding("misfit", "do not trust", "Model misfit.")
     only = ModelErrors(2.0, 0.01, {"T": 2.0}, (offset,))
     assert Verdict.of([misfit]).with_errors(only).level == "caution"
 
@@ -409,10 +407,8 @@ def test_a_later_estimate_has_an_interval_as_much_wider_as_before():
 def test_other_findings_keep_their_severity():
     held = Finding("held", "do not trust", "The unknowns were held.")
     assert Verdict.of([held]).with_errors(errors(0.01, 1.0)).level == "do not trust"
-    unit = Cause("unit", "T", "the values of sensor T are in degF", 0.99)
-    gross = Finding(
-        "misfit", "do not trust", "The model does not explain the data.", causes=(unit,)
-    )
+    unit = Cause("unit", "T", "T may be in degF instead of degC", 0.99)
+    gross = Finding("misfit", "do not trust", "Model misfit.", causes=(unit,))
     assert Verdict.of([gross]).with_errors(errors(0.01, 1.0)).level == "do not trust"
 
 

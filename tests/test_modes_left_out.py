@@ -54,9 +54,9 @@ def test_a_sentence_says_so_with_the_remedy():
     (text,) = [text for text in doubts(data) if "modes" in text]
     std = np.sqrt((data["s_std"].values[-1] ** 2).mean())
     alone = std * np.sqrt(1.0 - float(data["s_left_out"][-1]))
-    assert "s: more than 99% of its variance" in text
-    assert f"root mean square) is {std:.2g}, and of the 4 modes alone {alone:.2g}" in text
-    assert "Give law.modes a larger number" in text
+    assert "More than 99 % of the variance of `s`" in text
+    assert f"root mean square) is {std:.2g}, and {alone:.2g} from these modes alone" in text
+    assert "Increase `law.modes`" in text
     (row,) = next(table for table in tables(data) if table.title == "Estimated fields").rows
     assert row[-2] == f"{100 * float(data['s_left_out'][-1]):.2g} %"
 

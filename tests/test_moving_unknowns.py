@@ -409,7 +409,7 @@ def test_the_preview_tells_of_the_end_and_of_errors_that_are_not_seen(
     assert last.name == first.name
     assert 0 < last.left < 1
     assert last.left != pytest.approx(first.left, rel=1e-3)
-    assert any("The discretisation has shifted" in text for text in found.sentences)
+    assert any("Discretisation errors have shifted" in text for text in found.sentences)
     assert not preview(prepared, stream[:60]).last
 
 

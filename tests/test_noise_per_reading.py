@@ -345,8 +345,8 @@ def _ran(prepared):
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('kind = "sensitivity"', 'kind = "gradient"', "gradient law does not weigh readings"),
-        ('at = "left", unit = "degC"', 'at = "left", noise_column = "s"', "belongs to sensors"),
+        ('kind = "sensitivity"', 'kind = "gradient"', "gradient law does not weight readings"),
+        ('at = "left", unit = "degC"', 'at = "left", noise_column = "s"', "requires a sensor"),
         (
             "[law]",
             '[channels."noise of T"]\nrole = "sensor"\ncolumn = "T"\nat = 0.5\nnoise = 1\n[law]',

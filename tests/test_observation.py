@@ -171,9 +171,9 @@ def test_regions_that_are_none_are_refused_in_a_sentence():
         ([lambda x: x[0] < 0.5], "expected a mapping, sensor name -> predicate .*; got \\[<func"),
         (lambda x: x[0] < 0.5, "expected a mapping, sensor name -> predicate .*; got <func"),
         (0.5, r"as in Averages\({'core': lambda x: x\[0\] < 0\.1}\); got 0\.5"),
-        ({"core": (0.1, 0.2)}, r"'core': \(0\.1, 0\.2\) is no region; expected the name of a"),
-        ({"core": None}, "'core': None is no region"),
-        ({3: "left"}, "3: 'left' is no region"),
+        ({"core": (0.1, 0.2)}, r"'core': \(0\.1, 0\.2\) is not a region; expected the name of a"),
+        ({"core": None}, "'core': None is not a region"),
+        ({3: "left"}, "3: 'left' is not a region"),
         ({}, "at least one region"),
     ]
     for regions, message in bad:
@@ -297,7 +297,7 @@ def test_sensors_that_do_not_fit():
         (model, lambda: lp.Points([[0.2, 0.3]]), "dimension 2; the mesh has 1"),
         (plane, lambda: lp.Points([[0.2, np.nan]]), "lies outside"),
         (model, lambda: lp.Averages({}), "at least one region"),
-        (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' holds no part"),
+        (model, lambda: lp.Averages({"r": lambda x: x[0] > 2}), "region 'r' contains no part"),
         (model, lambda: lp.observation.Matrix(np.eye(5)), "5 columns; the state has 13"),
         (model, lambda: lp.observation.Matrix(np.eye(13), labels=["a"]), "1 labels for 13 rows"),
         (model, lambda: lp.observation.Matrix(np.full((1, 13), np.nan)), "not finite"),

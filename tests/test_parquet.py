@@ -129,7 +129,11 @@ def test_only_the_columns_that_are_needed_are_read(written):
         ({"T 1": [1.0, np.inf, 1.0]}, SampleError, "column 'T 1' is infinite in sample 1"),
         ({"time": [0.0, None, 1.0]}, SampleError, "sample 1, times 'time': got None; expected"),
         ({"time": [0.0, 2.0, 2.0]}, TimeOrderError, "sample 2: the time is that of"),
-        ({name: pa.array([], pa.float64()) for name in NUMBERS}, SampleError, "holds no samples"),
+        (
+            {name: pa.array([], pa.float64()) for name in NUMBERS},
+            SampleError,
+            "contains no samples",
+        ),
     ],
 )
 def test_what_cannot_be_used_is_named(written, columns, error, said):

@@ -197,7 +197,7 @@ def test_checks_pass_and_find_a_wrong_derivative(found):
         ("bounds", "LawError: PetscObserver: lower must be less than upper; got 1.0 and 0.0."),
         ("sample time", "LawError: PetscObserver: t must be later than 0.0; got 0.0."),
         ("numbers", "ModelError: DolfinxModel: the paper's law needs a field q: use PetscFilter."),
-        ("outside", "ModelError: DolfinxModel: sensor 0 at [2. 2. 0.] lies outside of the mesh."),
+        ("outside", "ModelError: DolfinxModel: sensor 0 at [2. 2. 0.] lies outside the mesh."),
         ("element", "ModelError: DolfinxModel: coefficients keep their numbers"),
         ("no checkpoint", "RunError: "),
         ("another model", "RunError: "),

@@ -185,7 +185,7 @@ def test_a_case_states_it(tmp_path):
 
 
 def test_at_std_belongs_to_a_position(tmp_path):
-    with pytest.raises(lp.errors.CaseError, match="at_std belongs to at"):
+    with pytest.raises(lp.errors.CaseError, match="at_std requires at"):
         case(tmp_path, 'over = "left", at_std = "1 cm"')
     with pytest.raises(lp.errors.CaseError, match="at_std: got '0 cm'"):
         case(tmp_path, 'at = "30 cm", at_std = "0 cm"')

@@ -72,11 +72,14 @@ def test_refusals_count_no_longer_once_a_fit_of_all_readings_has_converged(conve
 
 
 def test_below_half_of_the_misfit_no_single_cause_is_named():
-    causes = (Cause("gain", "T", "T is large", 0.36), Cause("lag", "T", "T is late", 0.2))
+    causes = (Cause("gain", "T", "T may be large", 0.36), Cause("lag", "T", "T may be late", 0.2))
     found = Finding("misfit", "caution", "It misfits.", causes=causes).sentence
     assert found == (
-        "It misfits. No single cause explains it. Candidates: T is large (36%); T is late (20%)."
+        "It misfits. No single cause explains this. Candidates: T may be large (36 %); T may be "
+        "late (20 %)."
     )
-    likely = (Cause("gain", "T", "T is large", 0.6), *causes[1:])
+    likely = (Cause("gain", "T", "T may be large", 0.6), *causes[1:])
     found = Finding("misfit", "caution", "It misfits.", causes=likely).sentence
-    assert found == "It misfits. Most likely T is large (explains 60% of it). Else T is late (20%)."
+    assert found == (
+        "It misfits. T may be large (explains 60 %). Alternatively, T may be late (20 %)."
+    )

@@ -289,7 +289,7 @@ def test_a_fit_that_leaves_out_many_readings_says_so():
     assert (last.fit.readings, last.fit.refused) == (len(TIMES), wild.sum())
     (said,) = [one for one in last.verdict.findings if one.what == "fit"]
     assert said.severity == "caution"
-    assert "left out" in said.text
+    assert "excluded" in said.text
     clean = column((0.3, 0.1, 0.05, 0.03)).run(stream()).last
     assert not [one for one in clean.verdict.findings if one.what == "fit"]
 

@@ -203,7 +203,7 @@ def test_a_run_without_samples(tmp_path):
 def test_nothing_is_written_over(tmp_path, driven):
     written(tmp_path / "run", driven)
     before = (tmp_path / "run" / "run.json").read_text()
-    with pytest.raises(lp.errors.RunError, match="already holds a run"):
+    with pytest.raises(lp.errors.RunError, match="already contains a run"):
         written(tmp_path / "run", driven)
     assert (tmp_path / "run" / "run.json").read_text() == before
     (tmp_path / "other").mkdir()
@@ -212,7 +212,7 @@ def test_nothing_is_written_over(tmp_path, driven):
         written(tmp_path / "other", driven)
     with pytest.raises(lp.errors.RunError, match="is a file"):
         written(tmp_path / "other" / "notes.txt", driven)
-    with pytest.raises(lp.errors.RunError, match="cannot be made"):
+    with pytest.raises(lp.errors.RunError, match="cannot be created"):
         written(tmp_path / "other" / "notes.txt" / "run", driven)
     (tmp_path / "empty").mkdir()
     written(tmp_path / "empty", driven)
@@ -251,7 +251,7 @@ def test_checkpoint_continues(tmp_path):
 
 @pytest.mark.slow
 def test_runs_that_cannot_be_opened(tmp_path, driven):
-    with pytest.raises(lp.errors.RunError, match="holds no run"):
+    with pytest.raises(lp.errors.RunError, match="contains no run"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(lp.errors.RunError, match="is damaged"):
@@ -260,13 +260,15 @@ def test_runs_that_cannot_be_opened(tmp_path, driven):
     with pytest.raises(lp.errors.RunError, match="not a record of this version"):
         runs.open(tmp_path)
     (tmp_path / "run.json").write_text(json.dumps({"format": 2, "status": "running"}))
-    with pytest.raises(lp.errors.RunError, match="is damaged: it is not as it was written"):
+    with pytest.raises(
+        lp.errors.RunError, match="is damaged: its content has changed since it was written"
+    ):
         runs.open(tmp_path)
     RunWriter(tmp_path, {"format": 2, "status": "running"})._save_record()
     run = runs.open(tmp_path)
     assert run.title == tmp_path.name
     assert run.checks == []
-    with pytest.raises(lp.errors.RunError, match="holds no estimates; its status is 'running'"):
+    with pytest.raises(lp.errors.RunError, match="contains no estimates; its status is 'running'"):
         _ = run.dataset
     (tmp_path / "estimates.nc").write_text("not netCDF")
     with pytest.raises(lp.errors.RunError, match="is damaged"):
@@ -376,7 +378,9 @@ def test_each_bit_of_the_estimates_counts(tmp_path, driven):
     assert runs.open(tmp_path / "run").dataset.sizes["time"] == len(driven.result)
     (tmp_path / "run" / "journal.sqlite").write_bytes(b"")
     path.write_bytes(flipped(whole, 0))
-    with pytest.raises(lp.errors.RunError, match="delete it: they are read from the journal then"):
+    with pytest.raises(
+        lp.errors.RunError, match="delete it, so that they are read from the journal"
+    ):
         _ = runs.open(tmp_path / "run").dataset
 
 

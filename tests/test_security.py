@@ -186,7 +186,7 @@ def test_a_report_is_not_written_through_a_link(hostile, tmp_path):
     (hostile / "report.md").symlink_to(mine)
     assert call("report", str(hostile)) == (
         2,
-        f"{hostile / 'report.md'} is a link: what is written to it would land elsewhere.",
+        f"{hostile / 'report.md'} is a link: data written to it would go elsewhere.",
     )
     assert mine.read_text() == "mine"
 

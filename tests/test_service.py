@@ -128,7 +128,7 @@ def test_another_file_is_followed_as_the_one_it_stands_for(here):
 @pytest.mark.parametrize("name", [None, "other.csv"])
 def test_a_file_that_is_not_there_yet_is_named(here, caplog, name):
     source_of(cases.load(case()), name, "").close()
-    assert f"there is no file '{name or 'rows.csv'}' yet: waits for it" in caplog.text
+    assert f"there is no file '{name or 'rows.csv'}' yet: waiting for it" in caplog.text
 
 
 def test_what_a_process_sends_does_not_end_a_run(here):
@@ -255,7 +255,7 @@ def test_it_begins_with_the_first_sample_that_has_what_is_needed(here):
     assert runs.open("run").dataset.sizes["time"] == 5
     with pytest.raises(lp.errors.DataError, match="'left'"):
         call("run", "case.toml", "--realtime", "--data", "-", "--out", "none", stdin=lines[0])
-    with pytest.raises(lp.errors.DataError, match="no sample came"):
+    with pytest.raises(lp.errors.DataError, match="no sample arrived"):
         call("run", "case.toml", "--realtime", "--data", "-", "--out", "void", stdin="")
 
 
@@ -274,10 +274,13 @@ def test_estimates_as_lines_of_json(here):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("--speed", "2"), "--speed belongs to a run beside a process"),
+        (("--speed", "2"), "--speed requires --realtime"),
         (("--realtime", "--speed", "0"), "a speed > 0; got 0"),
         (("--realtime", "--speed", "nan"), "a speed > 0; got nan"),
-        (("--realtime", "--speed", "2", "--data", "-"), "replays a finished file"),
+        (
+            ("--realtime", "--speed", "2", "--data", "-"),
+            "only valid for the replay of a complete file",
+        ),
     ],
 )
 def test_a_speed_of_nothing_is_refused(here, arguments, told):
@@ -407,9 +410,14 @@ def test_a_signal_before_the_first_step_ends_the_run(here, monkeypatch, moment):
     [
         ('file = "rows.csv"\nzone = "Mars"', "", "", "data.zone: there is no time zone 'Mars'"),
         ("mqtt = {}", "", "", "expected rows = [topics], or columns"),
-        ('follow = true\nmqtt = { rows = ["a"] }', "", "", "follow belongs to one file that grows"),
+        (
+            'follow = true\nmqtt = { rows = ["a"] }',
+            "",
+            "",
+            "follow requires a single file that grows",
+        ),
         ('file = "a.csv"\nmqtt = { rows = ["a"] }', "", "", "file and mqtt are two sources"),
-        ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every belongs to data that are"),
+        ('file = "rows.csv"\nfollow = true\nevery = 2', "", "", "every requires complete data"),
         ('file = "rows.csv"', 'wait = "-1 s"', "", "wait must be a time >= 0"),
         ('file = "rows.csv"', 'wait = "1 m"', "", "intake.wait: 'm' cannot be converted to 's'"),
         ('file = "rows.csv"', "queue = 0", "", "queue"),
@@ -427,7 +435,7 @@ def test_a_wiring_that_makes_no_sense_says_so(here, data, intake, habit, text):
 @pytest.mark.parametrize("option", [("--listen", "9100"), ("--watch", "8050"), ("--estimates",)])
 def test_what_belongs_to_a_live_run(here, option):
     Path("rows.csv").write_text(HEADER + table(row(0)))
-    assert "add --realtime" in bad("run", case('file = "rows.csv"'), *option)
+    assert "requires --realtime" in bad("run", case('file = "rows.csv"'), *option)
 
 
 def test_a_password_comes_from_the_environment(here, monkeypatch):
@@ -442,7 +450,7 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
     with (
         caplog.at_level("WARNING"),
         LiveCase(loaded, Rows(wrong)) as wiring,
-        pytest.raises(lp.errors.DataError, match=r"no sample came \(malformed: .*'time'"),
+        pytest.raises(lp.errors.DataError, match=r"no sample arrived \(malformed: .*'time'"),
     ):
         wiring.live()
     assert [one.message.split(":")[0] for one in caplog.records] == ["malformed"]
@@ -469,15 +477,15 @@ def test_what_keeps_a_run_from_its_first_sample_is_told(here, caplog):
     with LiveCase(cases.load(case(intake='silence = "1 ms"')), Nothing([])) as wiring:
         assert wiring.live(stopping=Nothing.stopping) is None
         assert wiring.silent
-    assert "nothing has come from the source" in caplog.text
+    assert "no data from the source" in caplog.text
 
 
 def test_a_run_without_a_sample_has_failed_and_can_begin_again(here):
     Path("rows.csv").write_text(HEADER)
     arguments = ["run", case('file = "rows.csv"'), "--realtime", "--speed", "inf"]
-    assert "no sample came" in bad(*arguments, "--out", "live")
+    assert "no sample arrived" in bad(*arguments, "--out", "live")
     assert runs.open("live").status == "failed"
-    assert "status is 'failed'. case.toml: no sample came" in bad("report", "live")
+    assert "status is 'failed'. case.toml: no sample arrived" in bad("report", "live")
     Path("rows.csv").write_text(HEADER + table(*(row(k) for k in range(5))))
     assert call(*arguments, "--out", "live", "--resume")[0] == 0
     assert runs.open("live").status == "finished"

@@ -378,7 +378,7 @@ def test_a_mesh_whose_initial_state_is_not_finite_is_followed_later() -> None:
 def test_speaks_and_names_the_cause() -> None:
     def said(cells: int, **k: Any) -> list[str]:
         data = identifier(cells, **k).run(samples()).to_xarray()
-        return [text for text in doubts(data) if "discretisation" in text]
+        return [text for text in doubts(data) if "Discretisation" in text]
 
     assert "the mesh" in said(5)[0]
     assert "the time step" in said(160, scheme=ImplicitEuler())[0]

@@ -72,7 +72,7 @@ def test_a_closed_pipe_ends_the_sink_and_not_the_run(tmp_path):
     os.close(reading)
     told = child(tmp_path, writing)
     os.close(writing)
-    assert told.count("JsonLinesSink is given up") == 2  # the event, and the log
+    assert told.count("JsonLinesSink failed and was removed") == 2  # the event, and the log
     assert "30 [('sink', " in told
     assert "Exception ignored" not in told
 

@@ -109,7 +109,7 @@ def test_the_bound_on_the_cost_is_said_where_it_bites() -> None:
     estimate = ran(given := identifier(law))
     assert parts_of(given).max() == 2
     (found,) = [one for one in estimate.verdict.findings if one.what == "step"]
-    assert "2 parts at most" in found.text
+    assert "at most 2 parts" in found.text
     assert "law.shadows.parts" in found.remedy
     assert not [one for one in ran(identifier()).verdict.findings if one.what == "step"]
 

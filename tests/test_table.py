@@ -65,11 +65,11 @@ def test_what_counts_as_missing(csv, missing):
         ("t,a,b\n2025-01-01,1,1\n5,1,1\n", "expected a date"),
         ("t,a,b\n0,1,1\ns,K,K\n1,1,1\n", "row 3, column 't': got 's'; expected a number"),
         ("t,a,b\n0,'1,5',1\n", "row 2: 4 fields, but the header has 3; decimals need a point"),
-        ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, say decimal = ','"),
+        ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, set decimal = ','"),
         ('t,a,b\n"0,5",1,1\n"0,6",1,1\n', "got '0,5'; if that is a decimal comma"),
-        ("t,a,b\n1.4.2025 9:05,1,1\n", "say time_format, perhaps '%d.%m.%Y %H:%M'"),
-        ("t;a;b\n0;1;1\n", "3 with ';': say separator = ';'."),
-        ("t;a;b\n0;1,5;1\n", "3 with ';': say separator = ';' and decimal = ','."),
+        ("t,a,b\n1.4.2025 9:05,1,1\n", "set time_format, perhaps '%d.%m.%Y %H:%M'"),
+        ("t;a;b\n0;1;1\n", "3 with ';': set separator = ';'."),
+        ("t;a;b\n0;1,5;1\n", "3 with ';': set separator = ';' and decimal = ','."),
         ("t,a,b\n", "no rows"),
         ("", "cannot be read"),
     ],
@@ -99,10 +99,10 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
         with pytest.raises(DataError) as error:
             read_csv(path, COLUMNS, Clock("Uhr ü"))
         assert str(error.value).endswith(
-            f"in row 1): say encoding = '{encoding}', separator = ';', decimal = ',' and "
-            "time_format = '%d.%m.%Y %H:%M'; or save it as 'CSV UTF-8'."
+            f"in row 1): set encoding = '{encoding}', separator = ';', decimal = ',' and "
+            "time_format = '%d.%m.%Y %H:%M', or save it as 'CSV UTF-8'."
         )
-        with pytest.raises(DataError, match=f": say encoding = '{encoding}'; or save it"):
+        with pytest.raises(DataError, match=f": set encoding = '{encoding}', or save it"):
             read_csv(path, COMMAS, clock, **how)
         how["encoding"] = encoding
     table = read_csv(path, COMMAS, clock, **how)
@@ -154,7 +154,7 @@ def test_decimal_commas_are_no_fields_beside_an_empty_last_one(csv):
 @pytest.mark.parametrize("rest", ['1,1,"x\n2,2,y\n', '1,1,"x', '2,1,1\n"'])
 def test_a_quote_that_does_not_end(csv, rest):
     """Else all that follows it would be one field, and lost without a word."""
-    with pytest.raises(DataError, match="cannot be read as a CSV file: a quote does not end"):
+    with pytest.raises(DataError, match="cannot be read as a CSV file: a quote is not closed"):
         read_csv(csv("t,a,b\n0,1,1\n" + rest), COLUMNS, Clock("t"))
 
 
@@ -209,7 +209,11 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("1,5", "1.234", "row 2, column 'a': got '1.234'; with decimal = ',' a point is none of"),
+        (
+            "1,5",
+            "1.234",
+            "row 2, column 'a': got '1.234'; with decimal = ',', a point is not a decimal",
+        ),
         ("1,5", "1.234,5", "row 2, column 'a': got '1.234,5'; expected a number"),
         ("01.04.2025 12:30", "31.02.2025 12:30", "as time_format has it, '%d.%m.%Y %H:%M'"),
     ],
@@ -250,7 +254,7 @@ def test_a_day_includes_its_hours_also_if_it_has_25(night, stop):
 @pytest.mark.parametrize("minutes", [30, 60])
 def test_an_hour_that_comes_twice_is_told(night, minutes):
     path = night(minutes, offset=False)
-    told = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30"
+    told = "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30"
     with pytest.raises(TimeOrderError, match=told):
         read_csv(path, COLUMNS, Clock("t", zone=GERMAN.zone))
     header, *rows = path.read_text().splitlines()

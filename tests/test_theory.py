@@ -257,7 +257,7 @@ def test_what_constants_refuse(monkeypatch):
     with pytest.raises(ConfigurationError, match="at least one state"):
         dg.constants(spaces, np.zeros(1), [])
     monkeypatch.setattr(constants_module, "LARGEST_DENSE_BASIS", 3)
-    with pytest.raises(ConfigurationError, match="Take a coarser mesh"):
+    with pytest.raises(ConfigurationError, match="Use a coarser mesh"):
         dg.constants(spaces, np.zeros(1), [np.zeros(model.X.dim)])
 
 
@@ -614,7 +614,7 @@ def test_the_page_of_a_run_without_any_measurement():
     identifier = lp.Identifier(model, lp.Points([0.4]), lp.GradientLaw(), u0=1.0)
     found = dg.theory_report(identifier, [(t, [np.nan]) for t in (0.1, 0.2, 0.3)])
     assert found.constants is None
-    assert any("no sample of the run holds a measurement" in note for note in found.notes)
+    assert any("no sample of the run contains a measurement" in note for note in found.notes)
 
 
 @pytest.mark.long

@@ -126,17 +126,17 @@ def notes(estimate: lp.Estimate) -> list[str]:
     return [item.text for item in estimate.verdict.findings if item.what == "input"]
 
 
-UNSTATED = "had no value at the initial time: its first one was held over the first interval."
+UNSTATED = "had no value at the initial time, so its first value was used for the first interval."
 
 
 def test_inputs_that_no_state_has_are_named():
     who = identifier(0.0, heated())
     first = who.step(0.1, {"a": 0.1, "T": 1.0, "Q": 2.0})
     assert first.held == ("Q",)
-    assert notes(first) == [f"Channel Q {UNSTATED}"]
+    assert notes(first) == [f"Input Q {UNSTATED}"]
     second = who.step(0.2, {"a": 0.1, "T": 1.0, "Q": 2.0})
     assert second.held == ()
-    assert notes(second) == [f"Channel Q {UNSTATED}"]
+    assert notes(second) == [f"Input Q {UNSTATED}"]
     assert {item.severity for item in second.verdict.findings if item.what == "input"} == {"note"}
     begun = identifier(0.0, heated())
     begun.step(0.0, {"T": 1.0, "Q": 2.0})
@@ -149,7 +149,7 @@ def test_inputs_that_no_state_has_are_named():
 def test_an_initial_state_that_is_left_out_states_no_boundary_value(u0: Any):
     """Zero is the default state. It says nothing of a boundary: its first value is held."""
     who = identifier(u0)
-    start, names = (0.0, []) if u0 == 0.0 else (1.0, [f"Channel T {UNSTATED}"])
+    start, names = (0.0, []) if u0 == 0.0 else (1.0, [f"Input T {UNSTATED}"])
     expected = differences(start, 1.0, 0.0, 0.1)
     assert seen(who, 0.1, {"T": 1.0}) == pytest.approx(expected, abs=0.02)
     assert notes(who.estimate()) == names
@@ -161,7 +161,7 @@ def test_the_note_survives_a_restart(tmp_path: Path):
     first.save(tmp_path / "state.bin")
     second.load(tmp_path / "state.bin")
     one, other = (who.step(0.2, {"a": 0.1, "T": 1.0, "Q": 2.0}) for who in (first, second))
-    assert notes(one) == notes(other) == [f"Channel Q {UNSTATED}"]
+    assert notes(one) == notes(other) == [f"Input Q {UNSTATED}"]
     np.testing.assert_array_equal(one.q, other.q)
 
 

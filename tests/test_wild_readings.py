@@ -81,6 +81,6 @@ def test_a_live_run_reports_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     run = live_rod.live(tmp_path, Rows(given))
     run.run()
     (event,) = [one for one in run.journal.events if one.kind == "wild"]
-    assert event.message.startswith("t = 4: 1 readings lie far outside of all before them")
+    assert event.message.startswith("t = 4: 1 outliers, far outside the range so far")
     while live_rod.OPENED:
         live_rod.OPENED.pop().close()

@@ -15,7 +15,7 @@ PARTIAL = ".partial"  # how the name of a file ends that is being written
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield a new temporary file beside a path, renamed to it if the block raises nothing.
+    """Yield a new temporary file next to a path, renamed to it if the block raises nothing.
 
     The file is created exclusively (O_EXCL) under a random name, so that neither a file nor a link
     of another process can be opened in its place. An existing file or symbolic link at the path is

@@ -59,8 +59,8 @@ class Channels:
         both = [name for name in self.hidden if name in self.observed.names]
         if both:
             raise ConfigurationError(
-                f"channels {both} are both assimilated and withheld: give the sensors names of "
-                'their own, as in Points({"T_30": 0.3}).'
+                f"channels {both} are both assimilated and withheld: rename the "
+                'sensors, as in Points({"T_30": 0.3}).'
             )
         if taken := [name for name in self.inputs if name in self.noise]:
             raise ConfigurationError(

@@ -57,7 +57,7 @@ def _gather(value: Any, prefix: str, leaves: dict[str, Any]) -> None:
 
 @lru_cache(maxsize=256)
 def _parts(kind: type) -> tuple[tuple[str, int, bool], ...] | None:
-    """Return name, axis that grows, and whether it begins anew of each field of a dataclass."""
+    """Return name, axis that grows, and whether it restarts, of each field of a dataclass."""
     if not is_dataclass(kind):
         return None
     return tuple(
@@ -181,7 +181,7 @@ def _read(text: bytes) -> tuple[dict[str, Any], list[tuple[str, np.dtype[Any], t
     for name, kind, shape in described:
         dtype, lengths = np.dtype(str(kind)), tuple(int(length) for length in shape)
         if dtype.kind not in PLAIN or min(lengths, default=0) < 0 or math.prod(lengths) > MOST:
-            raise ValueError(f"'{name}' is no array of numbers")
+            raise ValueError(f"'{name}' is not an array of numbers")
         found.append((str(name), dtype, lengths))
     return dict(header), found
 
@@ -193,8 +193,8 @@ def write(path: str | os.PathLike[str], content: bytes) -> None:
         write_bytes(target, content, sync=True)
     except OSError as error:
         raise RunError(
-            f"Cannot write the checkpoint {target}: {error.strerror or error}; make room or mend "
-            "the folder."
+            f"Cannot write the checkpoint {target}: {error.strerror or error}; free disk space "
+            "or check the folder."
         ) from error
 
 

@@ -46,7 +46,7 @@ __all__ = [
 
 
 class LivepdeError(Exception):
-    """Base of everything livepde raises on purpose; the message says where, what and the remedy."""
+    """Base of everything livepde raises on purpose; the message has place, problem and remedy."""
 
 
 class ConfigurationError(LivepdeError, ValueError):
@@ -62,7 +62,7 @@ class ModelError(ConfigurationError):
 
 
 class NameClashError(ModelError):
-    """Unknowns or components with names that stand for something else in a run's dataset."""
+    """Unknowns or components with names that mean something else in a run's dataset."""
 
 
 class ObservationError(ConfigurationError):

@@ -1,4 +1,4 @@
-"""Fingerprint of an identification problem, by which a checkpoint is known to belong to it.
+"""Fingerprint of an identification problem, by which its checkpoints are recognised.
 
 Digests of matrices would differ between machines, whose sums round differently. So numbers are kept
 as they are, a few for each part: model, priors, sensors and options are evaluated at fixed states,
@@ -239,7 +239,7 @@ def _described(value: Any, numbers: list[float]) -> str:
 
 
 def _options(value: Any) -> list[tuple[str, Any]]:
-    """Return names and values of what an object was made of, but for what may begin anew."""
+    """Return names and values of the parts of an object, without those that may restart."""
     if is_dataclass(value):
         given = [item for item in fields(value) if not item.metadata.get("begins_anew")]
         return [(item.name, getattr(value, item.name)) for item in given if item.init]

@@ -121,7 +121,7 @@ def over_time(data: xr.Dataset, variable: str, dimension: str) -> dict[str, Arra
 
 
 def with_estimates(data: xr.Dataset) -> xr.Dataset:
-    """Return the dataset of a run with dates, and with its numbers on axes of their own."""
+    """Return the dataset of a run with dates, and with its numbers on separate axes."""
     found: dict[str, Any] = {}
     labels = scalars(data)
     for name in [*labels, *field_names(data)]:

@@ -230,7 +230,7 @@ class Identifier(Shown):
         return other
 
     def placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
-        """Return an identifier of the same parts that stands elsewhere; for `Fleet.identifier`.
+        """Return an identifier of the same parts in another state; for `Fleet.identifier`.
 
         Parameters
         ----------
@@ -261,7 +261,7 @@ class Identifier(Shown):
             if name not in self.model.channels:
                 raise ConfigurationError(
                     f"input_noise: the model has no channel '{name}'; it has "
-                    f"{list(self.model.channels)}. Noise of sensors belongs to the observation."
+                    f"{list(self.model.channels)}. Specify the noise of sensors in the observation."
                 )
             if not (math.isfinite(std) and std > 0.0):
                 raise ConfigurationError(
@@ -275,8 +275,8 @@ class Identifier(Shown):
         for name in u0_from:
             if name not in known:
                 raise ConfigurationError(
-                    f"u0_from: '{name}' is no assimilated sensor and no channel of the model; "
-                    f"those are {sorted(known)}."
+                    f"u0_from: '{name}' is neither an assimilated sensor nor a channel of the "
+                    f"model; these are {sorted(known)}."
                 )
         space = self.model.state_space
         found = {}
@@ -295,7 +295,7 @@ class Identifier(Shown):
         return found
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Identifier:
-        """Return an identifier that goes on by itself; model, law and matrices are shared."""
+        """Return an identifier that continues independently; model, law and matrices are shared."""
         other = copy.copy(self)
         other._state, other._z = copy.deepcopy((self._state, self._z), memo)
         return other
@@ -1012,8 +1012,8 @@ class Identifier(Shown):
             if header.get(key) != value:
                 if key == "format":
                     raise RunError(
-                        f"{where} was saved by another version of livepde, in another format: go "
-                        "on with that version, or begin anew."
+                        f"{where} was saved by another version of livepde, in another format: "
+                        "continue with that version, or start again."
                     )
                 raise RunError(
                     f"{where} was saved with {key} = {header.get(key)!r}; this identifier has "
@@ -1056,27 +1056,25 @@ class Identifier(Shown):
 
 
 def _check_parts(*parts: object) -> None:
-    """Refuse what is no model, observation and law, in this order."""
+    """Refuse what is not a model, an observation and a law, in this order."""
     for part, kind in zip(parts, (Model, Observation, Law), strict=True):
         if not isinstance(part, kind):
             remedy = ": call it" if isinstance(part, type) and issubclass(part, kind) else ""
             raise ConfigurationError(
-                "Identifier(model, observation, law): in the place of the "
-                f"{kind.__name__.lower()} stands {part!r:.80}{remedy}."
+                "Identifier(model, observation, law): as "
+                f"{kind.__name__.lower()}, got {part!r:.80}{remedy}."
             )
 
 
 def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any]) -> None:
-    """Refuse an initial time that is not finite, and an initial state that is said twice or not."""
+    """Refuse an initial time that is not finite, and an initial state given twice or not at all."""
     if not np.isfinite(t0):
         raise ConfigurationError(f"t0 must be a finite number; got {t0}.")
     for name, given in uncertain.items():
         if given and u0 is None:
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
     if u0 is not None and model.form_initial is not None:
-        raise ConfigurationError(
-            "the model has an initial state of its own (initial=): leave out u0."
-        )
+        raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
 
 
 def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:

@@ -292,7 +292,7 @@ class Model(Shown):
         return found
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:
-        """Return the same process with more unknowns, which its forms do not see: of sensors, say.
+        """Return the same process with more unknowns, such as those of sensors, not in its forms.
 
         Raises
         ------
@@ -340,7 +340,7 @@ class Model(Shown):
         return Model(self.state, self.parameter, **parts, **about)
 
     def with_constant_inputs(self, values: Mapping[str, float]) -> Model:
-        """Return the same process with constants in the place of some of its inputs.
+        """Return the same process with constants instead of some of its inputs.
 
         Raises
         ------
@@ -453,7 +453,7 @@ class Model(Shown):
         return bool((factors < 0.0).any() and (factors <= 0.0).all())
 
     def _check_names(self) -> None:
-        """Refuse names that a run's dataset could not tell apart."""
+        """Refuse names that a run's dataset could not distinguish."""
         state, parameter = self.state_space, self.parameter_space
         axes = "xyz"[: self.mesh.dim()]
         clashes = name_clashes(
@@ -681,7 +681,7 @@ class Model(Shown):
         return found
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
-        """Return coefficients of the initial state that belongs to a latent parameter."""
+        """Return coefficients of the initial state of a latent parameter."""
         if self.form_initial is None:
             return self.impose(np.zeros(self.X.dim), moment)
         boundary = self.impose(np.zeros(self.X.dim), moment)
@@ -712,7 +712,7 @@ class Model(Shown):
         q[self.latent.fixed] = 0.0
         lower, upper = self.latent.bounds
         if np.any(q < lower) or np.any(q > upper):
-            raise ModelError("q0 lies outside of the bounds of a scalar unknown.")
+            raise ModelError("q0 is outside the bounds of a scalar unknown.")
         return q
 
 

@@ -69,7 +69,7 @@ NUMBER_ENDS = {
 FIELD_ENDS = {
     **STATE_ENDS,
     **INTERVAL_ENDS,
-    "_modes": "the number of modes told",
+    "_modes": "the number of determined modes",
     "_left_out": "the share of modes left out",
 }
 
@@ -115,7 +115,7 @@ class Snapshot:
         n = head.get("correlation")
         numbers = np.frombuffer(body)
         if len(numbers) != sum(sizes) + (n or 0) ** 2:
-            raise ValueError("fields of another size than they say")
+            raise ValueError("fields of another size than declared")
         *parts, rest = np.split(numbers, np.cumsum(sizes))
         return cls(
             dict(zip(head["profiles"], parts, strict=True)),
@@ -560,7 +560,7 @@ class Layout:
             data[name] = (("snapshot", "vertex"), values, attrs)
         for name, (_, count) in kept[-1].told.items():
             told = np.array([snapshot.told[name][0] for snapshot in kept])
-            about = {"long_name": "modes that the data have told of", "of": count}
+            about = {"long_name": "modes that the data determine", "of": count}
             data[f"{name}_modes"] = ("snapshot", told, about)
             left = np.array([snapshot.left_out.get(name, np.nan) for snapshot in kept])
             about = {"long_name": "share of modes that the law leaves out in the variance of"}
@@ -589,7 +589,7 @@ def _layouts() -> TypeAdapter[Layout]:
 
 
 def bare(name: str) -> str:
-    """Return the name of the unknown that a variable belongs to."""
+    """Return the name of the unknown of a variable."""
     for end in (*STATE_ENDS, *INTERVAL_ENDS):
         name = name.removesuffix(end)
     return name
@@ -630,7 +630,7 @@ def used_errors(data: xr.Dataset, variable: str, dimension: str) -> Array:
 def name_clashes(
     own: Iterable[str], state: Iterable[str], numbers: Iterable[str], fields: Iterable[str]
 ) -> list[str]:
-    """Return a sentence for each name that would stand for two things in a run's dataset.
+    """Return a sentence for each name that would have two meanings in a run's dataset.
 
     Parameters
     ----------
@@ -658,7 +658,7 @@ def name_clashes(
 
 
 def _uses(name: str, kind: str, ends: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """Iterate over the variables that belong to one of a model's quantities, and their meanings."""
+    """Iterate over the variables of one of a model's quantities, and their meanings."""
     yield name, f"{kind} '{name}'"
     if name.startswith(NOTE):
         yield name, "a note of the law"

@@ -434,7 +434,7 @@ class Marginal:
 
 
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
-    """Return findings on scalar unknowns that are hardly identified, or end at a bound."""
+    """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
     for label, row in space.labels.items():
         unknown, value = unknown_of(space, label), float(belief.q[row])
         lower, upper = map(float, unknown.prior.bounds)
@@ -774,7 +774,7 @@ class Result(Shown):
     def _last(self, what: str) -> Estimate:
         """Return the last estimate."""
         if self.last is None:
-            raise ConfigurationError(f"{what}: the run holds no samples yet.")
+            raise ConfigurationError(f"{what}: the run contains no samples yet.")
         return self.last
 
     def dataset(self) -> xr.Dataset:

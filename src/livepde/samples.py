@@ -1,4 +1,4 @@
-"""Samples of a stream, and what may stand in them."""
+"""Samples of a stream, and what they may contain."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def check_noise(name: str, value: Any) -> float:
 
 
 def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
-    """Return readings as channel -> number, noise by a name of its own.
+    """Return readings as channel -> number, with noise under a separate name.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def _array(z: Any) -> Array:
 
 
 def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
-    """Return the measurements of all sensors, shape (sensors,), as an array of their own.
+    """Return the measurements of all sensors, shape (sensors,), as a new array.
 
     And the noise of each, None if none has one of its own.
     """

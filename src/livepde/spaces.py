@@ -206,7 +206,7 @@ class HilbertSpace:
         return self._between(*self._solved)
 
     def beyond(self, modes: Array) -> Array:
-        """Return the prior variance of each coefficient outside of given modes, shape (n,).
+        """Return the prior variance of each coefficient outside given modes, shape (n,).
 
         As `variance`, but beyond 20 000 coefficients the remainder is interpolated instead of the
         whole variance. Values at rounding level are set to zero.

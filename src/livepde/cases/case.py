@@ -271,7 +271,7 @@ class Case(CaseContent):
 
     @property
     def source(self) -> str:
-        """Source of the references: a publication, say."""
+        """Source of the references, such as a publication."""
         given = self.spec.reference.get("source", "")
         return given if isinstance(given, str) and "source" not in self.references else ""
 
@@ -295,7 +295,7 @@ class Case(CaseContent):
         """The assimilated sensors."""
         observation = observation_of(self, "sensor")
         if observation is None:
-            text = "there is no sensor to learn from; give at least one channel role = 'sensor'."
+            text = "there is no sensor. Add at least one channel with role = 'sensor'."
             raise self.error("channels", text)
         return observation
 
@@ -395,7 +395,7 @@ class Case(CaseContent):
         samples: Iterator[Sample] = iter(data)
         first = next(samples, None)
         if first is None:
-            raise DataError(f"{self.path}: the data hold no sample between start and stop.")
+            raise DataError(f"{self.path}: the data contain no sample between start and stop.")
         start = assimilation_start(self, self.clock, data.origin)
         if isinstance(data, DataTable) and isinstance(raw, DataTable):
             return Prepared(self, first, data, start, data.origin, raw)

@@ -108,7 +108,7 @@ def _noise_column(case: CaseContent, name: str, channel: ChannelSpec, factor: fl
     """Return where the noise of the readings of a channel comes from, in its unit."""
     key = f"channels.{name}.noise_column"
     if isinstance(case.spec.law, GradientSpec):
-        raise case.error(key, "the gradient law does not weigh readings: leave it out.")
+        raise case.error(key, "the gradient law does not weight readings: leave it out.")
     if noise_channel(name) in case.spec.channels:
         raise case.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
     decimal = case.spec.data.decimal
@@ -293,7 +293,7 @@ def _inside_mesh(case: CaseContent, at: Any, key: str) -> Any:
         if not left - slack <= x <= right + slack:
             raise case.error(
                 key,
-                f"{x:g} {unit} lies outside of the mesh, which spans {left:g} to {right:g} {unit}; "
+                f"{x:g} {unit} lies outside the mesh, which spans {left:g} to {right:g} {unit}; "
                 "check the position and its unit.",
             )
     place = [float(np.clip(x, a, b)) for x, a, b in zip(point, low, high, strict=True)]
@@ -328,8 +328,9 @@ def _crowded(case: CaseContent) -> list[str]:
     if len(at) == 1 or len(set(np.searchsorted(np.sort(case.mesh.p[0]), list(at)).tolist())) > 1:
         return []
     return [
-        f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which hardly tells them "
-        "apart: more mesh.cells, or mesh.spacing = 'geometric' for smaller ones at the left end."
+        f"All sensors ({', '.join(channels)}) lie in one cell of the mesh, which barely "
+        "distinguishes them. Increase `mesh.cells`, or refine the left end with "
+        "`mesh.spacing = 'geometric'`."
     ]
 
 
@@ -528,7 +529,7 @@ def _listed(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tup
     # Row 1 of the file is its header.
     for row, label in enumerate(table["name"], 2):
         if not label or label in found:
-            what = f"the name '{label}' stands there twice" if label else "the name is missing"
+            what = f"the name '{label}' occurs twice" if label else "the name is missing"
             raise case.error(key, f"{file}, row {row}: {what}.")
         where = f"{key}: {file}, row {row}"
         place = tuple(_coordinate(case, table[axis][row - 2], where) for axis in axes)

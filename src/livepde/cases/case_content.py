@@ -246,7 +246,7 @@ def _layer_edges(case: CaseContent) -> list[tuple[str, float]]:
 
 
 def _fitted(nodes: Array, edges: Iterable[float]) -> list[float]:
-    """Return the edges inside of a mesh that its nodes can move to, at most one for each node."""
+    """Return the edges inside a mesh that its nodes can move to, at most one for each node."""
     # The ends of the mesh stay where they are.
     inner = nodes[1:-1]
     found: dict[int, float] = {}
@@ -273,7 +273,7 @@ def _check_cells(number: float, where: str) -> None:
 
 
 def off_nodes(case: CaseContent, nodes: Array) -> list[str]:
-    """Return the names of layers and sources with an end inside of a cell."""
+    """Return the names of layers and sources with an end inside a cell."""
     within = 1e-6 * np.ptp(nodes)
     crossed = dict.fromkeys(
         what
@@ -296,7 +296,7 @@ def subdomain(case: CaseContent, mesh: Any, name: str, key: str) -> str:
 def inside(
     case: CaseContent, given: Any, dimension: int, key: str, *, closed: bool = False
 ) -> Callable[[Any], Any]:
-    """Return whether points x lie in a layer or box; its upper sides belong to it if `closed`."""
+    """Return whether points x lie in a layer or box; with its upper sides if `closed`."""
     sides, below = sides_of(case, given, dimension, key), np.less_equal if closed else np.less
     return lambda x: np.logical_and.reduce(
         [(x[k] >= low) & below(x[k], high) for k, (low, high) in enumerate(sides)]

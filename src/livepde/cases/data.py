@@ -65,7 +65,7 @@ __all__ = [
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
 UNSET = (
-    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that holds "
+    f"{VARIABLE} is not set; set the environment variable LIVEPDE_DATA to the folder that contains "
     "the measurements."
 )
 PASSWORDS = "LIVEPDE_"  # how variables begin that a case may use as passwords
@@ -106,7 +106,7 @@ def _zone(case: CaseContent) -> tzinfo:
     try:
         return ZoneInfo(name)
     except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
-        text = f"there is no time zone '{name}'; expected a name as Europe/Berlin."
+        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
         raise case.error("data.zone", text) from None
 
 
@@ -177,7 +177,7 @@ def _all_read(
 
 
 def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
-    """Refuse times in two columns of a source that is no CSV file."""
+    """Refuse times in two columns of a source that is not a CSV file."""
     ending = Path(source).suffix if isinstance(source, str) else ""
     if clock.hour and ending in ("", ".parquet", *JSON_LINES):
         text = "times in two columns are read from CSV files only: join them in one column."
@@ -185,7 +185,7 @@ def check_hours(case: CaseContent, clock: Clock, source: Any) -> None:
 
 
 def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpec) -> DataTable:
-    """Return the data of a file, whose ending tells its format."""
+    """Return the data of a file; its extension gives the format."""
     rows: dict[str, Any] = {"every": spec.every, "missing": spec.missing}
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, **rows)
@@ -258,7 +258,7 @@ def _owner(
 def _header(case: CaseContent, spec: DataSpec, path: Path) -> list[str]:
     """Return the names of the columns of one of several files."""
     if path.suffix in (".parquet", *JSON_LINES):
-        raise case.error("data.file", f"{path} is no CSV file; only these are joined.")
+        raise case.error("data.file", f"{path} is not a CSV file; only CSV files can be joined.")
     return header_of(path, spec.separator, spec.encoding, spec.skip)
 
 
@@ -412,7 +412,7 @@ def assimilation_start(case: CaseContent, clock: Clock, origin: datetime | None)
         raise case.error("data.assimilate_from", text)
     stamp = clock.stamp(value)
     if stamp is None:
-        text = f"got '{value}'; expected a date as 2025-04-01 12:00."
+        text = f"got '{value}'; expected a date such as 2025-04-01 12:00."
         raise case.error("data.assimilate_from", text)
     return (stamp - since_1970(origin)) * clock.second
 
@@ -454,7 +454,7 @@ def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) 
 def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
     spec = case.spec.data
     if spec.follow and not path.exists():
-        LOG.warning("there is no file '%s' yet: waits for it", path)
+        LOG.warning("there is no file '%s' yet: waiting for it", path)
     return Follow(
         path,
         separator=spec.separator,

@@ -33,7 +33,7 @@ def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equat
         if name not in EQUATIONS:
             raise CaseError(
                 f"{where}: equation: there is no equation '{name}'; "
-                f"{did_you_mean(name, EQUATIONS)} An own one is 'file.py:function'."
+                f"{did_you_mean(name, EQUATIONS)} For your own equation, use 'file.py:function'."
             )
         return EQUATIONS[name]
     expected = "(mesh, unknowns, dirichlet, **options) -> livepde.Model"
@@ -100,7 +100,7 @@ def own_code(what: str) -> Iterator[None]:
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
-    """Import the object that a case names, from a module or from a file beside the case.
+    """Import the object that a case names, from a module or a file in the folder of the case.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
 
 
 def check_options(function: Any, given: Iterable[str], where: str) -> None:
-    """Refuse an option that a function does not take; the first argument is no option."""
+    """Refuse an option that a function does not have; the first argument is not an option."""
     _, *known = inspect.signature(function).parameters.values()
     if any(item.kind is inspect.Parameter.VAR_KEYWORD for item in known):
         return
@@ -150,7 +150,7 @@ def _no_code(path: Path, source: str, folder: Path) -> str:
     """Return a sentence on a missing code file, with a hint if the working directory has it."""
     if Path(source).is_file():
         there = beside(Path(source), folder).as_posix()
-        return f"there is no file '{path}', beside the case; did you mean '{there}'?"
+        return f"there is no file '{path}', next to the case; did you mean '{there}'?"
     return str(no_file(path))
 
 

@@ -33,14 +33,14 @@ def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
         expected = apply(read_toml(text, where), {key: value}, where)
         text = _with(text, key_path(key, where), value)
         if _without_empty(read_toml(text, where)) != _without_empty(expected):
-            raise CaseError(f"{where}: {key}: cannot be set here; edit the file in its place.")
+            raise CaseError(f"{where}: {key}: cannot be set here; edit the file instead.")
     if settings:
         spec_of(read_toml(text, where), where)
     return text
 
 
 def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document without its empty tables, which are there with a head of their own only."""
+    """Return a document without its empty tables, which consist of a head only."""
     return {name: value for name, value in document.items() if value != {}}
 
 

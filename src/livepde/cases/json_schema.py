@@ -19,7 +19,7 @@ BROKER = {
     "client_id": "Name of this client at the broker; each run needs its own. "
     "Without it: livepde-CASE.",
     "username": "User name at the broker.",
-    "password_env": "Environment variable that holds the password: LIVEPDE_..., or one that "
+    "password_env": "Environment variable that contains the password: LIVEPDE_..., or one that "
     "--allow-env allows.",
     "tls": "Whether the connection is encrypted.",
     "ca_file": "File of the certificates that are trusted; without it those of the system.",
@@ -85,7 +85,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "password_env": BROKER["password_env"],
     },
     "FileSpec": {
-        "file": "CSV file, beside the case.",
+        "file": "CSV file, relative to the case.",
         "separator": "Separator of fields; without it that of [data].",
         "decimal": "Decimal mark; without it that of [data].",
         "encoding": "Encoding of the text; without it that of [data].",
@@ -95,7 +95,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "time_format": "Format of dates; without it that of [data].",
     },
     "DataSpec": {
-        "file": "CSV, .jsonl or .parquet file beside the case; ${LIVEPDE_DATA} may stand in it. "
+        "file": "CSV, .jsonl or .parquet file, relative to the case; may contain ${LIVEPDE_DATA}. "
         "Several CSV files are joined by time.",
         "follow": "Whether the file grows, so that more is waited for at its end.",
         "mqtt": "Message broker instead of a file.",
@@ -118,7 +118,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
     },
     "IntakeSpec": {
         "wait": "How much later than newer ones a row may come; a time.",
-        "tolerance": "Rows whose times differ by at most this belong to one sample; a time.",
+        "tolerance": "Rows whose times differ by at most this form one sample; a time.",
         "leap": "A row further ahead than this has to be confirmed by others; a time. Without "
         "it: 30 days.",
         "repeated": "Which of two values for one moment is used.",
@@ -154,7 +154,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "role": "sensor: assimilated. withheld: predicted only, for validation. ignored: shown "
         "only. boundary: value of the state there. input: read by the equation. position: of a "
         "sensor that moves.",
-        "column": "Column of the data; {} stands for the number of a family of sensors.",
+        "column": "Column of the data; {} is replaced by the numbers of a family of sensors.",
         "columns": "Columns that are averaged.",
         "at": "Position, a length or one for each coordinate; or the name of a boundary.",
         "at_std": "Standard deviation of the position; a length.",
@@ -178,8 +178,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "repeated": "Which of two values for one moment is used; without it as in [intake].",
         "valid": "[low, high]: a value outside is not used; in the unit of the channel.",
         "missing": "Treatment of gaps; without it interpolate for inputs, hold for others.",
-        "spikes": "Whether single values of an input far off their neighbours are refused; "
-        "without it they are.",
+        "spikes": "Whether spikes of an input are rejected; without it they are.",
         "between": "Input between two readings: line, hold (until the next reading) or next (mean "
         "since the last reading).",
     },
@@ -198,7 +197,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "jumps": "Whether sudden changes are looked for, or of which unknowns; or a table of "
         "options.",
         "guards": "Whether safeguards are used; or a table of options.",
-        "verdict": 'Whether the run is judged; "cheap" without directions that cost solves.',
+        "verdict": 'Whether the run is assessed; "cheap" leaves out tests that require solves.',
     },
     "TikhonovSpec": {
         "norm": "Norm of the penalty.",

@@ -191,7 +191,9 @@ class LiveCase:
         self.running = live
         again = live.resume()
         if len(live.result):
-            LOG.info("goes on after %d samples, %d of them taken again", len(live.result), again)
+            LOG.info(
+                "resumed after %d samples, %d of them processed again", len(live.result), again
+            )
         return live
 
     def _prepared(self, first: Sample) -> Prepared:
@@ -210,8 +212,8 @@ class LiveCase:
 
         Remarks on irregular rows received meanwhile are added to `irregular`.
         """
-        LOG.info("waits for the first sample")
-        why = told = "no sample came"
+        LOG.info("waiting for the first sample")
+        why = logged = "no sample arrived"
         heard = time.monotonic()
         found: list[Ready] = []
         holds = [n for n, item in self.case.spec.channels.items() if item.between == "hold"]
@@ -232,10 +234,10 @@ class LiveCase:
                     return self._prepared(Sample(t=found[0].t, z=values)), found
                 except DataError as error:
                     why = str(error).removesuffix(".")
-                self.why = f"the run cannot begin yet: {why}"
-                if why != told:
-                    told = why
-                    LOG.warning("cannot begin yet: %s", why)
+                self.why = f"the run cannot start yet: {why}"
+                if why != logged:
+                    logged = why
+                    LOG.warning("cannot start yet: %s", why)
                 self._feed.acknowledge(found.pop(0))
             # The remarks of the poll in which the run begins are left to the run.
             for remark in remarks:
@@ -258,7 +260,9 @@ class LiveCase:
             return []
         remarks = []
         for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):
-            message = f"{name} = {found[k].values[name]:g} is far off all that follows"
+            message = (
+                f"{name} = {found[k].values[name]:g} is an outlier: it is far from all later values"
+            )
             remarks.append(Remark(START, name, message))
             found[k] = replace(found[k], values=found[k].values | {name: math.nan})
         return remarks
@@ -271,7 +275,7 @@ class LiveCase:
             return time.monotonic()
         if not self.silent and time.monotonic() - heard > silence:
             self.silent = True
-            self.why = f"nothing has come from the source for more than {silence:g} s"
+            self.why = f"no data from the source for more than {silence:g} s"
             LOG.warning("silent: %s", self.why)
         return heard
 
@@ -293,7 +297,7 @@ class LiveCase:
         if not isinstance(file, tuple):
             check_hours(case, self.case.clock, file)
         if spec.every > 1 and not (file or reader):
-            text = f"got {spec.every}; of a source that goes on all rows are taken: leave it out."
+            text = f"got {spec.every}; a live source uses all rows: leave it out."
             raise case.error("data.every", text)
         whole = isinstance(file, tuple) or str(file).endswith(".parquet") or reader is not None
         # These options are of files: lines that are sent have neither titles nor a second column.

@@ -88,8 +88,8 @@ class Measured:
             )
         if (self.samples.origin is None) != (other.samples.origin is None):
             raise SampleError(
-                f"{other.path}: its times and those of {self.path} are dates in one and numbers "
-                "in the other: write both alike."
+                f"{other.path}: one of this file and {self.path} has dates as times, the other has "
+                "numbers. Use the same format in both."
             )
         return replace(self, more=(*self.more, other))
 
@@ -136,7 +136,7 @@ def measured(
         There is no such file, or it is no table of times and measurements; one sentence.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
-        raise SampleError(f"{table}: a case is begun from a CSV file, with a header.")
+        raise SampleError(f"{table}: expected a CSV file with a header.")
     written = how_written(table, skip=skip)
     kinds = _kinds(table, written, time_format)
     time = _times(table, written, kinds)
@@ -147,7 +147,7 @@ def measured(
     counted = tuple(name for name in numbers if _counts_rows(name, written))
     columns = {n: Column((n,), decimal=written.decimal) for n in numbers if n not in counted}
     if not columns:
-        raise SampleError(f"{table}: beside the times, '{time[0]}', no column holds numbers.")
+        raise SampleError(f"{table}: no column but the times, '{time[0]}', contains numbers.")
     samples = read_csv(
         table,
         columns,
@@ -177,11 +177,13 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
     """Return column -> kind of most of its cells: "number", "date", "hour" or "text"."""
     header, rows = written.header, written.rows
     if not rows:
-        raise SampleError(f"{table}: holds no rows beside its header.")
+        raise SampleError(f"{table}: has no rows below its header.")
     form = form or next(iter(written.time_formats), "")
     of_cell = partial(_kind, decimal=written.decimal, form=form)
     if VALUES.issuperset(map(of_cell, filter(None, header))):
-        raise SampleError(f"{table}: has no header: begin it with a line of names of its columns.")
+        raise SampleError(
+            f"{table}: has no header. Add a first line with the names of its columns."
+        )
     if len(header) < 2:
         raise SampleError(
             f"{table}: has one column, '{header[0]}'; expected times and measurements, with a "
@@ -189,8 +191,8 @@ def _kinds(table: Path, written: Written, form: str) -> dict[str, str]:
         )
     if VALUES.isdisjoint(map(of_cell, rows[0])):
         raise SampleError(
-            f"{table}, row {written.skip + 2}: holds no numbers; the header is one line: delete "
-            "the second, or say --skip if the first are titles."
+            f"{table}, row {written.skip + 2}: contains no numbers. If the header has two lines, "
+            "delete the second. If the first lines are titles, set --skip."
         )
     return {
         name: mode([of_cell(cell) for cell in _cells(name, written)] or ["text"])
@@ -226,7 +228,7 @@ def _times(table: Path, written: Written, kinds: Mapping[str, str]) -> tuple[str
     elif hours:
         more = f" '{hours[0]}' has times of day: add a column of days."
     raise SampleError(
-        f"{table}: no column holds times: expected dates, or numbers that increase from row to "
+        f"{table}: no column contains times: expected dates, or numbers that increase from row to "
         f"row.{more}"
     )
 
@@ -251,7 +253,7 @@ def _format(table: Path, written: Written, time: tuple[str, ...], given: str) ->
         return formats[0]
     if not formats:
         raise SampleError(
-            f"{table}, column '{time[0]}': got '{cells[0]}'; say --time-format, as "
+            f"{table}, column '{time[0]}': got '{cells[0]}'; set --time-format, such as "
             "'%d.%m.%Y %H:%M'."
         )
     candidates = " or ".join(
@@ -259,8 +261,8 @@ def _format(table: Path, written: Written, time: tuple[str, ...], given: str) ->
         for form in formats
     )
     raise SampleError(
-        f"{table}, column '{time[0]}': the order of day, month and year in '{cells[0]}' cannot be "
-        f"known: say --time-format, {candidates}."
+        f"{table}, column '{time[0]}': the order of day, month and year in '{cells[0]}' is "
+        f"ambiguous: set --time-format, {candidates}."
     )
 
 

@@ -43,28 +43,28 @@ PLACES = "places.csv"  # the table of positions that is written beside the case
 FAMILY = 8  # so many numbered columns become one line of [channels]
 HEAD = """\
 #:schema ./livepde.schema.json
-# A case of livepde: which process, what is unknown, which channel is what.
-#   livepde check {case}     what is in here, and what its sensors can tell
-#   livepde run {case}       identify; writes a run directory
-# '?' stands for what the table does not tell: fill it in; 'livepde check' names what is left.
+# A case of livepde: equation, unknowns, and the role of each channel.
+#   livepde check {case}     check this case, and which unknowns its sensors can identify
+#   livepde run {case}       estimate the unknowns, and write a run directory
+# Replace each '?': the table has no value for it. 'livepde check' lists those that remain.
 """
 VALUES = """\
-# A value given at an end: role = "boundary", at = "left" or "right". An end without one is closed,
-# or has a flux or an exchange: [boundary], as left = {{ flux = "1 {flux}" }}."""
+# A measured value at an end: role = "boundary", at = "left" or "right". Other ends are closed, or
+# have a flux or an exchange in [boundary], such as left = {{ flux = "1 {flux}" }}."""
 ENDS = """\
-# A value given at a boundary: role = "boundary", at = its name, as "left"; others are closed."""
+# A measured value at a boundary: role = "boundary", at = its name. Other boundaries are closed."""
 TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
 NOISE = 0.05
 CASE = """\
 #:schema ./livepde.schema.json
-# A case of livepde: which process, what is unknown, which channel is what.
-#   livepde check {0}     what is in here, and what its sensors can tell
-#   livepde run {0}       identify; writes a run directory
-# Numbers are in the model's units (m, s, degC); text may carry any unit of the same kind.
-# With data of your own: 'livepde init DIR --data FILE.csv' fills in what they tell.
+# A case of livepde: equation, unknowns, and the role of each channel.
+#   livepde check {0}     check this case, and which unknowns its sensors can identify
+#   livepde run {0}       estimate the unknowns, and write a run directory
+# Numbers are in the model's units (m, s, degC). Text such as "40 cm" is converted.
+# For your own data: 'livepde init DIR --data FILE.csv' writes a case from the table.
 title = "A metal rod, heated and cooled at its left end"
 equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
-                               # or your own as "file.py:function" (run it with --allow-code)
+                               # or your own: "file.py:function" (run it with --allow-code)
 initial = "interpolate"        # from the first sample; or a number such as "20 degC"
 
 [mesh]
@@ -73,16 +73,16 @@ to = "40 cm"
 cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
 
 [data]
-file = "rod.csv"               # beside this file; ${{LIVEPDE_DATA}} may stand in it
+file = "rod.csv"               # relative to this file; may contain ${{LIVEPDE_DATA}}
 time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
 time_unit = "s"
 # dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
-# as a German Excel writes it: separator = ";", decimal = ",", encoding = "cp1252"
+# written by a German Excel: separator = ";", decimal = ",", encoding = "cp1252"
 # start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
 
-[unknowns.alpha]               # names are those of the equation
-prior = "5e-5 m^2/s"           # what you would have said without data ...
-std = "3e-5 m^2/s"             # ... and how far off that may be
+[unknowns.alpha]               # an unknown of the equation
+prior = "5e-5 m^2/s"           # best guess before seeing data
+std = "3e-5 m^2/s"             # its standard deviation
 bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
 # by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
 # as a field: field = true, length = "10 cm"   (and no bounds)
@@ -102,7 +102,7 @@ kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed
 scheme = "alexander2"          # second order; or "implicit-euler"
 dt_max = "20 s"                # longer intervals between samples are divided
 
-[expect]                       # of these very data: drop it, or say what you expect of yours
+[expect]                       # results for these data: remove it, or adapt it to yours
 alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
 rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
 """
@@ -136,7 +136,7 @@ class FoundChannel:
 
 
 def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
-    """Return the text of a case in `folder` that equation and table tell; the rest is open."""
+    """Return the text of a case in `folder`, from equation and table; the rest is open."""
     found = channels_in(table, equation)
     given = {item.name for item in found if item.columns and not item.is_sensor}
     # Noise is a standard deviation, a difference of temperatures: in K.
@@ -192,7 +192,7 @@ def _top(table: Measured, equation: Equation, inputs: set[str]) -> Iterator[str]
     """Yield the lines of title, equation, the options that it needs, and the initial state."""
     yield toml_line("title", table.path.stem)
     yield _told(toml_line("equation", equation.name), equation.formula)
-    yield f"# 'livepde equations {equation.name}' tells what it knows; 'livepde equations': others"
+    yield f"# 'livepde equations {equation.name}' lists its keys, 'livepde equations' all equations"
     asked = equation.alternatives.get(_alternative(equation, inputs), ())
     for name, option in equation.options.items():
         if option.default is None or name in asked:
@@ -233,7 +233,7 @@ def _data(table: Measured, folder: Path) -> dict[str, Any]:
 
 
 def _missing(table: Measured) -> list[float]:
-    """Return the values that stand for no reading in some column, and are usual in no other."""
+    """Return the values that are placeholders in some column, and usual in no other."""
     columns = table.columns.values()
     found = {one.value for values in columns for one in sentinels(values)}
 
@@ -300,8 +300,8 @@ def _alternative(equation: Equation, inputs: set[str]) -> str:
 
 def _unknowns(equation: Equation, inputs: set[str]) -> Iterator[str]:
     """Yield the lines of the unknowns that have to be there."""
-    yield "# prior: what you would have said without data; std: how far off that may be;"
-    yield '# transform = "log" keeps an unknown positive: drop it where it need not be'
+    yield "# prior: best guess before seeing data; std: its standard deviation"
+    yield '# transform = "log" keeps an unknown positive; remove it if negative values are possible'
     chosen = _alternative(equation, inputs)
     for name, variable in equation.unknowns.items():
         if name == chosen or not variable.optional:
@@ -330,9 +330,9 @@ def _inputs(found: list[FoundChannel]) -> Iterator[str]:
 
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
     """Yield the lines of [channels], with comments on their options."""
-    yield f'# Drop what is no {equation.state.text}. role = "withheld": only scored.'
+    yield f'# Remove what is not {equation.state.text}. role = "withheld": for validation only.'
     for name, quantity in equation.quantities.items():
-        yield f'# In place of at = ...: quantity = "{name}", the {quantity.text}.'
+        yield f'# Instead of at = ...: quantity = "{name}", the {quantity.text}.'
     if equation.takes_values:
         units = equation.fluxes
         yield ENDS if units is None else VALUES.format(flux=units.flux)
@@ -411,7 +411,7 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
         at = [at] * equation.dimension
     elif place is not None and equation.length_unit:
         at = f"{place[1].replace(',', '.')} {place[2]}"
-        told.append("place as its name says")
+        told.append("position from the name")
     elif fraction is not None:
         told.append(f'at = "{fraction[0]} {equation.length_unit}"?')
     given["at"] = at
@@ -510,7 +510,7 @@ def check_free(folder: Path, names: Iterable[str]) -> None:
         raise RunError(f"{folder} is a file: 'livepde init DIR --data {folder}' takes a table.")
     for path in (folder / name for name in names):
         if path.exists():
-            raise RunError(f"{path} is there already: choose another folder, nothing was written.")
+            raise RunError(f"{path} exists. Choose another folder. Nothing was written.")
 
 
 def write_files(folder: Path, files: Mapping[str, str]) -> None:

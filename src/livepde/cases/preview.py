@@ -31,7 +31,7 @@ MOST_SAMPLES = 500
 MOST_CANDIDATES = 400  # positions that are compared
 SHORT_LIST = 5  # of those, tried in a preview of their own where unknowns move
 NEW = "one more sensor"
-NOTHING = "advice on sensors: the data hold no measurement."
+NOTHING = "advice on sensors: the data contain no measurement."
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Identified:
 
     @property
     def hardly(self) -> bool:
-        """True if the sensors provide hardly any information on it."""
+        """True if the sensors do not identify it."""
         return self.left > FLAT
 
 

@@ -157,8 +157,8 @@ def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> Prior:
         if isinstance(given, str):
             # An equation of the user's own may declare no unit, and then text cannot be converted.
             if not unit and ":" in case.spec.equation:
-                text = f"got '{given}'; '{case.spec.equation}' has no units of its own: "
-                text += f"say {key}.unit, too, or write numbers."
+                text = f"got '{given}'; '{case.spec.equation}' defines no units: "
+                text += f"add `{key}.unit`, or write numbers."
                 raise case.error(f"{key}.{item}", text)
             return case.convert(given, unit, f"{key}.{item}")
         return rule.factor * given + rule.offset
@@ -174,7 +174,7 @@ def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"got [{low:g}, {high:g}] {unit}".rstrip()
             raise case.error(f"{key}.bounds", f"{text}; needs the lower one first.")
         if not low <= prior <= high:
-            text = f"the prior {prior:g} lies outside of the bounds [{low:g}, {high:g}] {unit}"
+            text = f"the prior {prior:g} is outside the bounds [{low:g}, {high:g}] {unit}"
             raise case.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
         return Normal(prior, std, (low, high))
@@ -193,13 +193,13 @@ def _transformed(
     low, high = bounds
     if transform == "log":
         if np.isfinite(high):
-            raise case.error(key, "transform='log' knows no upper bound; take 'logit'.")
+            raise case.error(key, "transform='log' has no upper bound; use 'logit'.")
         low = low if np.isfinite(low) else 0.0
     elif not np.isfinite(bounds).all():
         raise case.error(key, f"transform='logit' needs two finite bounds; got {bounds}.")
     if not low < median < high:
-        text = f"prior {median} is not inside of what transform='{transform}' allows; move it "
-        raise case.error(key, text + "inside of the bounds.")
+        text = f"prior {median} is outside the range of transform='{transform}'; move it "
+        raise case.error(key, text + "inside the bounds.")
     return (LogNormal if transform == "log" else LogitNormal)(median, std, (low, high))
 
 
@@ -271,7 +271,7 @@ def _without_cells(case: CaseContent, given: Any, key: str) -> CaseError:
     spans = " x ".join(f"[{low:g}, {high:g}]" for low, high in sides)
     limits = zip(mesh.p.min(axis=1), mesh.p.max(axis=1), strict=True)
     ends = " x ".join(f"{low:g} to {high:g}" for low, high in limits)
-    text = f"{spans} {unit} holds no cell of the mesh, which spans {ends} {unit}."
+    text = f"{spans} {unit} contains no cell of the mesh, which spans {ends} {unit}."
     return case.error(key, text)
 
 
@@ -316,9 +316,9 @@ def drive_notes(case: CaseContent, model: Model) -> list[str]:
     if not _rests(model):
         return []
     return [
-        "No boundary value, flux, exchange, source or input: nothing drives the process, and only "
-        "the decay of its initial state tells of the unknowns. Give a channel role = 'boundary', "
-        "or [boundary] a value or a flux."
+        "No boundary value, flux, exchange, source or input drives the process. Only the decay of "
+        "its initial state depends on the unknowns. Add a channel with role = 'boundary', or a "
+        "value or a flux in [boundary]."
     ]
 
 
@@ -339,14 +339,14 @@ def process_notes(case: CaseContent) -> list[str]:
     graded = case.equation.spacing == "geometric"
     if graded and spec.start is not None and spec.spacing == "uniform":
         found.append(
-            "The mesh is uniform, with cells too large at the left end, where "
-            f"'{case.equation.name}' changes most: mesh.spacing = 'geometric'."
+            "The mesh is uniform, so its cells are too large at the left end, where "
+            f"'{case.equation.name}' changes most. Set `mesh.spacing = 'geometric'`."
         )
     line = len(case.mesh.p) == 1 and spec.file is None
     if line and (crossed := off_nodes(case, case.mesh.p[0])):
-        remedy = "add the ends to mesh.nodes" if spec.nodes else "take more mesh.cells"
+        remedy = "Add the ends to `mesh.nodes`" if spec.nodes else "Increase `mesh.cells`"
         names, end = ", ".join(crossed), "end" if len(crossed) > 1 else "ends"
-        found.append(f"{names[0].upper()}{names[1:]} {end} inside of a cell: {remedy}.")
+        found.append(f"{names[0].upper()}{names[1:]} {end} inside a cell. {remedy}.")
     return found
 
 
@@ -375,7 +375,7 @@ def conditioned(case: CaseContent) -> CaseContent:
         keys = [f"boundary.{name}" for name in given] + [f"sources.{n}" for n in spec.sources]
         key = next(iter(keys), f"channels.{next(iter(shifted), '')}.offset")
         text = f"the equation '{equation.name}' takes no fluxes and no sources of a case; "
-        raise case.error(key, text + "'livepde equations' tells which ones do.")
+        raise case.error(key, text + "'livepde equations' lists those that do.")
     names = _ConditionNames(case)
     boundary = {name: _passing(names, units, name, item) for name, item in given.items()}
     for name, channel in shifted.items():
@@ -546,5 +546,5 @@ def _place(case: CaseContent, mesh: Any, over: Any, name: str) -> Any:
         return subdomain(case, mesh, over, key)
     place = inside(case, over, len(mesh.p), key)
     if not np.any(place(mesh.p[:, mesh.t].mean(axis=1))):
-        raise case.error(key, "holds no cell of the mesh.")
+        raise case.error(key, "contains no cell of the mesh.")
     return place

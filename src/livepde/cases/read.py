@@ -95,13 +95,13 @@ def read_text(path: Path) -> str:
     """Return the text of a case file."""
     if path.suffix in DATA:
         raise CaseError(
-            f"{path}: is data, not a case: 'livepde init DIR --data {path}' begins one."
+            f"{path}: is data, not a case. 'livepde init DIR --data {path}' begins one."
         )
     try:
         with path.open("rb") as file:
             content = file.read(LONGEST + 1)
         if len(content) > LONGEST:
-            raise CaseError(f"{path}: is longer than {LONGEST} bytes; data belong to a data file.")
+            raise CaseError(f"{path}: is longer than {LONGEST} bytes. Put data into a data file.")
         return content.decode("utf-8").replace("\r\n", "\n")
     except FileNotFoundError:
         near = _nearest(path.parent, path.name)
@@ -318,7 +318,7 @@ def parse(assignments: Iterable[str]) -> dict[str, Any]:
     for text in assignments:
         key, equals, value = text.partition("=")
         if not (equals and key.strip()):
-            raise CaseError(f"--set {text}: expected key=value, as law.memory='3 d'.")
+            raise CaseError(f"--set {text}: expected key=value, such as law.memory='3 d'.")
         if not value.strip():
             found[key.strip()] = None
             continue
@@ -367,14 +367,14 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
                 here[path[-1]] = value
             elif here.pop(path[-1], None) is None:
                 raise CaseError(
-                    f"{where}: there is no key '{'.'.join(path)}' to take away; "
+                    f"{where}: there is no key '{'.'.join(path)}' to remove; "
                     f"{did_you_mean(path[-1], here)}"
                 )
     return changed
 
 
 def settings_in(text: str) -> tuple[str, ...]:
-    """Return the settings in a text that separates them by semicolons outside of quotes.
+    """Return the settings in a text that separates them by semicolons outside quotes.
 
     >>> settings_in('data.separator=";"; law.jumps=true')
     ('data.separator=";"', 'law.jumps=true')
@@ -388,7 +388,9 @@ def key_path(key: str, where: str) -> tuple[str, ...]:
     try:
         here: Any = tomllib.loads(f"{key} = 0")
     except tomllib.TOMLDecodeError:
-        raise CaseError(f"{where}: '{key}' is no key; expected one as 'law.noise'.") from None
+        raise CaseError(
+            f"{where}: '{key}' is not a key; expected a key such as 'law.noise'."
+        ) from None
     path = []
     while isinstance(here, dict):
         ((name, here),) = here.items()
@@ -419,7 +421,7 @@ def toml_key(name: str) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value on one line, with blanks inside of the braces of an inline table."""
+    """Return a value on one line, with blanks inside the braces of an inline table."""
     if isinstance(value, Mapping):
         items = ", ".join(toml_line(key, item) for key, item in value.items())
         return f"{{ {items} }}" if items else "{}"

@@ -1,4 +1,4 @@
-"""Settings of a case that free the causes which a verdict names."""
+"""Settings of a case that estimate or correct the causes which a verdict names."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from livepde.cases.read import settings_in, toml_key, toml_value
 from livepde.verdict import Cause, Finding, Verdict, channel_setting
+from livepde.verdict.sentences import ESTIMATED, LIKELY, estimating
 
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
@@ -19,22 +20,24 @@ __all__ = ["KEYS", "adding", "freed", "with_settings"]
 
 WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
 PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
-KEYS = {"offset": "offset", "gain": "gain", "position": "at_std"}
+KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}
 """Kind of error of a sensor -> its key in a case; all sensors share one prior of each."""
 # Errors with a size that a fit could find.
 SIZED = ("boundary", "channel", "drift", "flux", "lag", "loss", "source")
 STATED = ("factor", "late")  # keys of a channel whose stated value a cause does not replace
-NO_SETTING = "No setting of this case frees it."
+NO_SETTING = "This case has no setting to estimate it."
 
 
 def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
-    """Return a verdict whose causes have the settings of the case that free them.
+    """Return a verdict whose causes have the settings of the case that estimate or correct them.
 
-    A cause that no setting frees says so in its remedy.
+    If there is no setting, the remedy states it.
     """
 
     def named(cause: Cause) -> Cause:
-        if settings := freed(prepared, cause):
+        settings = freed(prepared, cause)
+        cause = _with_remedy(prepared.case, cause, settings)
+        if settings:
             return replace(cause, setting="; ".join(settings))
         plain = cause.remedy.removesuffix(NO_SETTING).strip()
         more = f" {NO_SETTING}" if cause.kind in SIZED else ""
@@ -44,6 +47,18 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
         return replace(finding, causes=tuple(map(named, finding.causes)))
 
     return replace(verdict, findings=tuple(map(settled, verdict.findings)))
+
+
+def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
+    """Return a cause whose remedy, for an error of a sensor, has the value of its setting."""
+    if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
+        return cause
+    if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
+        return cause
+    if not settings:
+        return replace(cause, remedy=LIKELY[cause.kind].remedy.format(name=cause.subject))
+    value = settings[0].partition("=")[2]
+    return replace(cause, remedy=estimating(cause.kind, cause.subject, value))
 
 
 def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:

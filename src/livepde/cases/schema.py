@@ -88,7 +88,7 @@ BOUNDS: dict[str, Any] = {
 
 
 def _short(key: str) -> BeforeValidator:
-    """Return the reading of a value that is no table as a table with this key only."""
+    """Return the reading of a value that is not a table as a table with this key only."""
     return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
 
 
@@ -211,7 +211,7 @@ class MeshSpec(Spec):
         given = self.model_fields_set - {"spacing", "unit"}
         if given in ({"nodes"}, {"file"}, {"x", "y"}):
             if "spacing" in self.model_fields_set:
-                raise ValueError("spacing belongs to an interval with cells")
+                raise ValueError("spacing requires an interval with cells")
         elif given == {"start", "stop", "cells"}:
             if not isinstance(self.cells, int):
                 raise ValueError("cells: expected one number for an interval")
@@ -225,7 +225,7 @@ class MeshSpec(Spec):
                 "(an interval); or file"
             )
         if self.unit is not None and self.file is None:
-            raise ValueError("unit belongs to a file")
+            raise ValueError("unit requires file")
         return self
 
     def _check_rectangle(self) -> None:
@@ -316,7 +316,7 @@ class DataSpec(Spec):
         if self.reader is None and "time" not in self.model_fields_set:
             raise ValueError("time is missing: the name of the column of times")
         if self.reader is None and self.options:
-            raise ValueError("options belong to a reader")
+            raise ValueError("options require a reader")
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
         if len(sources) > 1:
             raise ValueError(f"{sources[0]} and {sources[1]} are two sources: keep one")
@@ -325,11 +325,11 @@ class DataSpec(Spec):
     @model_validator(mode="after")
     def _source_that_goes_on(self) -> DataSpec:
         if self.follow and not isinstance(self.file, str):
-            raise ValueError("follow belongs to one file that grows; several are not followed")
+            raise ValueError("follow requires a single file that grows")
         if self.live and not self.follow and (self.skip or not isinstance(self.time, str)):
             raise ValueError("skip and a time in two columns are only valid with a file")
         if self.live and self.every > 1:
-            raise ValueError("every belongs to data that are there, not to a source that goes on")
+            raise ValueError("every requires complete data, not a live source")
         return self
 
     def of(self, file: FileSpec) -> DataSpec:
@@ -344,7 +344,7 @@ class DataSpec(Spec):
 
     @property
     def live(self) -> bool:
-        """Whether the source goes on."""
+        """Whether the source is live."""
         return self.follow or self.mqtt is not None or self.opcua is not None
 
 
@@ -380,7 +380,7 @@ class EvolutionSpec(Spec):
 
 
 class PriorSpec(Spec):
-    """Keys of the prior of an unknown, also of a region that has one of its own."""
+    """Keys of the prior of an unknown, or of a region with its own prior."""
 
     prior: Quantity | None = None
     std: Quantity | None = None
@@ -413,13 +413,13 @@ class UnknownSpec(PriorSpec):
     @model_validator(mode="after")
     def _one_kind(self) -> UnknownSpec:
         if self.field and (self.regions or (self.bounds and not self.transform)):
-            raise ValueError("a field takes no regions, and bounds with a transform only")
+            raise ValueError("a field has no regions, and bounds only with a transform")
         if self.length is not None and not self.field:
-            raise ValueError("length belongs to a field: add field = true")
+            raise ValueError("length requires field = true")
         return self
 
     def at(self, region: RegionSpec) -> UnknownSpec | None:
-        """Return the prior of the unknown in a region; None if it has none of its own."""
+        """Return the prior of the unknown in a region; None if the region has no prior."""
         own = {key: getattr(region, key) for key in region.model_fields_set - {"over"}}
         return self.model_copy(update=own) if own else None
 
@@ -534,7 +534,7 @@ class ChannelSpec(Spec):
         if self.positions is not None and (self.columns or "{}" not in (self.column or "{}")):
             raise ValueError('positions takes column = a name with {} for that of a row, as "T_{}"')
         if self.at_std is not None and not self.is_point:
-            raise ValueError("at_std belongs to at = position")
+            raise ValueError("at_std requires at = position")
         return self
 
     @model_validator(mode="after")
@@ -545,15 +545,15 @@ class ChannelSpec(Spec):
         if self.role == "boundary":
             own -= {"offset"}
         if own and self.role not in ("sensor", "ignored"):
-            raise ValueError(f"{own.pop()} belongs to sensors that are assimilated")
+            raise ValueError(f"{own.pop()} requires role = 'sensor'")
         if self.of is not None and not sensor:
-            raise ValueError(f"of belongs to sensors, not to a channel of role {self.role}")
+            raise ValueError(f"of requires a sensor, but the role is {self.role}")
         if self.component is not None and not (sensor and self.is_point):
             raise ValueError("component requires a sensor at a position")
         if not self.drives and (self.missing == "interpolate" or self.spikes is not None):
             raise ValueError(
-                'missing = "interpolate" and spikes belong to boundary and input channels; '
-                "values of sensors that are far off are refused by law.gate"
+                'missing = "interpolate" and spikes require a boundary or input channel; '
+                "outliers of sensors are rejected by law.gate"
             )
         if not self.drives and "between" in self.model_fields_set:
             raise ValueError("between requires a boundary or input channel: leave it out")
@@ -564,7 +564,7 @@ class ChannelSpec(Spec):
                 'a value with between = "hold" is never missing: leave out the key missing'
             )
         if self.noise_column is not None and not sensor:
-            raise ValueError("noise_column belongs to sensors: leave it out")
+            raise ValueError("noise_column requires a sensor: leave it out")
         if self.role == "position" and self.noise is not None:
             raise ValueError("noise of a channel of role position is not possible: leave it out")
         return self
@@ -651,9 +651,9 @@ class OutputSpec(Spec):
     @model_validator(mode="after")
     def _thins_the_past(self) -> OutputSpec:
         if self.thin > 1 and self.retain is None:
-            raise ValueError("thin belongs to retain = the time for which all is kept")
+            raise ValueError("thin requires retain, the time for which all estimates are kept")
         if self.smoothed and self.retain is not None:
-            raise ValueError("smoothed takes all samples again, which retain does not keep")
+            raise ValueError("smoothed requires all samples, which retain does not keep")
         return self
 
 
@@ -694,7 +694,7 @@ class BoundarySpec(Spec):
     @model_validator(mode="after")
     def _consistent(self) -> BoundarySpec:
         if (self.transfer is None) != (self.ambient is None):
-            raise ValueError("transfer and ambient belong together: give both")
+            raise ValueError("transfer and ambient require each other: give both")
         if (self.value is None) != self.passes:
             raise ValueError("expected a value, or flux, or transfer with ambient")
         return self

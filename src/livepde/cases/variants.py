@@ -374,7 +374,7 @@ def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
     if math.isnan(base.log_evidence):
         text = (
             "Variants are not ranked: this case has no log evidence (its law has no covariance). "
-            "The case as it is remains."
+            "The case is kept unchanged."
         )
         return [text, *_failures(others), *_disagreements(best, [base, *others])]
     return [
@@ -395,8 +395,8 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
     if best is base:
         which = " that predicts the withheld sensors as well" if base.withheld else ""
         return (
-            f"Recommended: the case as it is. No variant{which} gains more than {GAINED:g} of log "
-            "evidence."
+            f"Recommended: the case, unchanged. No variant{which} gains more than {GAINED:g} of "
+            "log evidence."
         )
     text = (
         f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
@@ -404,9 +404,9 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
     )
     if math.isfinite(base.withheld_error):
         errors = f"{best.withheld_error:.3g} instead of {base.withheld_error:.3g}"
-        text += f" It misses the withheld sensors by {errors}."
+        text += f" Its error at the withheld sensors is {errors}."
     else:
-        text += " No sensor is withheld to confirm it."
+        text += " No withheld sensor confirms it."
     return text
 
 
@@ -425,7 +425,7 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
             )
     refuted = [f"'{one.variant.name}'" for one in others if one.gained(base) < -GAINED]
     if refuted:
-        yield f"The data speak against {', '.join(refuted)}: less evidence than the case has."
+        yield f"The data contradict {', '.join(refuted)}: lower evidence than the case."
     apart = [one for one in others if not one.error and math.isnan(one.gained(base))]
     if apart:
         names = ", ".join(f"'{one.variant.name}'" for one in apart)
@@ -441,7 +441,7 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
         for name in one.apart(best):
             found.setdefault(name, []).append(one.variant.name)
     for name, names in found.items():
-        others_say = ", ".join(f"'{one}'" for one in names)
-        yield f"{name} depends on the variant: its interval in {others_say} does not overlap."
+        listed = ", ".join(f"'{one}'" for one in names)
+        yield f"{name} depends on the variant: its interval in {listed} does not overlap."
     if shared and not found:
         yield "All variants agree: their intervals overlap with that of the recommended one."

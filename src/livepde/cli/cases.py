@@ -1,4 +1,4 @@
-"""To begin with: a case to start from, and the ready-made equations."""
+"""A case to start from, and the built-in equations."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def init(
     data: Annotated[
         list[Path] | None,
         option(
-            "Your own table, with a header: what it tells is filled in. Repeatable: several "
-            "are joined by time.",
+            "Table of measurements with a header. The case is filled in from it. Repeatable: "
+            "several tables are joined by time.",
             metavar="FILE.csv",
         ),
     ] = None,
     equation: Annotated[
         str | None,
         typer.Option(
-            help="With --data: one of those that 'livepde equations' shows. Default: heat.",
+            help="With --data: equation, as listed by 'livepde equations'. Default: heat.",
             autocompletion=names_in("livepde.models:EQUATIONS"),
             show_default=False,
         ),
@@ -43,26 +43,26 @@ def init(
     time_format: Annotated[
         str,
         option(
-            "With --data: of its dates, as '%d.%m.%Y %H:%M'. Default: found from the rows.",
+            "With --data: format of its dates, such as '%d.%m.%Y %H:%M'. Default: detected.",
             metavar="FORMAT",
         ),
     ] = "",
     skip: Annotated[
         int | None,
-        option("With --data: lines before the header. Default: found from the lines.", min=0),
+        option("With --data: number of lines before the header. Default: detected.", min=0),
     ] = None,
     settings: Annotated[
         list[str] | None,
         option(
-            "With --data: what you know beside the table, as mesh.to='40 cm'; repeatable.",
+            "With --data: set a case key, such as mesh.to='40 cm'. Repeatable.",
             "--set",
             metavar="KEY=VALUE",
         ),
     ] = None,
 ) -> None:
-    """Write a commented case to start from, with made-up data that it runs on, or for your own.
+    """Write a commented case, with synthetic data or for your own table.
 
-    For your own data, replace each '?' in the case: the table has no value for it.
+    If you give a table, replace each '?' in the case: the table has no value for it.
 
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
@@ -77,16 +77,14 @@ def init(
         given = {"--equation": equation, "--time-format": time_format, "--set": settings}
         given |= {"--skip": None if skip is None else "given"}
         for option in (name for name, value in given.items() if value):
-            raise ConfigurationError(
-                f"{option} belongs to a table of your own: add --data FILE.csv."
-            )
+            raise ConfigurationError(f"{option} requires --data FILE.csv.")
         case, table = write_template(folder)
         console.print(f"Wrote {case} and {table}. Next:", soft_wrap=True)
     else:
         if equation is not None and ":" in equation:
             raise ConfigurationError(
-                f"--equation takes a ready-made one: begin with any, and write '{equation}' into "
-                "the case."
+                f"--equation accepts built-in equations only. Start with any of them, and write "
+                f"'{equation}' into the case."
             )
         check_free(folder, ["case.toml"])
         found = named(equation or "heat", EQUATIONS, "equation")
@@ -115,7 +113,7 @@ def _read(data: Sequence[Path], equation: Equation, time_format: str, skip: int 
 def _show_written(
     console: Console, case: Path, data: Sequence[Path], files: Mapping[str, str]
 ) -> None:
-    """Print the names of the written files, and what is to be filled in there."""
+    """Print the names of the written files, and the keys to fill in there."""
     from livepde.cases.read import blanks_in, read_toml, toml_value
 
     blanks = blanks_in(read_toml(files["case.toml"], str(case)))
@@ -161,12 +159,12 @@ def equations(
     name: Annotated[
         str,
         typer.Argument(
-            help="Name of an equation; 'list' shows them.",
+            help="Name of an equation. 'list' lists them.",
             autocompletion=names_in("livepde.models:EQUATIONS"),
         ),
     ] = "list",
 ) -> None:
-    """Show the ready-made equations, and what a case says about one of them.
+    """List the built-in equations, or show the case keys of one of them.
 
     Example:  livepde equations heat
     """
@@ -181,13 +179,13 @@ def equations(
     found = named(name, EQUATIONS, "equation")
     console.print(f"[bold]{found.name}[/]  {escape(found.summary)}", soft_wrap=True)
     console.print(escape(found.formula), soft_wrap=True)
-    columns = ("where", "name", "what", "unit", "default")
-    print_table(console, Table("What a case says about it", columns, _entries(found)))
+    columns = ("table", "key", "meaning", "unit", "default")
+    print_table(console, Table("Keys of a case", columns, _entries(found)))
     console.print(f"Length in {found.length_unit or '1'}, time in {found.time_unit or '1'}.")
 
 
 def _entries(found: Equation) -> list[tuple[str, ...]]:
-    """Return what a case says about an equation: table, key, meaning, unit and default of each."""
+    """Return the case keys of an equation: table, key, meaning, unit and default of each."""
     unit = found.state.unit
     rows: list[tuple[str, ...]] = [("state", "u", found.state.text, unit, "")]
     for table, known in (("[unknowns]", found.unknowns), ("[channels], input", found.inputs)):

@@ -29,16 +29,16 @@ def check(
     case: CaseArgument,
     data: Annotated[
         str | None,
-        option("Other data than the case names (.csv, .jsonl, .parquet)."),
+        option("Use this data instead of the case's (.csv, .jsonl, .parquet)."),
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
     advise: Annotated[
         bool,
-        typer.Option("--advise", help="Tell also where one more point sensor would help most."),
+        typer.Option("--advise", help="Recommend a position for one more point sensor."),
     ] = False,
 ) -> None:
-    """Check a case and its data, and tell what its sensors can identify.
+    """Check a case and its data, and which unknowns its sensors can identify.
 
     Nothing is written. Example:  livepde check mycase/case.toml
     """
@@ -74,21 +74,20 @@ def _refused(prepared: Prepared) -> list[str]:
     """Return sentences on values of input channels that a run will refuse."""
     remarks = getattr(prepared.stream, "remarks", {})
     wild = [
-        f"{number} first values of {name} are far off all that follow, and off the other channels: "
-        "a run counts them as missing."
+        f"{name}: the first {number} values are outliers. A run counts them as missing."
         for (kind, name), number in remarks.items()
         if kind == "start"
     ]
     return wild + [
-        f"{number} values of {name} are far off those before and after: a run refuses them as "
-        'spikes; channels.NAME.spikes = "keep" takes them.'
+        f"{name}: {number} values are spikes. A run rejects them. To use them, set "
+        f'`channels.{name}.spikes = "keep"`.'
         for (kind, name), number in remarks.items()
         if kind == "spike"
     ]
 
 
 def _sentinels(case: Case, samples: DataTable) -> list[str]:
-    """Return sentences on values that may stand for no reading, as they are in the file."""
+    """Return sentences on values that may be placeholders, as they are in the file."""
     said: list[str] = []
     for name, values in zip(samples.names, samples.values.T, strict=True):
         column = case.columns[name]
@@ -96,8 +95,8 @@ def _sentinels(case: Case, samples: DataTable) -> list[str]:
             continue
         said += [
             f"{name}: {found.value:g} occurs {found.times} times, far outside the other values "
-            f"({found.low:.4g} to {found.high:.4g}). If it stands for no reading, add it to "
-            f"`data.missing`; else state the range with `channels.{name}.valid`."
+            f"({found.low:.4g} to {found.high:.4g}). If it is a placeholder, add it to "
+            f"`data.missing`. Otherwise specify the range with `channels.{name}.valid`."
             for found in sentinels(np.round((values - column.offset) / column.factor, 9))
         ]
     return said
@@ -116,14 +115,11 @@ def _sampling(prepared: Prepared, samples: DataTable) -> list[str]:
 
 
 def _switching(case: Case, samples: DataTable) -> list[str]:
-    """Return sentences on inputs that switch, of which the case does not state what lies between.
-
-    A stated `between` is the user's answer.
-    """
+    """Return sentences on inputs that switch, if the case does not specify `between`."""
     return [
-        f"{name}: constant stretches with jumps. If a value holds until the next reading, add "
-        f'`between = "hold"` to `[channels.{name}]`; if it is the mean since the last reading, '
-        '`"next"`; `"line"`, the default, makes a ramp of each jump.'
+        f'{name}: constant stretches with jumps, but the default `between = "line"` interpolates '
+        f'each jump. If a value holds until the next reading, add `between = "hold"` to '
+        f'`[channels.{name}]`. If it is the mean since the last reading, add `between = "next"`.'
         for name, channel in case.roles("input").items()
         if "between" not in channel.model_fields_set
         and switches(samples.t, samples.values[:, samples.names.index(name)])
@@ -131,10 +127,10 @@ def _switching(case: Case, samples: DataTable) -> list[str]:
 
 
 def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
-    """Print the information on the unknowns that the sensors give; return sentences on it."""
+    """Print how well the sensors can identify the unknowns; return sentences on it."""
     from livepde.cases.preview import MOST_SAMPLES, preview
     from livepde.runs import Table
-    from livepde.verdict import TELLING
+    from livepde.verdict.sentences import LONGER_DATA
 
     found = preview(prepared, prepared.stream)
     late = {item.name: item.left for item in found.last}
@@ -146,21 +142,22 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             _percent(item.left),
             *([_percent(late[item.name])] if item.name in late else []),
             item.unit,
-            "hardly identified" if item.hardly else "",
+            "not identifiable" if item.hardly else "",
         )
         for item in found.unknowns
     ]
     if rows:
-        more = [f"left by the last {MOST_SAMPLES}"] if late else []
-        columns = ("unknown", "prior std. dev.", "after", "left", *more, "unit", "")
-        title = f"What {'the first ' if late else ''}{found.samples} samples can tell, at best"
+        more = [f"share after the last {MOST_SAMPLES}"] if late else []
+        columns = ("unknown", "prior std. dev.", "after", "share", *more, "unit", "")
+        which = f"the first {found.samples}" if late else str(found.samples)
+        title = f"Smallest standard deviations that {which} samples allow"
         print_table(console, Table(title, columns, rows))
-    hardly = [
-        f"{item.name}: these data can tell hardly anything. {TELLING}"
+    unidentified = [
+        f"`{item.name}` is not identifiable from these data. {LONGER_DATA}"
         for item in found.unknowns
         if item.hardly
     ]
-    return [*hardly, *found.sentences]
+    return [*unidentified, *found.sentences]
 
 
 def _percent(share: float) -> str:
@@ -177,11 +174,11 @@ def _show_advice(console: Console, prepared: Prepared) -> None:
     at = ", ".join(f"{x:.3g}" for x in found.position)
     rows = [(name, _percent(left), _percent(found.then[name])) for name, left in found.now.items()]
     title = f"One more sensor helps most at {at} {unit}".rstrip()
-    columns = ("unknown", "std. dev. left", "with the sensor")
+    columns = ("unknown", "std. dev. / prior", "with the sensor")
     print_table(console, Table(title, columns, rows))
     console.print(
-        f"Best of {found.candidates} vertices by the mean share of variance left, with the noise "
-        "of the other sensors.",
+        f"Best of {found.candidates} vertices by the mean share of the prior variance, with the "
+        "noise of the other sensors.",
         soft_wrap=True,
     )
 
@@ -204,17 +201,17 @@ def _show_wiring(console: Console, case: Case) -> None:
                 "" if math.isinf(high - low) else f"{low:g} to {high:g} {case.unit(name)}",
                 f"{policy.longest(habit):g} {unit}".rstrip(),
                 policy.keeps(name),
-                "skip" if column.needed else spec.gaps if spec.drives else "go on",
+                "skip" if column.needed else spec.gaps if spec.drives else "continue",
                 spec.between if spec.drives and not column.noise_of else "",
             )
         )
-    columns = ("channel", "role", "column", "valid", "waits", "of two", "missing", "between")
+    columns = ("channel", "role", "column", "valid", "wait", "repeated", "missing", "between")
     # Most channels are lines: the table stays narrow then.
     shown = len(columns) - all(row[-1] in ("", "line") for row in rows)
     rows = [row[:shown] for row in rows]
     print_table(console, Table(f"Channels from {source_text(case)}", columns[:shown], rows))
     console.print(
-        "Add --data FILE, a recording with the same columns, to see what its sensors can identify.",
+        "To see what the sensors can identify, add --data FILE: a recording with these columns.",
         soft_wrap=True,
     )
 
@@ -275,7 +272,7 @@ def _longest_gap(present: Any) -> int:
 
 
 def _show_checks(console: Console, prepared: Prepared) -> bool:
-    """Run the library's own checks on the case's model; True if one failed."""
+    """Run the library's checks on the model of the case; True if one failed."""
     from livepde.diagnostics import check_model, check_observation
 
     case, first = prepared.case, prepared.first

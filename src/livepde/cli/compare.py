@@ -35,31 +35,31 @@ def compare(
     variants: Annotated[
         list[str] | None,
         option(
-            "A variant: its name, and settings as those of --set, separated by ';'. Repeat it for "
-            "more. Default: the likely causes of the first run, and what is often wrong.",
+            "A variant: its name, and settings as for --set, separated by ';'. Repeatable. "
+            "Default: the likely causes of the first run, and common errors.",
             "--variant",
             metavar="'NAME: KEY=VALUE; KEY=VALUE'",
         ),
     ] = None,
     settings: SetOption = None,
     data: Annotated[
-        str | None, option("Other data than the case names (.csv, .jsonl, .parquet).")
+        str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
     ] = None,
     most: Annotated[
-        int, typer.Option(min=1, help="Variants at most, where the program chooses them.")
+        int, typer.Option(min=1, help="Largest number of variants, if the program chooses them.")
     ] = 12,
     jobs: Annotated[
-        int, option("Processes at once. Default: one for each processor.", min=1)
+        int, option("Number of processes. Default: one for each processor.", min=1)
     ] = os.cpu_count() or 1,
     write: Annotated[
         Path | None,
         option(
-            "Write the recommended variant as a case there, with the comments of the case.",
+            "Write the recommended variant as a case file, with the comments of the case.",
             metavar="FILE.toml",
         ),
     ] = None,
     force: Annotated[
-        bool, typer.Option("--force", help="With --write: replace a file that is there.")
+        bool, typer.Option("--force", help="With --write: replace an existing file.")
     ] = False,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
@@ -82,7 +82,7 @@ def compare(
     loaded = load_case(case, allow_code, settings)
     if loaded.goes_on(data) or data == "-":
         raise ConfigurationError(
-            "compare requires data that are complete: add --data FILE with recorded rows."
+            "compare requires complete data. Add --data FILE with recorded rows."
         )
     if write is not None:
         _check_target(write, case, force)
@@ -91,13 +91,13 @@ def compare(
     except CaseError as error:
         if named == case:
             raise
-        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        moved = "The case has been moved or changed. Add --data FILE with its data."
         raise RunError(f"{error} {moved}") from error
     run = partial(_run, case, settings, data=data, allow_code=allow_code)
     stated = Variant(AS_STATED)
     (base, *found) = _all(run, [stated, *given], jobs, as_json)
     if base.error:
-        raise RunError(f"{case}: the run of the case itself failed: {base.error}")
+        raise RunError(f"{case}: the run of the case failed: {base.error}")
     chosen = [] if given else proposed(prepared, base, most)
     found += _all(run, chosen, jobs, as_json)
     best = recommended(base, found)
@@ -133,7 +133,7 @@ def _of_run(
 def _all(
     run: Callable[[Variant], VariantRun], variants: Sequence[Variant], jobs: int, quiet: bool
 ) -> list[VariantRun]:
-    """Return how the runs of variants ended, in their order; each in a process of its own."""
+    """Return how the runs of variants ended, in their order; each in its own process."""
     from livepde.progress import watched
 
     def apart(variant: Variant) -> VariantRun:
@@ -144,7 +144,7 @@ def _all(
             try:
                 return process.submit(run, variant).result()
             except BrokenProcessPool:
-                return VariantRun(variant, error="its process was killed, or out of memory")
+                return VariantRun(variant, error="its process was killed or ran out of memory")
 
     if jobs == 1 or len(variants) < 2:
         ended: Iterator[VariantRun] = map(run, variants)
@@ -194,7 +194,7 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
             )
         )
     columns = ("variant", "verdict", "log evidence", "misfit / noise", "withheld RMSE", "unknowns")
-    title = "Variants; * recommended; log evidence less that of the case"
+    title = "Variants (* recommended; log evidence relative to the case)"
     tables = [Table(title, (*columns, "overlaps", *labels), rows)]
     more = [
         (one.variant.name, label, _interval(known), known.unit)

@@ -1,4 +1,4 @@
-"""Write a run, or the identifier of a case, for other programs."""
+"""Export of a run, or of the identifier of a case, for other programs."""
 
 from __future__ import annotations
 
@@ -42,13 +42,11 @@ def export(
     ],
     at: Annotated[
         str | None,
-        option(
-            "Of .vtu and .vtk: the time of the fields, as 3600, '1 h' or a date. Default: the last."
-        ),
+        option("Time of the fields in .vtu and .vtk: 3600, '1 h' or a date. Default: the last."),
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Write a run, also one that still goes on, in formats that other programs open.
+    """Convert a run, also an unfinished one, to formats of other programs.
 
     Example:  livepde export runs/mycase mycase.nc mycase.csv mycase.html
     ParaView: livepde export runs/mycase mycase.xdmf
@@ -115,27 +113,25 @@ def fmu(
     source: Annotated[
         str,
         argument(
-            "The case file (TOML); or file.py:function or module:function of your own, which "
-            "returns an Identifier.",
+            "The case file (TOML), or file.py:function or module:function that returns an "
+            "Identifier.",
             metavar="CASE",
         ),
     ],
     out: Annotated[
         Path | None,
-        option("File to write. Default: the case's name."),
+        option("File to write. Default: named after the case."),
     ] = None,
-    fmi: Annotated[Standard, typer.Option(help="Version of the standard: FMI 2.0 or 3.0.")] = (
-        Standard.two
-    ),
+    fmi: Annotated[Standard, typer.Option(help="Version of FMI: 2 or 3.")] = (Standard.two),
     force: ForceOption = False,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
 ) -> None:
-    """Write a case as a co-simulation unit (FMU) for Simulink, Modelica tools and others.
+    """Export a case as a co-simulation unit (FMU) for Simulink, Modelica tools and others.
 
-    Its inputs are the channels of the case, its outputs the estimates with their deviations, the
-    model's value at each sensor, and a status. Where it runs, Python has to find livepde.
+    Its inputs are the channels of the case. Its outputs are the estimates with their standard
+    deviations, the model's value at each sensor, and a status. It requires an installed livepde.
 
     Example:  livepde fmu mycase/case.toml --out rod.fmu
     """
@@ -144,7 +140,7 @@ def fmu(
 
     code = is_code(source)
     if code and settings:
-        raise ConfigurationError(f"--set belongs to a case; {source} is code.")
+        raise ConfigurationError(f"--set requires a case file, but {source} is code.")
     recipe = recipe_of(source if code else load_case(Path(source), allow_code, settings))
     process = recipe.process
     path = write_unit(recipe, out, fmi=2 if fmi is Standard.two else 3, force=force)

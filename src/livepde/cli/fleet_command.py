@@ -1,4 +1,4 @@
-"""Many runs of one case: a table says which."""
+"""Many runs of one case, which a table lists."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["fleet"]
 
 SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
-ASKED, GOES_ON = "as --separately says", "they had begun before"
+ASKED, GOES_ON = "--separately", "resumed runs"
 UNFIT = frozenset('/\\:*?"<>|')  # what names of folders do without
 
 
@@ -63,7 +63,7 @@ class MemberOutcome:
     status
         "finished", "interrupted" or "failed".
     samples
-        How many it has taken.
+        How many it has processed.
     level
         Level of its verdict; empty without samples.
     unknowns
@@ -94,8 +94,8 @@ def fleet(
     members: Annotated[
         Path,
         option(
-            "A .csv file with a row for each run. Columns: name; data, a file beside the "
-            "table; and keys of the case, as unknowns.alpha.prior, with a value for each run."
+            "A .csv file with a row for each run. Columns: `name`, `data` (a file, relative to the "
+            "table), and case keys such as `unknowns.alpha.prior`."
         ),
     ],
     out: Annotated[
@@ -103,33 +103,31 @@ def fleet(
         option("Folder for the run directories. Default: a new one in runs/."),
     ] = None,
     jobs: Annotated[
-        int, typer.Option(min=-1, help="Processes at once; -1 for one on each processor.")
+        int, typer.Option(min=-1, help="Number of processes. -1: one for each processor.")
     ] = 1,
     backend: Annotated[
         Backend | None,
         option(
-            "Backend of joblib for the processes: loky on this machine (default with --jobs); "
-            "Dask or Ray, with the cluster that DASK_SCHEDULER_ADDRESS or RAY_ADDRESS names."
+            "joblib backend of the processes: loky on this machine (default with --jobs), or Dask "
+            "or Ray with the cluster at DASK_SCHEDULER_ADDRESS or RAY_ADDRESS."
         ),
     ] = None,
     resume: Annotated[
         bool,
-        typer.Option(
-            "--resume", help="Go on with the runs in --out; begin those that are not there."
-        ),
+        typer.Option("--resume", help="Resume the runs in --out, and start the missing ones."),
     ] = False,
     separately: Annotated[
         bool,
         typer.Option(
             "--separately",
-            help="Step no members together: the numbers are those of 'livepde run' to the bit.",
+            help="Run each member separately, with results identical to 'livepde run'.",
         ),
     ] = False,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     settings: SetOption = None,
 ) -> None:
-    """Run a case for each row of a table: other data, other settings, a run directory each.
+    """Run a case for each row of a table, with its own data, settings and run directory.
 
     Members that differ in nothing but data and initial state are stepped together, many times
     faster, where there are blocks for their case; the summary says why others are not. A run that
@@ -140,7 +138,7 @@ def fleet(
     from livepde.runs import free_path, refuse_taken
 
     if resume and out is None:
-        raise ConfigurationError("--resume needs --out: the folder of the runs to go on with.")
+        raise ConfigurationError("--resume requires --out: the folder of the runs to resume.")
     if jobs == 0:
         raise ConfigurationError("--jobs 0: give at least 1, or -1 for one on each processor.")
     rows = _read(members)
@@ -205,7 +203,7 @@ def _member(content: Mapping[Hashable, str], path: Path) -> Member:
     texts = {str(key).strip(): str(value).strip() for key, value in content.items()}
     name, data = texts.pop(NAME), texts.pop(DATA, "")
     if not name or name.startswith(".") or UNFIT & set(name):
-        raise DataError(f"{path}: the name {name!r} does not do for a folder.")
+        raise DataError(f"{path}: the name {name!r} is not valid as a folder name.")
     given = tuple(f"{key}={value}" for key, value in texts.items() if value)
     return Member(name, str(path.parent / data) if data else "", given)
 
@@ -235,12 +233,12 @@ def _each(
     except ConfigurationError:
         raise
     except RunError as error:  # workers died again and again
-        given_up = f"{error} Go on with --resume."
+        given_up = f"{error} Resume with --resume."
         lost = {row.name: MemberOutcome(row.name, "failed", error=given_up) for row in rows}
         ended = lost | run.left(rows, ended, "failed", given_up) | ended
     except (Exception, KeyboardInterrupt) as error:
         status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
-        ended |= run.left(rows, ended, status, "The command was ended: go on with --resume.")
+        ended |= run.left(rows, ended, status, "The command was ended. Resume with --resume.")
         summed_up()
         raise
     return _in_order(rows, ended), told, summed_up()
@@ -362,7 +360,7 @@ class FleetRunner:
         return command + [word for text in self._own(member) for word in ("--set", text)]
 
     def _refuse_other(self, member: Member, case: Case) -> None:
-        """Raise `RunError` if there is a run to go on with that is none of this member."""
+        """Raise `RunError` if there is a run to resume that is not a run of this member."""
         from livepde import runs
 
         target = self._target(member.name)
@@ -397,7 +395,7 @@ class FleetRunner:
         return ended
 
     def _alone(self, member: Member, prepared: Prepared) -> MemberOutcome:
-        """Run one member, or find that it is through."""
+        """Run one member, if it has not finished."""
         case, name = prepared.case, member.name
         target = self._target(name)
         try:

@@ -65,8 +65,8 @@ def in_parts(
         from joblib.parallel import get_active_backend
     except ImportError as error:
         raise ConfigurationError(
-            "--jobs needs joblib: pip install 'livepde[fleet]'; without it the runs follow each "
-            "other."
+            "--jobs requires joblib: pip install 'livepde[fleet]'. Without --jobs, members run one "
+            "after the other."
         ) from error
     with ExitStack() as stack:
         if backend is not None:
@@ -90,12 +90,12 @@ def in_parts(
                     raise
                 lost += 1
                 members = sum(map(len, parts.values()))
-                what = f"A worker process died (killed, or out of memory), {members} members open"
+                what = (
+                    f"A worker process died (killed or out of memory), {members} members unfinished"
+                )
                 if lost == ATTEMPTS:
-                    raise RunError(
-                        f"{what}; {lost} times in a row, with nothing done in between."
-                    ) from error
-                told.append(f"{what}: they went on from their run directories.")
+                    raise RunError(f"{what}, {lost} times in a row without progress.") from error
+                told.append(f"{what}. They were resumed from their run directories.")
 
 
 def _attempt(

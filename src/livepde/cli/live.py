@@ -1,4 +1,4 @@
-"""A run beside a process: it waits for the first sample, and goes on until it is stopped."""
+"""A live run: it waits for the first sample, and continues until it is stopped."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ METRICS_PORT = 9100
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """How a run goes on beside a process.
+    """Options of a live run.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
     """Return the content of /health, also before the first sample."""
     if wiring.running is not None:
         return wiring.running.health
-    status = "waits for the first sample"
+    status = "waiting for the first sample"
     silent, why = wiring.silent, wiring.why
     ailment = "silent" if silent else "start" if why else ""
     return {
@@ -141,13 +141,13 @@ class _Heartbeat:
     """A sink that logs the progress of a run at intervals."""
 
     def __init__(self) -> None:
-        self._said = -math.inf
+        self._logged = -math.inf
 
     def put(self, estimate: Estimate) -> None:
         now = time.monotonic()
-        if now - self._said < BEAT:
+        if now - self._logged < BEAT:
             return
-        self._said = now
+        self._logged = now
         numbers = estimate.parameters.items()
         shown = ", ".join(f"{label} = {value:.6g} +- {std:.2g}" for label, (value, std) in numbers)
         LOG.info("t = %g: %s", estimate.t, shown or estimate.status.code)
@@ -184,7 +184,7 @@ def _observers(
 
 
 def _show(page: str, token: str, folder: Path, stack: ExitStack) -> None:
-    """Serve the page from a process of its own: drawing must not delay steps."""
+    """Serve the page from a separate process: drawing must not delay steps."""
     watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", page]
     secret = {"LIVEPDE_TOKEN": token} if token else {}
     process = subprocess.Popen(

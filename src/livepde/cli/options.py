@@ -31,7 +31,7 @@ __all__ = [
 
 
 def option(text: str, *names: str, **more: Any) -> Any:
-    """Return an option whose help says its default itself, or needs none."""
+    """Return an option whose help names its default, or needs none."""
     return typer.Option(*names, help=text, show_default=False, **more)
 
 
@@ -41,23 +41,23 @@ def argument(text: str, **more: Any) -> Any:
 
 
 JsonOption = Annotated[
-    bool, typer.Option("--json", help="Print one JSON object, with 'checks'; exit 1 if one fails.")
+    bool, typer.Option("--json", help="Print one JSON object. If a check fails, exit with code 1.")
 ]
 OutOption = Annotated[
     Path | None,
-    option("Run directory to make. Default: a new one in runs/."),
+    option("Run directory to create. Default: a new one in runs/."),
 ]
 CodeOption = Annotated[
     bool,
     typer.Option(
-        "--allow-code", help="Load the equation or reader of your own that the case names."
+        "--allow-code", help="Load the Python code (equation or reader) that the case names."
     ),
 ]
 EnvOption = Annotated[
     list[str] | None,
     option(
-        "Environment variable that the case may use as a password (`password_env`), if its name "
-        "does not begin with LIVEPDE_. Repeat it for more.",
+        "Allow the case to send this environment variable as a password (`password_env`). "
+        "Repeatable. Not required for names that begin with LIVEPDE_.",
         "--allow-env",
         metavar="NAME",
     ),
@@ -65,14 +65,14 @@ EnvOption = Annotated[
 SetOption = Annotated[
     list[str] | None,
     option(
-        "Another value than the case has, as law.noise='2 K'; nothing after the = takes the "
-        "key away. Repeat it for more.",
+        "Override a case setting, such as `law.noise='2 K'`. An empty value removes the key. "
+        "Repeatable.",
         "--set",
         metavar="KEY=VALUE",
     ),
 ]
 RunArgument = Annotated[Path, argument("A run directory.", metavar="RUN")]
-ForceOption = Annotated[bool, typer.Option("--force", help="Write over what is there.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing files.")]
 CaseArgument = Annotated[Path, argument("The case file (TOML).")]
 
 
@@ -113,5 +113,5 @@ def prepare_again(opened: Run, data: str | None, allow_code: bool) -> Prepared:
     except CaseError as error:
         if case.parent != opened.path:
             raise
-        moved = "The case is not where it was run, or has changed: add --data FILE with its data."
+        moved = "The case has been moved or changed. Add --data FILE with its data."
         raise RunError(f"{error} {moved}") from error

@@ -35,7 +35,7 @@ __all__ = [
 
 MOST_CURVES = 100_000  # samples of a run whose readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
-FIGURES_MISSING = "No figures: they need Matplotlib, pip install 'livepde[plots]'."
+FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plots]'."
 
 
 def terminal(*, err: bool = False) -> Console:
@@ -53,7 +53,7 @@ def named(name: str, known: Mapping[str, Any], what: str) -> Any:
 
 
 def can_draw(console: Console) -> bool:
-    """Return whether figures can be drawn; say why not."""
+    """Return whether figures can be drawn; if not, print why."""
     import importlib.util
 
     found = importlib.util.find_spec("matplotlib") is not None

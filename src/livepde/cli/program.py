@@ -29,7 +29,7 @@ __all__ = ["app", "main"]
 
 app = typer.Typer(
     name="livepde",
-    help="""Identify the unknown parameters of a process that a PDE describes, while it runs.
+    help="""Estimate unknown parameters of partial differential equations from live data.
 
     Start with:  livepde demo,  then  livepde init mycase,  livepde run mycase/case.toml""",
     no_args_is_help=True,

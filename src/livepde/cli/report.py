@@ -19,17 +19,17 @@ def report(
         bool,
         typer.Option(
             "--theory",
-            help="What the paper's theory says about the run: constants, excitation, conditions, "
-            "T*. Takes the samples again; writes theory.md.",
+            help="Evaluate the paper's theory for the run: constants, excitation, conditions, T*. "
+            "Processes the samples again and writes theory.md.",
         ),
     ] = False,
     data: Annotated[
-        str | None, typer.Option(help="With --theory: the run's data, if its case was moved.")
+        str | None, typer.Option(help="With --theory: data of the run, if its case was moved.")
     ] = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
 ) -> None:
-    """Show what a run found: tables, and figures into the run directory.
+    """Print the tables of a run, and write its figures into the run directory.
 
     Example:  livepde report runs/mycase
     Theory:   livepde report runs/mycase --theory
@@ -75,7 +75,7 @@ def report(
 
 
 def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: bool) -> None:
-    """Take a run's samples again; print and write the theory report."""
+    """Process the samples of a run again; print and write the theory report."""
     from livepde.diagnostics import theory_report
 
     prepared = prepare_again(opened, data, allow_code)

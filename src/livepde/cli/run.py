@@ -1,4 +1,4 @@
-"""Take every sample of a case, and write a run directory."""
+"""Run of a case: estimate its unknowns, and write a run directory."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def run(
     data: Annotated[
         str | None,
         option(
-            "Other data than the case names: a .csv, .jsonl or .parquet file, or - for JSON "
-            "lines from standard input. With data.follow it is followed as the case's own file."
+            "Use this data instead of the case's: a .csv, .jsonl or .parquet file, or - for JSON "
+            "lines from standard input. If `data.follow` is set, the file is followed."
         ),
     ] = None,
     out: OutOption = None,
@@ -67,56 +67,56 @@ def run(
         bool,
         typer.Option(
             "--resume",
-            help="Go on with the run in --out as if it had never stopped; begin it if there is "
-            "none. Standard input is then read as with --realtime, and rows that were sent before "
-            "are counted.",
+            help="Resume the run in --out, with the same results as without the interruption. If "
+            "there is no run, start one. Standard input is then read as with --realtime, and rows "
+            "that were sent before are only counted.",
         ),
     ] = False,
     realtime: Annotated[
         bool,
         typer.Option(
             "--realtime",
-            help="Run beside the process: late, broken and missing rows are counted and do not end "
-            "the run; a finished file is replayed. Cases with a source that goes on do so anyway.",
+            help="Run online: late, malformed and missing rows are counted and do not end the run. "
+            "A complete file is replayed. This is the default if the source is live.",
         ),
     ] = False,
     speed: Annotated[
         float | None,
         option(
-            "With --realtime: how many times faster than it happened a file is replayed; inf "
-            "for as fast as it goes. Default: 1."
+            "Speed of the replay with --realtime, relative to the recorded times. inf: as fast as "
+            "possible. Default: 1."
         ),
     ] = None,
     listen: Annotated[
         str | None,
         option(
-            "Serve /livez, /readyz, /health and /metrics (Prometheus) there during the run.",
+            "Serve /livez, /readyz, /health and /metrics (Prometheus) at this address.",
             metavar="[HOST:]PORT",
         ),
     ] = None,
     watch: Annotated[
         str | None,
-        option("Serve the live page there while the run goes on.", metavar="[HOST:]PORT"),
+        option("Serve the live page at this address during the run.", metavar="[HOST:]PORT"),
     ] = None,
     token: Annotated[
         str,
-        option("What visitors of --listen and --watch have to know.", envvar="LIVEPDE_TOKEN"),
+        option("Token that clients of --listen and --watch must send.", envvar="LIVEPDE_TOKEN"),
     ] = "",
     estimates: Annotated[
         bool,
         typer.Option(
-            "--estimates", help="Print each estimate as a line of JSON to standard output."
+            "--estimates", help="Print each estimate to standard output as a line of JSON."
         ),
     ] = False,
-    log: Annotated[LogKind, typer.Option(help="How a live run writes its log.")] = LogKind.text,
+    log: Annotated[LogKind, typer.Option(help="Format of the log of a live run.")] = LogKind.text,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
     allow_env: EnvOption = None,
     settings: SetOption = None,
 ) -> None:
-    """Identify: take every sample of a case, and write a run directory.
+    """Estimate the unknowns of a case from its data, and write a run directory.
 
-    Ctrl-C or SIGTERM ends a run early; what it has is written.
+    Ctrl-C or SIGTERM ends a run early. The results so far are written.
 
     Example:  livepde run mycase/case.toml
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
@@ -155,7 +155,7 @@ def run(
 def _exit(driven: Driven, checks: Sequence[Check], live: bool, as_json: bool) -> None:
     """End the command with an exit code if the run was interrupted or, with JSON, a check failed.
 
-    A run beside a process usually ends by a signal, which is no interruption then.
+    A live run usually ends by a signal, which is not an interruption then.
     """
     if driven.status == "interrupted" and not live:
         raise typer.Exit(INTERRUPTED)
@@ -169,7 +169,7 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
 
     if out is None:
         if resume:
-            raise ConfigurationError("--resume needs --out: the folder of the run to go on with.")
+            raise ConfigurationError("--resume requires --out: the run directory to resume.")
         return free_path(Path("runs") / loaded.name)
     if not resume:
         refuse_taken(out)
@@ -177,7 +177,7 @@ def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
 
 
 def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
-    """Refuse options that do not belong together, before anything is read."""
+    """Refuse options that exclude each other, before anything is read."""
     beside_only = {
         "--speed": how.speed is not None,
         "--listen": how.listen,
@@ -186,12 +186,12 @@ def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
     }
     for name, given in beside_only.items():
         if given and not live:
-            raise ConfigurationError(f"{name} belongs to a run beside a process: add --realtime.")
+            raise ConfigurationError(f"{name} requires --realtime.")
     if as_json and how.estimates:
-        raise ConfigurationError("--json and --estimates both print to standard output: keep one.")
+        raise ConfigurationError("--json and --estimates both print to standard output. Keep one.")
     if how.goes_on and how.speed is not None:
         raise ConfigurationError(
-            "--speed replays a finished file: a source that goes on has its own."
+            "--speed is only valid for the replay of a complete file. This source is live."
         )
 
 
@@ -204,7 +204,7 @@ def _report(title: str, folder: Path, driven: Driven, found: Conclusion, as_json
         found.notes,
         as_json=as_json,
         title=f"[bold]{escape(title)}[/]  {len(driven.result)} samples",
-        lines=[f"[bold]Run directory: {where}[/]", f"Look at it: livepde watch {where}"],
+        lines=[f"[bold]Run directory: {where}[/]", f"To view it: livepde watch {where}"],
         dataset=found.dataset,
         run=str(folder),
         status=driven.status,
@@ -310,7 +310,7 @@ def concluded(
     loaded = prepared.case
     notes: list[str] = []
     nothing: list[Any] = []
-    ended = attempted("The estimate of the end", driven.result.dataset, None, notes)
+    ended = attempted("The final estimate", driven.result.dataset, None, notes)
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
@@ -365,13 +365,13 @@ def _with_smoothed(
     from livepde.hindsight import with_smoothed
 
     if driven.status != "finished" or not len(driven.result):
-        return dataset, ["Nothing is smoothed: the run has not come to its end."]
+        return dataset, ["No smoothed estimates: the run did not finish."]
     samples = ((taken.t, taken.values) for taken in driven.journal.taken())
     begun = prepared.identifier_with(prepared.case.law)
     try:
         smoothed = begun.smoothed(samples, fields_every=prepared.case.spec.output.fields_every)
     except LivepdeError as error:  # the estimates of the run are kept
-        return dataset, [f"Nothing is smoothed: {error}"]
+        return dataset, [f"No smoothed estimates: {error}"]
     return with_smoothed(dataset, smoothed), []
 
 

@@ -10,7 +10,7 @@ __all__ = ["schema"]
 
 
 def schema() -> None:
-    """Print the JSON schema of case files: editors complete keys by it and show what they mean.
+    """Print the JSON schema of case files: editors use it to complete and explain keys.
 
     The first line of a case names it: #:schema ./livepde.schema.json
 

@@ -1,4 +1,4 @@
-"""Look at a run in a browser."""
+"""Show a run in a browser."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def watch(
     address: Annotated[
         str,
         option(
-            "Where to listen. Default: port 8050 of this machine, reachable from it only.",
+            "Address to listen on. Default: port 8050, reachable from this machine only.",
             metavar="HOST:PORT",
         ),
     ] = "",
     token: Annotated[
         str,
         option(
-            "What a visitor has to know. Asked for on any address but this machine's own: "
-            "then one is made if none is given.",
+            "Token that clients must send. If the address is reachable from other machines, a "
+            "token is required, and generated if none is given.",
             envvar="LIVEPDE_TOKEN",
         ),
     ] = "",
@@ -44,9 +44,9 @@ def watch(
         bool, typer.Option("--attached", help="End with standard input.", hidden=True)
     ] = False,
 ) -> None:
-    """Show a run in a browser, while it goes on and afterwards; Ctrl-C ends it.
+    """Show a run in a browser, during the run and afterwards. Ctrl-C ends the server.
 
-    Of a folder of runs, a fleet's say, it shows a table with a link to the page of each.
+    For a folder of runs, such as a fleet's, it shows a table with a link to each run.
 
     Example:    livepde watch runs/mycase
     Elsewhere:  livepde watch runs/mycase --address 0.0.0.0:8050
@@ -56,10 +56,10 @@ def watch(
     from livepde.runs.web import Address
 
     if not runs.run_names(folder) or (folder / runs.RECORD).exists():
-        runs.open(folder)  # what is no run is said before all else
+        runs.open(folder)  # a folder that is not a run is reported before all else
     server = serve(folder, Address.read(address, PORT, token))
     try:
-        if attached:  # to a run that may be killed without a word
+        if attached:  # to a run that may be killed at any time
             Thread(target=_end_with_input, args=(server,), daemon=True).start()
         terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
         server.wait()

@@ -70,11 +70,11 @@ class Trust:
         misfit = estimate.diagnostics.innovation_ratio  # NaN: a law without innovations
         if misfit > self.misfit:
             return (
-                f"the model does not explain the data: innovations are {math.sqrt(misfit):.1f} "
-                "times as large as expected; look at dt_max, the noise, and what it lacks"
+                f"model misfit: innovations are {math.sqrt(misfit):.1f} "
+                "times as large as expected; check `dt_max`, the noise and the model"
             )
         if estimate.q_std is None:
-            return "the law has no covariance: take SensitivityLaw"
+            return "the law has no covariance: use SensitivityLaw"
         q, std = model.numbers(estimate.q), model.numbers(estimate.q_std)
         size = np.where(model.lower < 0.0, np.maximum(np.abs(q), model.std), np.abs(q))
         for label, value, deviation, scale, low, high in zip(

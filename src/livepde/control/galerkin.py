@@ -166,9 +166,8 @@ class GalerkinReduction:
         found = self._projected(self.linearisation.at(both))
         if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
             raise ModelError(
-                "reduce: the model is not linear in its unknown numbers, so that it has no reduced "
-                "model in which they are parameters. Write it linear in them: a LogNormal prior of "
-                "each is no hindrance."
+                "reduce: the model is not linear in its unknown numbers, so no reduced model has "
+                "them as parameters. Write it linear in them. They may have LogNormal priors."
             )
 
     def _check_effects(self) -> None:

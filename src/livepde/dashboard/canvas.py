@@ -96,7 +96,7 @@ def over_time(data: xr.Dataset, ylabel: str, at: float | None) -> tuple[go.Figur
         t = axis.values([jump.t, jump.t])
         _upright(figure, t, "jump", PALETTE[1], "dash", legend=k == 0)
     if at is not None:
-        _upright(figure, axis.values([at, at]), "shown time", INK, "solid", legend=False)
+        _upright(figure, axis.values([at, at]), "selected time", INK, "solid", legend=False)
     return figure, axis
 
 

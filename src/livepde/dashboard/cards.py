@@ -1,6 +1,6 @@
 """Parts of the page made of text: the headline, the verdict, cards of unknowns, tables.
 
-All text from files goes through Dash components as plain children, which show it as it stands.
+All text from files goes through Dash components as plain children, which show it unchanged.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from livepde.dashboard.view import RunView
 from livepde.plots.dataset import groups, labelled, modes_told, prior_left
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs import severities
-from livepde.runs.summary import channel_errors, determination, digits
+from livepde.runs.summary import STATES, channel_errors, determination, digits
 from livepde.verdict import Severity
 
 __all__ = [
@@ -38,7 +38,7 @@ __all__ = [
 
 Level = Literal["good", "info", "warn", "bad"]
 
-MOST_SAID = 6  # sentences of the verdict that are seen at once
+MOST_SHOWN = 6  # sentences of the verdict that are seen at once
 MOST_CARDS = 12
 MOST_ROWS = 100  # of a table
 LONG = 12  # rows from which a table is closed at first
@@ -49,18 +49,18 @@ STATUS: dict[str, tuple[Level, str]] = {
     "waiting": ("info", "waiting for the first sample"),
     "running": ("good", "running"),
     "silent": ("bad", "source is silent"),
-    "stopped": ("bad", "stopped without an end"),
+    "stopped": ("bad", "stopped unexpectedly"),
     "finished": ("info", "finished"),
-    "interrupted": ("info", "interrupted by its user"),
+    "interrupted": ("info", "interrupted by the user"),
     "failed": ("bad", "failed"),
     "unreadable": ("bad", "cannot be read"),
 }
-VERDICTS: dict[str, tuple[Level, str]] = {
-    "pinned": ("good", "well determined"),
-    "partly": ("info", "partly determined"),
-    "moves": ("info", "changes with time"),
-    "flat": ("warn", "hardly determined yet"),
-    "at its bound": ("warn", "at its bound: the bound decides"),
+GAINS: dict[str, Level] = {
+    "pinned": "good",
+    "partly": "info",
+    "moves": "info",
+    "flat": "warn",
+    "at its bound": "warn",
 }
 
 
@@ -93,7 +93,7 @@ def facts(seen: RunView) -> str:
         last = float(seen.dataset["time"][-1])
         parts.append(f"newest at {when_axis(seen.dataset).text(last)}")
     if seen.reading:
-        parts.append("still reading what was written before")
+        parts.append("reading earlier samples")
     elif seen.ended:
         parts.append(f"ended {seen.ended.replace('T', ' ').replace('+00:00', ' UTC')}")
     elif seen.written:
@@ -113,7 +113,7 @@ def summary(seen: RunView) -> str:
     """Return a sentence on unknowns, sensors and law."""
     data = seen.dataset
     if data is None:
-        return "Nothing is estimated yet."
+        return "No estimates yet."
     names = []
     for name, labels in groups(data).items():
         names.append(name if labels == [name] else f"{name} ({len(labels)} values)")
@@ -122,7 +122,7 @@ def summary(seen: RunView) -> str:
     found = f"Estimates {', '.join(names) or 'the state only'} from {sensors} sensor"
     found += "s" * (sensors != 1)
     if withheld:
-        found += f"; {withheld} more {'is' if withheld == 1 else 'are'} withheld to test it"
+        found += f", validated with {withheld} more"
     return f"{found}."
 
 
@@ -133,13 +133,13 @@ def gravest(seen: RunView) -> tuple[Level, str]:
 
 
 def verdict(seen: RunView) -> list[Any]:
-    """Return whether anything is wrong: a sentence each, the gravest first."""
+    """Return the findings and failures of a run: a sentence each, the gravest first."""
     found = _found(seen)
     lines = [html.Li([sign(level), html.Span(text)], className=level) for level, text in found]
-    if len(lines) <= MOST_SAID + 1:
+    if len(lines) <= MOST_SHOWN + 1:
         return lines
-    rest = [html.Summary(f"and {len(lines) - MOST_SAID} more"), html.Ul(lines[MOST_SAID:])]
-    return [*lines[:MOST_SAID], html.Li(html.Details(rest))]
+    rest = [html.Summary(f"and {len(lines) - MOST_SHOWN} more"), html.Ul(lines[MOST_SHOWN:])]
+    return [*lines[:MOST_SHOWN], html.Li(html.Details(rest))]
 
 
 def _found(seen: RunView) -> list[tuple[Level, str]]:
@@ -148,11 +148,11 @@ def _found(seen: RunView) -> list[tuple[Level, str]]:
     found: list[tuple[Level, str]] = [("bad", text) for text in _failures(seen)]
     found += [("bad", f"Expected {c.name} {c.sense} {c.bound_text}, but it is {c.value:.4g}.")
               for c in seen.checks if not c.ok]  # fmt: skip
-    # The notes of a thinned run that ended stand in the place of doubts, without a severity.
+    # The notes of a thinned run that ended replace its doubts, without a severity.
     graves = {} if data is None else severities(data)
     found += [(SEVERITY[graves.get(sentence, "caution")], sentence) for sentence in seen.doubts]
     if data is not None and {"bad", "warn"}.isdisjoint(level for level, _ in found):
-        text = "Nothing looks wrong: steps converge, and nothing speaks against the estimates."
+        text = "No problems detected."
         found.insert(0, ("good", text))
     return found + [("info", text) for text in _remarks(seen)]
 
@@ -162,19 +162,19 @@ def _failures(seen: RunView) -> Iterator[str]:
     if seen.problem:
         yield seen.problem
     if seen.status == "stopped":
-        text = "The run did not end, but nobody writes it any more: it was killed. Go on with it"
-        yield f"{text}: livepde run CASE --out RUN --resume."
+        text = "The process of this run was killed. To resume it"
+        yield f"{text}: `livepde run CASE --out RUN --resume`."
     if seen.status == "silent":
         # The page holds the newest events only, and this one may be older.
-        said = [event.message for event in seen.events if event.kind == "silent"]
-        yield f"The source is silent{''.join(f': {text}' for text in said[-1:])}."
+        messages = [event.message for event in seen.events if event.kind == "silent"]
+        yield f"The source is silent{''.join(f': {text}' for text in messages[-1:])}."
     if seen.unwell:
-        yield f"Not well: {seen.unwell}."
+        yield f"Unhealthy: {seen.unwell}."
     if seen.dataset is not None and seen.dataset.sizes["time"]:
         code = STATUS_CODES[int(seen.dataset["status"].values[-1])]
         if code != "ok":
             text = f"The last step failed ({code.replace('_', ' ')})"
-            yield f"{text}: the estimate is that of the last good step."
+            yield f"{text}. The estimate is from the last successful step."
 
 
 def _remarks(seen: RunView) -> Iterator[str]:
@@ -183,16 +183,16 @@ def _remarks(seen: RunView) -> Iterator[str]:
         reasons: Counter[str] = Counter()
         for (kind, _), number in seen.counts.items():
             reasons[kind] += number
-        said = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
-        yield f"Irregular rows or values: {said}. See Events."
+        counts = ", ".join(f"{number} {kind}" for kind, number in reasons.most_common())
+        yield f"Irregular rows or values: {counts}. See Events."
     if seen.gap > 1 and seen.doubts and not seen.ended:
-        yield f"Looked at is one in {seen.gap} samples of this long run; counts are of those."
+        yield f"This long run is shown, and counted, with one in {seen.gap} samples."
     yield from seen.notes
 
 
 def sign(level: Level) -> Any:
     """Return the sign of a level."""
-    hidden: Any = {"aria-hidden": "true"}  # it only repeats what the text says
+    hidden: Any = {"aria-hidden": "true"}  # it only repeats the text
     return html.Span(SIGNS[level], className=f"sign {level}", **hidden)
 
 
@@ -219,9 +219,11 @@ def _card(data: xr.Dataset, label: str, k: int) -> Any:
     lines: list[Any] = []
     if math.isfinite(std) and std > 0.0:
         low, high = (digits(float(end[k]), std)[0] for end in interval_95(data, label))
-        lines.append(html.P(["95 % sure: ", html.Span(_between(low, high))], className="interval"))
+        lines.append(
+            html.P(["95 % interval: ", html.Span(_between(low, high))], className="interval")
+        )
     else:
-        lines.append(html.P("no interval: the law has no covariance", className="interval"))
+        lines.append(html.P("no interval: this law has no covariance", className="interval"))
     if "reference" in data[label].attrs:
         reference = pretty(f"{float(data[label].attrs['reference']):.4g}")
         lines.append(html.P(f"reference {reference}", className="interval"))
@@ -241,9 +243,9 @@ def _article(data: xr.Dataset, name: str, value: str, kind: str, lines: list[Any
 
 def _known(data: xr.Dataset, label: str, value: float, left: float) -> Any:
     state = determination(data[label].attrs, value, left)
-    level, text = VERDICTS[state]
+    level, text = GAINS[state], STATES[state]
     if state in ("partly", "pinned"):
-        text += f": {100 * left:.2g}\N{NO-BREAK SPACE}% of prior std. dev. left"
+        text += f": std. dev. {100 * left:.2g}\N{NO-BREAK SPACE}% of the prior's"
     return html.P([sign(level), text], className="known")
 
 
@@ -260,7 +262,7 @@ def _field_card(data: xr.Dataset, name: str, at: float | None) -> Any:
     if f"{name}_modes" in data:
         some, count, _ = modes_told(data, name, k)
         level: Level = "good" if some > 0.9 * count else "info" if some >= 1.0 else "warn"
-        text = f"{some:.1f} of {count} modes told by the data"
+        text = f"{some:.1f} of {count} modes determined"
         lines.append(html.P([sign(level), text], className="known"))
     return _article(data, name, f"{low} to {high}", "value range", lines)
 
@@ -272,7 +274,7 @@ def tables(seen: RunView) -> dict[str, list[Any]]:
     """Return the tables: section -> components."""
     data = seen.dataset
     sensors = [] if data is None or not data.sizes["time"] else [_sensor_table(data)]
-    nothing = [html.P("Nothing has happened, and no row was irregular.")]
+    nothing = [html.P("No events and no irregular rows.")]
     return {"sensors": sensors, "events": [*_event_tables(seen)] or nothing}
 
 
@@ -283,18 +285,18 @@ def _event_tables(seen: RunView) -> Iterator[Any]:
             (_when(seen.dataset, event.t), event.kind, event.channel, event.message)
             for event in reversed(seen.events)
         ]
-        columns: tuple[str, ...] = ("when", "what", "channel", "in words")
-        yield _table("Events, the newest first", columns, events)
+        columns: tuple[str, ...] = ("Time", "Event", "Channel", "Details")
+        yield _table("Events, newest first", columns, events)
     if seen.counts:
         counts = [(kind, channel or "–", n) for (kind, channel), n in seen.counts.items()]
-        yield _table("Irregular rows and values", ("reason", "channel", "number"), counts)
+        yield _table("Irregular rows and values", ("Event", "Channel", "Number"), counts)
     if seen.checks:
         checks = [
             ("✓" if c.ok else "✕ failed", c.name, f"{c.value:.5g}", f"{c.sense} {c.bound_text}")
             for c in seen.checks
         ]
-        columns = ("", "number", "value", "expected")
-        yield _table("What was expected of this run", columns, checks)
+        columns = ("Result", "Quantity", "Value", "Expected")
+        yield _table("Expected results", columns, checks)
 
 
 def _sensor_table(data: xr.Dataset) -> Any:
@@ -315,8 +317,8 @@ def _sensor_table(data: xr.Dataset) -> Any:
         for name, (role, errors, _, refused) in channel_errors(data).items()
     ]
     unit = labelled("", str(data["innovation"].attrs.get("units", ""))).strip()
-    title = f"Measured minus expected {unit}".rstrip()
-    return _table(title, ("channel", "role", "last", "refused", "mean", "root mean square"), rows)
+    title = f"Measured minus predicted {unit}".rstrip()
+    return _table(title, ("Channel", "Role", "Last", "Rejected", "Mean", "Root mean square"), rows)
 
 
 def _when(data: xr.Dataset | None, t: float | None) -> str:

@@ -34,11 +34,13 @@ OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to b
 def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], str]:
     """Return the function that draws a field, and a hint for its caption."""
     if "z" in data.coords:
-        hint = f" Surface, seen through, and three cuts at {cut:.0%} of its size: drag to turn."
+        hint = f" Translucent surface, and three cuts at {cut:.0%} of its size: drag to rotate."
         return partial(field_solid, cut=cut), hint
     if "y" in data.coords:
-        return field_map, " Shown is where the mesh is fine: double-click for all." * _zoomed(data)
-    return field_profile, " Grey: at the start."
+        return field_map, " The region of fine mesh is shown. Double-click to show all." * _zoomed(
+            data
+        )
+    return field_profile, " Grey: initial state."
 
 
 def _zoomed(data: xr.Dataset) -> bool:
@@ -100,7 +102,7 @@ def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure
 
 
 def _fine(lines: Array) -> list[float] | None:
-    """Return where a mesh is fine, if its domain goes on far beyond."""
+    """Return where a mesh is fine, if its domain extends far beyond."""
     low, high = np.quantile(lines, [FINE, 1.0 - FINE]).tolist()
     return [low, high] if np.ptp(lines) > OUT * (high - low) else None
 

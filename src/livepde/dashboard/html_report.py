@@ -32,7 +32,7 @@ MOST_READINGS = 100_000  # samples of a run whose readings are drawn
 
 
 def write_report(run: Run, target: Path, *, force: bool = False) -> None:
-    """Write the report of a run, also of one that still goes on.
+    """Write the report of a run, also of one that still continues.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def write_report(run: Run, target: Path, *, force: bool = False) -> None:
     Raises
     ------
     RunError
-        The target exists, or cannot be written; the run holds no estimates.
+        The target exists, or cannot be written; the run contains no estimates.
     ConfigurationError
         Plotly or Jinja2 is not installed.
     """
@@ -70,7 +70,7 @@ def page_of(run: Run) -> str:
             readings = [known.get(t, missing) for t in data["time"].values.tolist()]
             data = with_readings(data, np.array(readings))
     if not data.sizes["time"]:
-        raise RunError(f"{run.path} holds no estimates yet: there is nothing to report.")
+        raise RunError(f"{run.path} contains no estimates yet, so there is nothing to report.")
     axis, drawn = when_axis(data), panels(data)
     case = run.path / CASE
     here = Path(__file__).parent
@@ -105,7 +105,7 @@ def page_of(run: Run) -> str:
 
 
 def _verdict(run: Run) -> list[tuple[str, str]]:
-    """Return sentences with how grave they are, the gravest first."""
+    """Return sentences with their severity, the gravest first."""
     from livepde.dashboard.cards import SEVERITY
 
     doubts = runs.doubts(run.dataset)
@@ -117,7 +117,7 @@ def _verdict(run: Run) -> list[tuple[str, str]]:
     graves = runs.severities(run.dataset)
     found += [(SEVERITY[graves.get(doubt, "caution")], doubt) for doubt in doubts]
     if not any(level in ("bad", "warn") for level, _ in found):
-        found.append(("good", "Nothing speaks against the estimates."))
+        found.append(("good", "No problems detected."))
     return found + [("info", note) for note in run.notes if note not in doubts]
 
 
@@ -152,7 +152,7 @@ def _journal(run: Run, axis: TimeAxis) -> dict[str, Any]:
             events, counts = journal.events, journal.counts
     newest = events[: -MOST_EVENTS - 1 : -1]
     return {
-        "newest": f"{len(newest)} of {len(events)}, the newest first",
+        "newest": f"{len(newest)} of {len(events)} events, newest first",
         "events": [(axis.text(e.t), e.kind, e.channel or "–", e.message) for e in newest],
         "counts": [(kind, channel or "–", number) for (kind, channel), number in counts.items()],
     }

@@ -57,7 +57,7 @@ class PerRun(Mapping[str, T]):
 
 
 def overview_page(folder: Path) -> WSGIApplication:
-    """Return the page of a folder of runs, a fleet's say: a table, and the page of each run.
+    """Return the page of a folder of runs, such as a fleet's: a table, and the page of each run.
 
     Parameters
     ----------
@@ -94,14 +94,14 @@ def overview_table(views: Mapping[str, View]) -> Any:
     seen = {name: views[name].look() for name in list(views)[:MOST_RUNS]}
     labels = _labels(one.dataset for one in seen.values() if one.dataset is not None)
     shown = list(labels)[:MOST_UNKNOWNS]
-    titles = ["run", "status", "verdict", "newest", *(labels[k] for k in shown)]
+    titles = ["Run", "Status", "Assessment", "Newest sample", *(labels[k] for k in shown)]
     levels = {name: cards.gravest(one) for name, one in seen.items()}
     order = sorted(seen, key=lambda name: (ORDER.index(levels[name][0]), name))
     rows = [html.Tr(_cells(name, seen[name], levels[name], shown)) for name in order]
     more = len(views) - len(seen)
-    told = f"{len(views)} runs" + (f", of which {more} are not shown." if more > 0 else ".")
+    count = f"{len(views)} runs" + (f", of which {more} are not shown." if more > 0 else ".")
     head = html.Thead(html.Tr([html.Th(title) for title in titles]))
-    return [html.P(told), html.Table([head, html.Tbody(rows)])]
+    return [html.P(count), html.Table([head, html.Tbody(rows)])]
 
 
 def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
@@ -113,7 +113,7 @@ def _labels(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
 
 
 def _title(data: xr.Dataset, label: str) -> str:
-    """Return the name of an unknown with its unit, and what stands in its column."""
+    """Return the name of an unknown with its unit, and what its column contains."""
     name = labelled(label, unit_of(data, label))
     first_order = "comment" in data[f"{label}_std"].attrs
     return f"{name}, median ± first-order std. dev." if first_order else f"{name} ± std. dev."
@@ -127,7 +127,7 @@ def _cells(name: str, one: RunView, level: tuple[cards.Level, str], shown: list[
         known = scalars(data)
         values = [_value(data, label) if label in known else "–" for label in shown]
     link = html.A(name, href=f"/run/{quote(name)}/")
-    short = level[1].partition(": ")[0].partition(". ")[0]
+    short = level[1].partition(": ")[0].partition(". ")[0].removesuffix(".")
     sign = html.Span([cards.sign(level[0]), html.Span(short)], title=level[1])
     cells: list[Any] = [link, cards.chip(one), sign, newest, *values]
     return [html.Td(cell) for cell in cells]

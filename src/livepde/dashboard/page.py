@@ -91,7 +91,7 @@ def _skeleton() -> Any:
                     html.P(id="facts"),
                 ]
             ),
-            html.Ul(id="verdict", **_aria(label="Is anything wrong?")),
+            html.Ul(id="verdict", **_aria(label="Assessment")),
             html.Div(id="cards", **_aria(label="Estimates")),
             _timebar(),
             *sections,
@@ -104,7 +104,7 @@ def _timebar() -> Any:
     """Return the slider that selects the time, and that of the cuts through solids."""
     return html.Div(
         [
-            html.Label("Look back", htmlFor="slider", id="slider-label"),
+            html.Label("History", htmlFor="slider", id="slider-label"),
             dcc.Slider(
                 id="slider",
                 min=0,
@@ -136,17 +136,17 @@ def _timebar() -> Any:
         ],
         id="timebar",
         role="group",
-        **_aria(label="Look back: arrow keys move, End follows the newest"),
+        **_aria(label="History: arrow keys select the time, End follows the newest sample"),
     )
 
 
 def _aria(**values: str) -> Any:
-    """Return attributes for those who listen to a page."""
+    """Return attributes for screen readers."""
     return {f"aria-{name}": value for name, value in values.items()}
 
 
 def _look(app: dash.Dash, view: View) -> None:
-    """Let the page look at the run from time to time."""
+    """Update the page from the run at intervals."""
 
     @app.callback(
         Output("news", "data"),
@@ -203,8 +203,8 @@ def _steer(app: dash.Dash, view: View) -> None:
         elif dash.ctx.triggered_id == "newest":
             at = None
         moment = high if at is None else at
-        said = f"{'newest' if at is None else 'looking back'}: {when_axis(data).text(moment)}"
-        return at, low, high, step, moment, not high > low, said
+        label = f"{'newest' if at is None else 'history'}: {when_axis(data).text(moment)}"
+        return at, low, high, step, moment, not high > low, label
 
 
 def _draw(app: dash.Dash, view: View) -> None:

@@ -50,11 +50,11 @@ __all__ = ["SECTIONS", "Panel", "panels"]
 SECTIONS = {
     "measured": "Measured and modelled",
     "estimates": "Estimates",
-    "sensors": "Sensors against the model",
-    "told": "What the data have told",
+    "sensors": "Residuals",
+    "told": "Identifiability",
 }
 MOST_POINTS = 2000  # of a line
-SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: pinned, hardly identified
+SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: determined, not identifiable
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,20 +99,22 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
             found.append(_residual_panel(data, variable, dimension, at))
     if note(data, "innovation_ratio") is not None:
         about = (
-            "Misses of the sensors, squared, over what noise and uncertainty allow: about 1 or "
-            "less is well. Above 4 the model does not explain the data."
+            "Ratio of squared innovations to their expected square. If the model is right, it is "
+            "about 1 or less. Above 4, the model does not fit the data."
         )
-        title = "Does the model explain the data?"
+        title = "Innovation ratio"
         found.append(Panel("ratio", "sensors", title, about, ratio(data, at)))
     if open_shares(data, at):
         about = (
-            "What is left of the standard deviation that was assumed before any data: left of 10 % "
-            "the data decide, right of 90 % they have told hardly anything."
+            "Standard deviation as a share of the prior's. Below 10 %, an unknown is well "
+            "determined. Above 90 %, it is not identifiable from these data."
         )
-        found.append(Panel("told", "told", "How much is still open", about, told(data, at)))
+        found.append(Panel("told", "told", "Remaining uncertainty", about, told(data, at)))
     if "correlation" in data:
-        about = "Near +1 or −1 the data tell only a combination of two unknowns (newest estimate)."
-        title = "Which unknowns are told only together"
+        about = (
+            "Near +1 or −1, only a combination of both unknowns is identifiable (newest estimate)."
+        )
+        title = "Correlation of the estimates"
         found.append(Panel("correlation", "told", title, about, correlation(data)))
     return found
 
@@ -189,7 +191,7 @@ def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
     for name, labels in groups(data).items():
         about = "Line: estimate."
         if np.isfinite(data[f"{labels[0]}_std"].values).any():
-            about = "Line: estimate. Band: holds the true value with 95 % probability."
+            about = "Line: estimate. Band: 95 % interval."
         if any("reference" in data[label].attrs for label in labels):
             about += " Dashed: reference value."
         figure = unknowns(data, labels, at)
@@ -213,12 +215,12 @@ def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> list[Panel]
         about = f"Estimate at {when}.{hint}"
         profile = draw is field_profile
         if profile and deviates:
-            about += " Band: holds the true one with 95 % probability."
+            about += " Band: 95 % interval."
         found.append(Panel(f"field:{name}", "estimates", title, about, draw(data, name, at)))
         if not profile and deviates and name in unknown:
-            about = f"Standard deviation at {when}: small where the data have told.{hint}"
+            about = f"Standard deviation at {when}.{hint}"
             spread = draw(data, f"{name}_std", at)
-            title = f"How sure: {name}"
+            title = f"Standard deviation of {name}"
             found.append(Panel(f"field:{name}_std", "estimates", title, about, spread))
     return found
 
@@ -227,19 +229,21 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
     figure = residuals(data, variable, dimension, at)
     if variable == "innovation":
         about = (
-            "Measured minus what the model expected before it saw the sample. Well if it scatters "
-            "about zero; a curve that stays on one side speaks of an offset or a missing process."
+            "Measured minus predicted, one step ahead. If the model is right, it scatters about "
+            "zero. If it stays on one side, there is an offset or a missing process."
         )
         if note(data, "residual") is not None:
-            about = "Measured minus what the model says after the step. Well if about zero."
-        title = "Sensors: measured − expected"
+            about = (
+                "Measured minus estimated, after the step. If the model is right, it is about zero."
+            )
+        title = "Sensors: measured − predicted"
         return Panel(variable, "sensors", title, about + _crowd(data, dimension), figure)
     about = (
-        "Measured minus estimated of channels that are withheld: the estimate never sees them, so "
-        "they test it."
+        "Measured minus estimated, of the validation sensors (withheld), which the estimate does "
+        "not use."
     )
     about += _crowd(data, dimension)
-    return Panel(variable, "sensors", "Withheld sensors: measured − estimated", about, figure)
+    return Panel(variable, "sensors", "Validation sensors: measured − estimated", about, figure)
 
 
 def _crowd(data: xr.Dataset, dimension: str) -> str:
@@ -371,7 +375,7 @@ def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
     data = _bounded(data)
     figure, axis = over_time(data, "", at)
     t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
-    about = {"name": "misses to expected", "hovertemplate": "%{y:.3g}"}
+    about = {"name": "innovation ratio", "hovertemplate": "%{y:.3g}"}
     line(figure, t, values, PALETTE[0], 2, **about)
     for level, name, colour in ((1.0, "as expected", GREY), (4.0, "too large", PALETTE[1])):
         line(figure, t[[0, -1]], [level] * 2, colour, 1.2, "dash", name=name, hoverinfo="skip")
@@ -390,14 +394,16 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
     for name in field_names(data):
         if f"{name}_modes" in data:
             some, count, left = modes_told(data, name, at_time(data, "snapshot", at))
-            found[f"{name} ({some:.1f} of {count} modes told)"] = left
+            found[f"{name} ({some:.1f} of {count} modes determined)"] = left
     return found
 
 
 def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
     """Draw the remaining share of the prior standard deviation of each unknown."""
     known = dict(reversed(open_shares(data, at).items()))
-    figure = empty("prior standard deviation left [%]", height=max(170, 90 + 26 * len(known)))
+    figure = empty(
+        "share of the prior standard deviation [%]", height=max(170, 90 + 26 * len(known))
+    )
     shares = [100.0 * left for left in known.values()]
     colours = [
         PALETTE[2] if share <= 100 * SURE else PALETTE[1] if share > 100 * FLAT else PALETTE[0]

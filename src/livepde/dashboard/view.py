@@ -1,4 +1,4 @@
-"""View of a run directory: read bit by bit while the run goes on, and afterwards."""
+"""View of a run directory: read bit by bit during the run, and afterwards."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
 
 
 class View:
-    """The current contents of a run directory, for any number of visitors.
+    """The current contents of a run directory, for any number of clients.
 
     Memory and the cost of each update are bounded, whatever the length of the run: only new records
     of a journal are read, and those in memory are thinned.

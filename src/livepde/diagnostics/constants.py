@@ -89,7 +89,7 @@ class Spaces:
 
     @cached_property
     def hidden_part(self) -> Part:
-        """Spaces V^ and VX^: functions outside of omega, or the range of P."""
+        """Spaces V^ and VX^: functions outside omega, or the range of P."""
         return self._parts[1]
 
     def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:
@@ -228,8 +228,8 @@ class Spaces:
         if X.dim > LARGEST_DENSE_BASIS:
             raise ConfigurationError(
                 f"Spaces: {X.dim} unknowns; for sensors other than a Subdomain the constants are "
-                f"computed densely up to {LARGEST_DENSE_BASIS}. Take a coarser mesh: they belong "
-                "to the problem and change little."
+                f"computed densely up to {LARGEST_DENSE_BASIS}. Use a coarser mesh: the constants "
+                "barely depend on it."
             )
         free = np.flatnonzero(X.free)
         left, sizes, _ = np.linalg.svd(R.toarray()[np.ix_(free, free)])

@@ -329,7 +329,7 @@ def _taylor(
 ) -> Check:
     """Return the rate of the Taylor remainder, or its size if it is at rounding level."""
     remedy = (
-        f"{given}= does not belong to {given[1]}: correct it, or leave it out and let a complex "
+        f"{given}= does not match {given[1]}: correct it, or leave it out and let a complex "
         "step take the derivative."
         if given
         else "a complex step cannot see abs, max, min or a comparison: write them as "

@@ -99,18 +99,18 @@ class Identifiability:
     def sentences(self) -> list[str]:
         """Sentences on correlated unknowns and on the determined modes of each field."""
         found = [
-            f"{a} and {b} are traded off against each other (correlation {r:+.2f}): the data tell "
-            "a combination of them, not each alone."
+            f"{a} and {b} are correlated ({r:+.2f}): the data identify a combination of them, "
+            "not each alone."
             for a, b, r in self.pairs
         ]
         found += [
-            f"Of {', '.join(d.weights)} the data pin the combination {d} (in prior "
-            f"standard deviations; {d.left:.0%} left), and none of them alone."
+            f"Of {', '.join(d.weights)}, the data identify only the combination {d}, in prior "
+            f"standard deviations. Its standard deviation is {100.0 * d.left:.2g} % of the prior's."
             for d in self.directions
         ]
         found += [
-            f"{item.name}: of {item.modes[2]} modes the data pin {item.modes[0]}; "
-            f"{item.modes[1]} are as the prior left them."
+            f"{item.name}: the data determine {item.modes[0]} of {item.modes[2]} modes well, "
+            f"and leave {item.modes[1]} at their prior."
             for item in self.unknowns
             if item.modes is not None
         ]

@@ -230,7 +230,7 @@ class OnlineTracker:
     def constants(self) -> Constants:
         """Return the constants at the last q and at states along the run."""
         if self.last is None:
-            raise ConfigurationError("theory: no sample of the run holds a measurement.")
+            raise ConfigurationError("theory: no sample of the run contains a measurement.")
         return constants(self.spaces, self.last.q, self.states, moment=self.moment, gain=self.gain)
 
     def stopping(self, c: Constants) -> StoppingState:
@@ -358,7 +358,7 @@ def _how(name: str, c: Constants) -> str:
 
 def _residual_tables(tracker: OnlineTracker, notes: list[str]) -> list[Table]:
     if not tracker.moments:
-        notes.append("No sample holds a measurement, so there is no residual.")
+        notes.append("No sample contains a measurement, so there is no residual.")
         return []
     X, VX, V = (tracker.series(name) for name in ("X", "VX", "V"))
     theta = tracker.series("theta")

@@ -42,7 +42,7 @@ class OnlineRegressor:
         self.estimate: Estimate | None = None
 
     def learn_one(self, x: Mapping[str, Any], y: Any) -> None:
-        """Learn from one sample; `estimate.status` tells if the step succeeded.
+        """Learn from one sample; `estimate.status` shows whether the step succeeded.
 
         Raises
         ------

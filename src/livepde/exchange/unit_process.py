@@ -139,7 +139,7 @@ class UnitProcess:
         """Messages about omitted outputs."""
         space, vertices = self.model.parameter_space, len(self.model.mesh.p[0])
         return [
-            f"The field {name} is no output: it has {vertices} vertices, more than {LARGEST}."
+            f"The field {name} is not an output: it has {vertices} vertices, more than {LARGEST}."
             for name in space.fields
             if name not in self.fields
         ]

@@ -459,7 +459,7 @@ class FieldBlock(Block):
         names = self.field.element.dofnames or []
         axes = [k for k in range(3) if f"u^{k + 1}" in names]
         if not (self.vector and axes):
-            what = "has no components" if self.vector else "is no vector"
+            what = "has no components" if self.vector else "is not a vector"
             raise SpaceError(
                 f"{where} has a value for each component, and the field {what}: give a number."
             )
@@ -585,7 +585,7 @@ class FieldBlock(Block):
         return self._outside(point[:, None]) is None
 
     def _outside(self, points: Array) -> int | None:
-        """Return the index of the first point, of shape (d, k), outside of the mesh; or None."""
+        """Return the index of the first point, of shape (d, k), outside the mesh; or None."""
         low, high = (corner[:, None] for corner in self.box)
         # Points on the boundary may lie outside by rounding; `probe` clips them to the bounding
         # box.
@@ -625,7 +625,7 @@ class FieldBlock(Block):
             )
         if (lost := self._outside(points)) is not None:
             raise ObservationError(
-                f"{what} {lost} at {points[:, lost].tolist()} lies outside of the mesh, which "
+                f"{what} {lost} at {points[:, lost].tolist()} lies outside the mesh, which "
                 f"spans {low.tolist()} to {high.tolist()}: check its coordinates and their unit."
             )
         return self._evaluated(np.clip(points.T, low, high).T)

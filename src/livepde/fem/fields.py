@@ -117,7 +117,7 @@ def _moved(nodes: Array, through: Sequence[float]) -> Array:
     if not inside or len(set(nearest)) < len(nearest) or 0 in nearest:
         raise SpaceError(
             f"interval: through={list(through)} needs points between {nodes[0]:g} and "
-            f"{nodes[-1]:g}, each with an inner node of its own nearby: take more cells."
+            f"{nodes[-1]:g}, each near its own inner node: use more cells."
         )
     moved[nearest] = through
     return moved
@@ -204,7 +204,7 @@ class _Declared:
 
 
 def _expected(given: Any) -> str:
-    """Return what to write in the place of something that is no prior."""
+    """Return what to write instead of something that is not a prior."""
     number = f"{given}" if isinstance(given, int | float) else "mean"
     return f"write Normal({number}, std), or LogNormal or LogitNormal with a median and a std"
 
@@ -367,7 +367,7 @@ class Scalar(_Declared):
 
 @dataclass(frozen=True, eq=False)
 class Piecewise(_Declared):
-    """One unknown number for each named region, with a common prior or priors of their own.
+    """One unknown number for each named region, with a common prior or its own.
 
     Parameters
     ----------
@@ -415,7 +415,7 @@ class Piecewise(_Declared):
 
 @dataclass(frozen=True, eq=False)
 class Scalars(_Declared):
-    """One unknown number for each name, with a common prior: an offset of each sensor, say.
+    """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
     Forms and sensors see a mapping, q.offset["T_10"].
 

@@ -161,7 +161,7 @@ class Latent:
             inside = p.transform.inverse(q[self.space.part(p.name)])
             if not np.isfinite(inside).all():
                 raise SpaceError(
-                    f"'{p.name}': a value is not strictly inside of the bounds "
+                    f"'{p.name}': a value is not strictly inside the bounds "
                     f"{p.unknown.prior.bounds} of its {type(p.unknown.prior).__name__} prior."
                 )
             a[p.part.start : p.part.start + p.size] = inside
@@ -241,7 +241,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form composed with q = V T(a): latent coefficients in the place of q."""
+    """A form composed with q = V T(a): latent coefficients instead of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form

@@ -244,14 +244,14 @@ def _loaded(path: Path, meshio: Any, from_meshio: Any) -> Mesh:
     except (Exception, SystemExit) as error:
         raise SpaceError(
             f"read_mesh: '{path}' cannot be read ({str(error) or type(error).__name__}): "
-            "check that its ending tells its format, or save it again as Gmsh 4.1 (.msh)."
+            "check that its extension matches its format, or save it as Gmsh 4.1 (.msh)."
         ) from error
     try:
         mesh: Mesh = from_meshio(read, ignore_orientation=True)
     except Exception as error:
         kinds = sorted(read.cells_dict) or "none"
         raise SpaceError(
-            f"read_mesh: '{path}' holds no mesh that livepde can use; its cells are {kinds}, "
+            f"read_mesh: '{path}' contains no mesh that livepde can use; its cells are {kinds}, "
             "expected lines, triangles, quadrilaterals, tetrahedra or hexahedra."
         ) from error
     total = sum(len(block.data) for block in read.cells if block.dim == mesh.dim())

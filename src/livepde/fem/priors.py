@@ -43,7 +43,7 @@ class Transform(ABC):
 
     @abstractmethod
     def inverse(self, q: Array) -> Array:
-        """Return the latent value of q; not finite where q lies outside of the range of T."""
+        """Return the latent value of q; not finite where q lies outside the range of T."""
 
     def shifted(self, q: Array, std: Array, z: float) -> Array:
         """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).
@@ -250,10 +250,10 @@ class Prior(ABC):
                 f"{what}: bounds must be (lower, upper) with lower < upper; got {self.bounds}."
             )
         if not lower <= at <= upper:
-            raise SpaceError(f"{what}: {centre} {at} lies outside of its bounds {self.bounds}.")
+            raise SpaceError(f"{what}: {centre} {at} is outside its bounds {self.bounds}.")
         if not np.isfinite(self.transform.inverse(np.array(at))):
             raise SpaceError(
-                f"{what}: {centre} {at} needs to be finite, and strictly inside of {self.bounds}."
+                f"{what}: {centre} {at} must be finite, and strictly inside {self.bounds}."
             )
 
 

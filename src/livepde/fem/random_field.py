@@ -1,4 +1,4 @@
-"""Smooth random fields as a few functions of x: the error of an initial state, say."""
+"""Smooth random fields as a few functions of x, such as the error of an initial state."""
 
 from __future__ import annotations
 

@@ -373,7 +373,7 @@ class FunctionSpace:
             of = next(iter(self.fields))
         if not of:
             raise SpaceError(
-                f"the state has the components {list(self.fields)}: say which one is meant, as in "
+                f"the state has the components {list(self.fields)}: specify one, as in "
                 f'of="{next(iter(self.fields), "u")}".'
             )
         if of not in self.fields:

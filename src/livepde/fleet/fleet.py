@@ -179,7 +179,7 @@ class Fleet:
         if len(value) != len(self.members):
             raise ConfigurationError(
                 f"{what}: a list of {len(value)} for {len(self.members)} members; give one for "
-                "each, or one value for all that is no list."
+                "each, or a single value for all."
             )
         return value
 
@@ -408,7 +408,7 @@ class Fleet:
         return replace(estimate, read=read, belief=belief)
 
     def identifier(self, member: str | int) -> Identifier:
-        """Return an identifier that goes on from the state of a member, by name or number.
+        """Return an identifier that continues from the state of a member, by name or number.
 
         Steps of this identifier do not change the fleet.
         """
@@ -427,7 +427,7 @@ class Fleet:
         return engine.start(self._q0[:1], self._u0[:1], moments)
 
     def subset(self, which: IntArray, state: Any, samples: int) -> Fleet:
-        """Return a fleet of some members, which stand where they do here; for `Shard`.
+        """Return a fleet of some members in their present states; for `Shard`.
 
         Parameters
         ----------
@@ -663,7 +663,7 @@ def _check_positive(name: str, noise: Array) -> None:
 
 
 def _numbers(what: str, values: ArrayLike) -> Array:
-    """Return an array of floats of its own."""
+    """Return a new array of floats."""
     try:
         if np.asarray(values).dtype.kind in "USb":
             raise TypeError

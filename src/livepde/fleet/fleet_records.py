@@ -1,4 +1,4 @@
-"""Records of the estimates of a fleet: for each member those of a run of its own."""
+"""Records of the estimates of a fleet: for each member as those of a single run."""
 
 from __future__ import annotations
 

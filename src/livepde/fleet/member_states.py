@@ -1,4 +1,4 @@
-"""States of members that have sample times of their own."""
+"""States of members that have their own sample times."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROOM = 8  # rows by which a log grows
 
 
 class OwnStates:
-    """States of members that step one by one, each a value of its own."""
+    """States of members that step one by one, each a separate value."""
 
     def __init__(self, template: State, count: int) -> None:
         self._template = template[0]

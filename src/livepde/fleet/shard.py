@@ -1,4 +1,4 @@
-"""A fleet for live streams: members with sample times of their own, and an offset."""
+"""A fleet for live streams: members with their own sample times, and an offset."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ class Shard:
         return self._fleet.subset(which, state, samples)
 
     def identifier(self, member: str) -> Identifier:
-        """Return an identifier that goes on from the state of a member; for forecasts and fields.
+        """Return an identifier that continues from the state of a member; for forecasts and fields.
 
         Steps of this identifier do not change the shard.
         """

@@ -39,7 +39,7 @@ LEARN = 0.3  # of a sample each adds to the count: errors of the first guess fad
 
 @dataclass(frozen=True, eq=False)
 class MemberReports:
-    """Report of a step of all members, beside the new state.
+    """Report of a step of all members, in addition to the new state.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ def assimilate(
 def absorb(
     filter_: Filter, x: FilterState, span: Span, options: UpdateOptions, steps: int | IntArray = 0
 ) -> tuple[FilterState, Assimilation]:
-    """Update a state that belongs to the end of a span by the measurements there.
+    """Update a state at the end of a span by the measurements there.
 
     Gate, verdict, update, statistics; `steps` are the substeps that have led to the state.
     """

@@ -1,7 +1,7 @@
 """Whether one column of the data explains a misfit: late, scaled, off, in another unit, exchanged.
 
-An error of a column is tried on the stored samples themselves: the column is mended, and the model
-is fitted again. So inputs and sensors are compared alike, and a lag or a unit is taken as it is.
+An error of a column is tried on the stored samples themselves: the column is corrected, and the
+model is fitted again. So inputs and sensors are compared alike, and lags and units are exact.
 An error of one size theta, which changes the residuals by g, first gets the size where the linear
 model of the samples has its minimum. With H = I + J^T J and h = J^T g at the best fit,
 
@@ -12,7 +12,7 @@ and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -28,6 +28,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
+from livepde.verdict.sentences import LIKELY, amount_of, table_of
 
 __all__ = ["Columns", "Explained", "likely_columns"]
 
@@ -46,23 +47,34 @@ CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelie
 
 
 class Unit(NamedTuple):
-    """A unit that a column may have: in words, its name, and factor and constant to convert it."""
+    """A unit that a column may have.
 
-    text: str
+    Attributes
+    ----------
+    name, expected
+        The unit, and the expected one; empty if they are not known.
+    factor, constant
+        Of the conversion of its values.
+    times
+        How many times too large or too small its values are.
+    """
+
     name: str
+    expected: str
     factor: float
     constant: float
+    times: float = np.nan
 
 
 UNITS: tuple[Unit, ...] = (
-    Unit("are in degF where degC is expected", "degF", 1.0 / 1.8, -32.0 / 1.8),
-    Unit("are in degC where degF is expected", "degC", 1.8, 32.0),
-    Unit("are in K where degC is expected", "K", 1.0, -273.15),
-    Unit("are in degC where K is expected", "degC", 1.0, 273.15),
+    Unit("degF", "degC", 1.0 / 1.8, -32.0 / 1.8),
+    Unit("degC", "degF", 1.8, 32.0),
+    Unit("K", "degC", 1.0, -273.15),
+    Unit("degC", "K", 1.0, 273.15),
     *(
-        Unit(f"are {factor:g} times too {word}, as in another unit", "", power, 0.0)
-        for factor in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
-        for word, power in (("large", 1.0 / factor), ("small", factor))
+        Unit("", "", power, 0.0, times)
+        for times in (10.0, 100.0, 1000.0, 60.0, 3600.0, 3.6)
+        for power in (1.0 / times, times)
     ),
 )
 
@@ -163,7 +175,7 @@ class Columns:
         return replace(self, state=changed(self.state, log=log))
 
     def samples(self, error: Error | None = None) -> StoredSamples:
-        """Return the samples, with the columns of an error mended.
+        """Return the samples, with the columns of an error corrected.
 
         A fit of those without an error that is small begins at the prior mean.
         """
@@ -321,7 +333,7 @@ class _Trials:
                 continue
             slopes[kind] = g / step
             gained, theta = base.freed(slopes[kind])
-            # Mending by theta changes the residuals by theta g: so the column is off by theta.
+            # Correcting by theta changes the residuals by theta g: so the column is off by theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if "offset" in slopes and ("gain" in slopes or constant):
             yield from self._units(base, name, slopes)
@@ -345,7 +357,7 @@ class _Trials:
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
-        for number, (_, _, factor, constant) in enumerate(UNITS):
+        for number, (_, _, factor, constant, _) in enumerate(UNITS):
             # values - offset, then divided by 1 + gain: to first order in the change of the column.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
@@ -379,7 +391,7 @@ class _Trials:
                 yield base.cost - _Fit.about(one).cost, error
 
     def _change(self, base: _Fit, error: Error) -> Array | None:
-        """Return by how much an error of a column, mended, changes the residuals."""
+        """Return by how much the correction of a column changes the residuals."""
         if self._only_sensors(error):  # it is that of the readings
             return self.columns.samples(error).readings - self.base_readings
         r = self.columns.samples(error).residuals(base.one.xi)
@@ -389,7 +401,7 @@ class _Trials:
         return not set(error.names) & set(self.columns.inputs)
 
     def fitted(self, error: Error) -> tuple[float, Error] | None:
-        """Return the cost of a fit with a column mended, and the error, its size improved."""
+        """Return the cost of a fit with a corrected column, and the error, its size improved."""
         for _ in range(ROUNDS):
             found = refitted(self.columns.samples(error), self.options, last=False)
             if found is None:
@@ -442,38 +454,28 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
     """Return an error as a cause."""
     first, size = error.names[0], error.size
     problem = columns.work.filter.problem
-    what = "input" if first in columns.inputs else "sensor"
-    time = f" {problem.model.time_unit}" if problem.model.time_unit else ""
     units = dict(zip(problem.observed.names, problem.observed.units, strict=True))
-    unit = units.get(first, "") if what == "sensor" else ""
-    amount = f"{abs(size):.2g} {unit}".rstrip()
-    words: dict[str, Callable[[], tuple[str, str]]] = {
-        "offset": lambda: (
-            f"{what} {first} reads {amount} too {'much' if size > 0 else 'little'}",
-            f"Check the offset and the place of {first}.",
-        ),
-        "gain": lambda: (
-            f"the scale of {what} {first} is {abs(100.0 * size):.2g} % too "
-            f"{'large' if size > 0 else 'small'}",
-            f"Check the scale and the unit of {first}.",
-        ),
-        "lag": lambda: (
-            f"{what} {first} is {abs(size):.2g}{time} {'late' if size > 0 else 'early'}",
-            f"Check the clock, the averaging and the response time of {first}.",
-        ),
-        "unit": lambda: (
-            f"the values of {what} {first} {UNITS[error.unit].text}",
-            f"State the unit of {first}: channels.{first}.unit.",
-        ),
-        "exchange": lambda: (
-            f"the columns of {first} and {error.names[-1]} are exchanged",
-            f"Exchange the columns of {first} and {error.names[-1]}.",
-        ),
-    }
-    text, remedy = words[error.kind]()
+    values: dict[str, object] = {"name": first, "other": error.names[-1]}
+    kind, unit_of, side = error.kind, UNITS[error.unit], size > 0
+    factor = unit_of.factor if kind == "unit" else 1.0 / (1.0 + size)
+    match kind:
+        case "offset":
+            unit = units.get(first, "") if first not in columns.inputs else ""
+            values |= {"amount": amount_of(abs(size), unit), "side": "high" if side else "low"}
+        case "gain":
+            values |= {"share": f"{100.0 * abs(size):.2g} %", "side": "large" if side else "small"}
+        case "lag":
+            lag = f"{abs(size):.2g} {problem.model.time_unit}".rstrip()
+            values |= {"amount": lag, "side": "late" if side else "early"}
+        case "unit" if unit_of.name:
+            values |= {"unit": unit_of.name, "expected": unit_of.expected}
+            values["table"] = table_of(first)
+        case "unit":
+            kind, large = "factor", factor < 1.0
+            values |= {"factor": unit_of.times, "side": "large" if large else "small"}
+            values |= {"correction": f"{factor:.6g}", "table": table_of(first)}
+    text, remedy = LIKELY[kind].filled(**values)
     late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
-    unit_of = UNITS[error.unit]
-    factor = unit_of.factor if error.kind == "unit" else 1.0 / (1.0 + size)
     keys = {
         "gain": ("factor", f"{factor:.6g}"),
         "lag": ("late", late),

@@ -55,7 +55,7 @@ class Residual:
         return Residual(0.0, 0.0, lambda: 0.0) if self._observed is None else self._observed()
 
     def replaced(self, X: float, VX: float, V: Callable[[], float]) -> Residual:
-        """Return other norms of r beside the same of u_alpha."""
+        """Return other norms of r, with the same norms of u_alpha."""
         return Residual(X, VX, V, lambda: self.observed)
 
 

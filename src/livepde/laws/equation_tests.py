@@ -36,6 +36,7 @@ from livepde.linalg import Array
 from livepde.model import Model, h1_form, mass_form
 from livepde.spaces import HilbertSpace
 from livepde.verdict import FEWEST, Finding, Severity, Verdict, too_few
+from livepde.verdict.sentences import FINDINGS, percent
 
 __all__ = ["EquationLedger", "EquationTests", "ObservedEquation"]
 
@@ -45,12 +46,12 @@ LASTS = 0.15  # error that goes on, over what q and the process do, from which i
 GRAVE = 0.3  # the same, from which the estimate is not to be trusted
 POWER = 2  # of the number of a sample, that weighs it
 UNTESTED = (
-    "the mesh and the time step: their errors are not followed",
-    "a fit of all samples again: there is none",
-    "intervals: the law has no covariance",
+    "the mesh and the time step: this law does not estimate their errors",
+    "a refit of all samples: this law has none",
+    "intervals: this law has no covariance",
     "correlation of the noise in time",
 )
-OUTSIDE = "the process outside of the observed part"
+OUTSIDE = "the process outside the observed part"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class EquationLedger:
 
     @property
     def lasting(self) -> float:
-        """Part of the equation error that goes on, over what q and the process do; at least 0."""
+        """Persistent part of the equation error, over what q and the process do; at least 0."""
         product, square, terms = self.sums.tolist()
         surely = product - DEVIATIONS * math.sqrt(square)
         return math.sqrt(max(surely, 0.0) / terms) if terms > 0.0 else 0.0
@@ -195,8 +196,8 @@ class EquationTests:
 
 
 def rested(count: int, when: str = "") -> Finding:
-    """Return the note that q was held because nothing excited it; `when`: ", last at noon", say."""
-    text = f"Nothing but noise excited the unknowns in {count} samples{when}: they were held then."
+    """Return the note that q was held because nothing excited it; `when` as in ", last at noon"."""
+    text, _ = FINDINGS["rest"].filled(count=count, when=when)
     return Finding("rest", "note", text, "unknowns", float(count))
 
 
@@ -204,14 +205,6 @@ def _misfit(ledger: EquationLedger) -> list[Finding]:
     size = ledger.lasting
     if size < LASTS:
         return []
-    text = (
-        "The model does not explain the data: with the estimated unknowns its equation is missed "
-        f"by {size:.0%} of what the unknowns and the process do in it, on the observed part and "
-        "from sample to sample, which noise is not."
-    )
-    remedy = (
-        "A process is missing in the model or has a wrong coefficient, or the unknowns are not "
-        "learned yet: compare with SensitivityLaw, a longer run or a larger gain."
-    )
+    text, remedy = FINDINGS["misfit, equation"].filled(size=percent(size))
     severity: Severity = "do not trust" if size >= GRAVE else "caution"
     return [Finding("misfit", severity, text, evidence=size, remedy=remedy)]

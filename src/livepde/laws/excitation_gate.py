@@ -115,7 +115,7 @@ class ExcitationGate:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationLevel:
-    """Statistics of the excitation of q, to tell it from noise.
+    """Statistics of the excitation of q, to distinguish it from noise.
 
     Attributes
     ----------

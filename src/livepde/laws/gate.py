@@ -1,4 +1,4 @@
-"""The gate: which readings are used, which sensors are set aside, and when they return."""
+"""The gate: which readings are used, which sensors are excluded, and when they return."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ class GradientLaw(Law[GradientParts, GradientState]):
     def prepare(self, problem: Problem) -> GradientParts:
         if len(problem.model.algebraic):
             raise LawError(
-                "GradientLaw: a component of the state has no mass term, so that M is no inner "
+                "GradientLaw: a component of the state has no mass term, so M is not an inner "
                 "product of X: use SensitivityLaw, or give M a term for each component."
             )
         if problem.input_noise or problem.initial_rank:

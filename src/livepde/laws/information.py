@@ -236,7 +236,7 @@ def _pattern(model: Model, selects: bool) -> Pattern:
 
 
 class InformationMetric(MetricRule[Information]):
-    """H/PULL in the place of G_Q/gain, with H = S G_Q + J.
+    """H/PULL instead of G_Q/gain, with H = S G_Q + J.
 
     Parameters
     ----------

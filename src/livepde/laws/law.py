@@ -37,11 +37,11 @@ __all__ = [
 LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
 REMEDIES = {
     "ok": "",
-    "not_converged": "Take a smaller dt_max, a smaller gain, or less damping.",
+    "not_converged": "Reduce `dt_max`, the gain or the damping.",
     "not_finite": "Check the sample, the bounds of the unknowns, and the gain.",
-    "departed": "Check the model and the sensors, give the unknowns a std that allows for such "
-    "values, or give a number for gain.",
-    "singular": "Check the model's forms at the current estimate, or take a smaller dt_max.",
+    "departed": "Check the model and the sensors. If such values are possible, increase the "
+    "standard deviations of the priors, or set a number for `gain`.",
+    "singular": "Check the model's forms at the current estimate, or reduce `dt_max`.",
 }
 
 
@@ -243,7 +243,7 @@ class Belief:
         return None if self.u_factor is None else _deviation(self.u_factor)
 
     def deviation(self, rows: Any, part: slice) -> Array | None:
-        """Return the standard deviation of rows @ q[part] for a matrix, that of point values, say.
+        """Return the standard deviation of rows @ q[part] for a matrix, such as of point values.
 
         Where a row has several entries the rest counts as if it were fully correlated.
         """
@@ -299,7 +299,7 @@ def _deviation(factor: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """Report of a step, beside the new state.
+    """Report of a step, in addition to the new state.
 
     Attributes
     ----------
@@ -459,11 +459,11 @@ class Law(ABC, Generic[Work, State]):
         return None
 
     def diagnosed(self, work: Work, state: State) -> Diagnostics[float]:
-        """Return what is known of the estimate beside it between two samples."""
+        """Return what is known of the estimate besides itself between two samples."""
         return Diagnostics()
 
     def weighs_readings(self) -> bool:
-        """Return whether a reading may have a noise of its own (`Interval.noise`); here not."""
+        """Return whether a reading may have its own noise (`Interval.noise`); here not."""
         return False
 
     def reading_noise(self, work: Work, state: State) -> Array | None:
@@ -519,7 +519,7 @@ class Law(ABC, Generic[Work, State]):
 
     def unjudged(self) -> Verdict:
         """Return the verdict where no innovation is judged."""
-        why = f"innovations: {type(self).__name__} says nothing of their size"
+        why = f"innovations: {type(self).__name__} does not test their size"
         return Verdict.of((), (why,), judged=False)
 
 

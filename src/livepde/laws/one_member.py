@@ -201,7 +201,7 @@ def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Int
 
 
 def _doubted(screened: Screened) -> int:
-    """Return how many readings in a row were refused of a sensor that is not set aside."""
+    """Return how many readings in a row were rejected of a sensor that is not excluded."""
     return int(np.where(screened.aside, 0, screened.refused).max())
 
 

@@ -55,7 +55,7 @@ class InputHistory:
         )
 
     def after(self, span: Span) -> InputHistory:
-        """Return the value after an interval; a pause says nothing on how steep inputs are."""
+        """Return the value after an interval; a pause does not show how steep inputs are."""
         length = span.t1 - span.t0
         if not length.all():
             return self

@@ -150,7 +150,7 @@ class Reduction:
         return numbers + modes
 
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
-        """Return which coordinates belong to some unknowns, shape (k,); None stands for all.
+        """Return the coordinates of some unknowns, shape (k,); None means all.
 
         Raises
         ------

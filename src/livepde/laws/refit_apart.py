@@ -1,4 +1,4 @@
-"""A refit in a thread of its own, while samples continue.
+"""A refit in its own thread, while samples continue.
 
 The refit is a function of the state where it began, so that it may run at any time, and again after
 a restart. When the filter goes over to it depends on the number of samples alone.

@@ -90,7 +90,7 @@ class Balance:
 
 
 def smooths(observed: Observed) -> bool:
-    """Return true if smoothing is chosen here: for samples of a function, if nothing else is said.
+    """Return true if smoothing is chosen here: by default for samples of a function.
 
     Averages are not differentiated, so noise of theirs needs no smoothing in space. Raises
     `LawError` for noisy samples of which the law cannot say how to smooth them.
@@ -110,7 +110,7 @@ def smooths(observed: Observed) -> bool:
 
 
 class NoiseDetector:
-    """Tells noisy samples of one set of present sensors from exact ones.
+    """Distinguishes noisy samples of one set of present sensors from exact ones.
 
     Second derivatives of noise are large and turn back with the next sample.
     """

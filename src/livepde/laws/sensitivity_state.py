@@ -519,7 +519,7 @@ def new_window(
 def restarted(
     work: SensitivityWork, start: FilterState, state: SensitivityState, row: int | None = None
 ) -> SensitivityState:
-    """Return one member that begins anew at a filter, as `new_window`, and never goes back."""
+    """Return one member that restarts at a filter, as `new_window`, and never goes back."""
     return without_past(new_window(work, start, state, row))
 
 

@@ -1,4 +1,4 @@
-"""Discretisation error followed beside a filter: the shifts by time step, mesh and input lines.
+"""Discretisation-error estimate of a filter: the shifts by time step, mesh and input lines.
 
 The filter and one without discretisation error would take the same samples with the same gain. The
 error of the former, e of the state and s of the unknowns, follows
@@ -70,7 +70,7 @@ SMOOTH = 0.5  # differences of changes over changes, squared: below, an input ch
 
 @dataclass(frozen=True)
 class Shadows:
-    """Discretisation errors that the sensitivity law follows beside its estimates.
+    """Discretisation errors that the sensitivity law estimates online.
 
     Their signed shifts are summed, and widen the reported covariance: variance plus square of the
     sum. The filter takes shorter steps where the error of the time step asks for it (`parts`); else
@@ -266,15 +266,15 @@ class Shadow(ABC):
         return {}
 
     def restarted(self, s: ShadowState, which: Mask) -> dict[str, Any]:
-        """Return fields of the state in which members have no error beside `ShadowState.u`."""
+        """Return fields of the state in which members have no error except `ShadowState.u`."""
         return {}
 
     def in_readings(self, s: ShadowState) -> Array | None:
-        """Return the error of the readings beside that due to `ShadowState.u`; None if zero."""
+        """Return the error of the readings except that due to `ShadowState.u`; None if zero."""
         return None
 
     def in_state(self, s: ShadowState) -> Array | None:
-        """Return the error of the state beside that in `ShadowState.u`, shape (members, n)."""
+        """Return the error of the state except that in `ShadowState.u`, shape (members, n)."""
         return None
 
 
@@ -453,7 +453,7 @@ class HeldInputShadow(InputShadow):
 
 @dataclass(frozen=True, eq=False)
 class MeshShadow(Shadow):
-    """The error of the mesh: a trajectory on the halved mesh beside one on the mesh.
+    """The error of the mesh: a trajectory on the halved mesh against one on the mesh.
 
     The fine trajectory has the unknowns of the filter, and follows where samples move the state:
     only its difference to the state of the filter is kept. Several steps are taken at once on both
@@ -526,7 +526,7 @@ class MeshShadow(Shadow):
 
 @dataclass(frozen=True, eq=False)
 class ShadowSet:
-    """The discretisation errors that are followed beside a filter.
+    """The discretisation errors that are estimated online with a filter.
 
     Attributes
     ----------
@@ -612,7 +612,7 @@ class ShadowSet:
 
     @cached_property
     def counted(self) -> slice:
-        """Which shadows tell an error: that of held inputs, the last one, does not."""
+        """Shadows that estimate an error: that of held inputs, the last one, does not."""
         return slice(0, len(self.kinds) - (HELD in self.kinds))
 
     @cached_property
@@ -621,7 +621,7 @@ class ShadowSet:
         return tuple(shadow.kind for shadow in self.shadows)
 
     def start(self, x: FilterState, moment: Moment | None, given: Any) -> ShadowState:
-        """Return the shadows of one member at the start; None stands for no moment yet."""
+        """Return the shadows of one member at the start; None means no moment yet."""
         n, k, rows = x.u.shape[1], x.C.shape[2], len(self.shadows)
         u, a = np.zeros((1, rows, n)), np.zeros((1, rows, k))
         nothing = np.zeros((1, len(self.problem.channels)))

@@ -12,6 +12,7 @@ from livepde.linalg import IntArray
 from livepde.records import STATUS_CODES
 from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import Finding, Severity
+from livepde.verdict.sentences import FINDINGS
 
 __all__ = ["COUNTS", "StepLedger", "step_findings"]
 
@@ -20,14 +21,7 @@ COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
 SOME = 0.02  # share of the samples from which failed steps are more than a mishap
 MOST = 0.5  # share from which little is left of the data
 PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
-WORDS = {
-    "departed": "departed: the unknowns were held, since prior and data do not allow for where "
-    "they would have gone",
-    "not_converged": "failed: no step converged",
-    "not_finite": "failed: the step gave numbers that are not finite",
-    "singular": "failed: the step met a singular matrix",
-}
-"""Code of a status that is not ok -> what has happened to such a sample."""
+FAILURES = ("departed", "not_converged", "not_finite", "singular")  # codes with a finding each
 
 
 class StepLedger(NamedTuple):
@@ -61,11 +55,7 @@ class StepLedger(NamedTuple):
         *counts, stretched = self.counts.tolist()
         yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
         if stretched:
-            text = (
-                f"{stretched} intervals between two samples have more than {MOST_SUBSTEPS} "
-                "substeps of dt_max: their substeps were longer."
-            )
-            remedy = "Check the times of the samples, or state a longer `steps.dt_max`."
+            text, remedy = FINDINGS["steps, long"].filled(count=stretched, most=MOST_SUBSTEPS)
             yield Finding("steps", "note", text, "dt_max", float(stretched), remedy=remedy)
 
 
@@ -78,11 +68,11 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
         Code of a status -> number of samples.
     """
     samples = sum(counts.values())
-    for code, words in WORDS.items():
+    for code in FAILURES:
         count = counts.get(code, 0)
         if not count:
             continue
-        text = f"{count} of {samples} samples {words}."
+        text, _ = FINDINGS[code].filled(count=count, samples=samples)
         severity = _severity(code, count / samples)
         remedy = Status(code).remedy
         yield Finding("steps", severity, text, code, float(count), remedy=remedy)

@@ -35,6 +35,7 @@ from livepde.verdict import (
     assess,
     too_few,
 )
+from livepde.verdict.sentences import FINDINGS, percent
 
 __all__ = [
     "after_fit",
@@ -120,18 +121,13 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
         return judge
     found = []
     if not fit.converged:
-        text = (
-            f"The fit of {fit.samples} samples did not converge: start from another prior, or "
-            "check the model."
-        )
-        found.append(Finding("fit", "do not trust", text))
+        text, remedy = FINDINGS["fit, not converged"].filled(samples=fit.samples)
+        found.append(Finding("fit", "do not trust", text, remedy=remedy))
     share = fit.refused / max(fit.readings, 1)
     if share > REFUSED:
-        text = (
-            f"The fit of {fit.samples} samples left out {share:.1%} of the readings "
-            f"({fit.refused}): they lie far from those around them, or from the model."
+        text, remedy = FINDINGS["fit, refused"].filled(
+            samples=fit.samples, share=percent(share, 1), count=fit.refused
         )
-        remedy = "Look at these readings, state a larger noise, or open the gate."
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
     return (lambda: judge().with_findings(found)) if found else judge
 
@@ -175,7 +171,8 @@ def with_discretisation(
             verdict = verdict.with_findings([_coarse(s, shadows.most)])
         if not missing or not verdict.judged:
             return verdict
-        more = Finding("untested", "note", f"Not tested: {missing}.", "discretisation")
+        text, _ = FINDINGS["untested"].filled(what=missing)
+        more = Finding("untested", "note", text, "discretisation")
         return verdict.with_untested(missing).with_findings([more])
 
     return found
@@ -184,11 +181,13 @@ def with_discretisation(
 def _coarse(s: ShadowState, most: int) -> Finding:
     """Return the finding of steps that would have to be shorter than is allowed."""
     coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
-    text = (
-        f"{coarse} of {int(s.count[0])} steps have an error of up to {ALLOWED * worst:.2g} times "
-        f"the noise, more than {ALLOWED:g} of it. A substep is divided into {most} parts at most."
+    text, remedy = FINDINGS["step"].filled(
+        count=coarse,
+        steps=int(s.count[0]),
+        size=ALLOWED * worst,
+        allowed=ALLOWED,
+        parts=most,
     )
-    remedy = "Take a smaller `steps.dt_max`, or allow more parts with `law.shadows.parts`."
     # The shift by errors that are so large is estimated with few correct digits.
     severity: Severity = "caution" if worst > COARSE else "note"
     return Finding("step", severity, text, "time step", worst, remedy=remedy)
@@ -256,7 +255,7 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
-    """Return where the estimates of one member stand."""
+    """Return the data on the estimates of one member, for its verdict."""
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
     _, C = reported_factors(filter_, x)

@@ -67,7 +67,7 @@ class ReadingRange:
         return replace(interval, z0=z0, z1=used), after
 
     def _wild(self, z: Array, least: float | Array) -> Mask:
-        """Return which readings are far outside of their past and of the other sensors'."""
+        """Return which readings are far outside their past and that of the other sensors."""
         known = self.count >= SETTLED
         none: Mask = np.zeros(len(z), dtype=bool)
         if not known.any():

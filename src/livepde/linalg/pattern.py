@@ -81,7 +81,7 @@ class Pattern:
         inside = rows.max() < self.shape[0] and cols.max() < self.shape[1]
         found: IntArray = np.asarray(places[rows, cols]).ravel() if inside else np.zeros(1, int)
         if not found.all():
-            raise IndexError("an entry lies outside of the sparsity pattern")
+            raise IndexError("an entry lies outside the sparsity pattern")
         return found - 1
 
     def matrix(self, data: Array) -> sp.csr_array:

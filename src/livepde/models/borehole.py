@@ -258,9 +258,9 @@ def _layered(mesh: Any, r_p: float, r_b: float) -> Any:
     inner, wall = (float(radii[np.abs(radii - r).argmin()]) for r in (r_p, r_b))
     if not first < r_p < r_b < last or not first < inner < wall < last:
         raise ModelError(
-            f"grouted_borehole: the radii r_p = {r_p:g} m and r_b = {r_b:g} m must lie inside of "
-            f"the mesh, {first:g} to {last:g} m, with cells of their own: let it begin a bit below "
-            "r_p, and take more cells or geometric spacing."
+            f"grouted_borehole: the radii r_p = {r_p:g} m and r_b = {r_b:g} m must lie inside "
+            f"the mesh, {first:g} to {last:g} m, in different cells: let it start a little below "
+            "r_p, and use more cells or geometric spacing."
         )
     points[0] = np.where(radii == inner, r_p, np.where(radii == wall, r_b, radii))
     moved = replace(mesh, doflocs=points)

@@ -226,8 +226,8 @@ def _check_boundary(model: Model, name: str) -> None:
         )
     if {name, "boundary"} & set(model.state_block.field.dirichlet):
         raise ModelError(
-            f"with_conditions: the boundary '{name}' has a value: a flux through it belongs to the "
-            "solution; keep one of both."
+            f"with_conditions: the boundary '{name}' has a value, so its flux is part of the "
+            "solution. Keep one of the two."
         )
 
 

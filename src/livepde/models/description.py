@@ -181,7 +181,7 @@ def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
 
 @dataclass(frozen=True)
 class _Closed:
-    """The `build` of a function that takes no boundary values, and says why: `ModelError`."""
+    """The `build` of a function without boundary values; raises `ModelError` with the reason."""
 
     function: Callable[..., Model]
     why: str
@@ -201,5 +201,5 @@ class _Closed:
 
 
 def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
-    """Return the `build` of a function that takes no boundary values, and says why."""
+    """Return the `build` of a function without boundary values; it raises the reason."""
     return _Closed(function, why)

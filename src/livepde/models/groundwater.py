@@ -176,9 +176,7 @@ def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[fl
     try:
         cell = mesh.element_finder()(*(np.array([c]) for c in place))[0]
     except ValueError:
-        raise ModelError(
-            f"groundwater: well '{name}' at {place} lies outside of the mesh."
-        ) from None
+        raise ModelError(f"groundwater: well '{name}' at {place} lies outside the mesh.") from None
     corners = mesh.p[:, mesh.t[:, cell]]
     width = float(np.linalg.norm(np.ptp(corners, axis=1)))
     if not radius >= width:

@@ -192,7 +192,7 @@ ADVECTION_DISPERSION = Equation(
 
 MOBILE_IMMOBILE = Equation(
     name="mobile_immobile",
-    summary="a tracer in a column of soil whose water partly stands still",
+    summary="a tracer in a column of soil with partly immobile water",
     formula="phi c_t = phi D c_xx - v c_x - omega (c - s),  (1 - phi) s_t = omega (c - s)",
     state=Variable("", "concentration in the mobile (c) and the immobile water (s)"),
     unknowns={

@@ -149,7 +149,7 @@ class FluxPlatesObserved(Observed):
                 )
             place = float(mesh.p[0][mesh.facets[0][np.asarray(facets)]].mean())
             if place not in (low, high):
-                raise ObservationError(f"FluxPlates: '{name}' is at '{at}', which is no end.")
+                raise ObservationError(f"FluxPlates: '{name}' is at '{at}', which is not an end.")
             # Into the domain: at the right end against x.
             sign = -1.0 if place == low else 1.0
         else:

@@ -111,7 +111,7 @@ class MovingObserved(Observed):
         return self._at(moment)[1]
 
     def _at(self, moment: Moment) -> tuple[sp.csr_array, Array]:
-        """Return G at a moment, and the mask of sensors inside of the mesh."""
+        """Return G at a moment, and the mask of sensors inside the mesh."""
         given = dict(moment.inputs)
         points = np.array(
             [[given.get(name, np.nan) for name in names] for names in self.observation.channels]

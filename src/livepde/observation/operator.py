@@ -77,7 +77,7 @@ class Observation:
     def _sees_all(self, remedy: str) -> None:
         """Raise an error if `of` is given but has no effect."""
         if self.of:
-            raise ObservationError(f"{type(self).__name__}: of='{self.of}' says nothing; {remedy}")
+            raise ObservationError(f"{type(self).__name__}: of='{self.of}' has no effect; {remedy}")
 
     def scalar_block(self, state: FunctionSpace) -> FieldBlock:
         """Return the component that is observed, which has to be one number at each point."""

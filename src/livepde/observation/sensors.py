@@ -217,8 +217,8 @@ class Averages(Observation):
         for name, region in given.items():
             if not (isinstance(name, str) and (isinstance(region, str) or callable(region))):
                 raise ObservationError(
-                    f"Averages: {name!r}: {region!r} is no region; expected the name of a sensor, "
-                    "and a predicate on x or the name of a boundary or subdomain of the mesh."
+                    f"Averages: {name!r}: {region!r} is not a region; expected the name of a "
+                    "sensor and a predicate on x, or a boundary or subdomain of the mesh."
                 )
 
     def names(self, count: int) -> tuple[str, ...]:
@@ -252,7 +252,7 @@ class Averages(Observation):
             local = block.local(piece)
             np.add.at(row, local.dofs, (local.part("value")[0] * weights).sum(axis=-1))
         if size <= 0:
-            raise ObservationError(f"Averages: region '{name}' holds no part of the mesh.")
+            raise ObservationError(f"Averages: region '{name}' contains no part of the mesh.")
         return row / size
 
 
@@ -359,7 +359,7 @@ class Matrix(Observation):
     labels: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
-        self._sees_all("G stands on all components.")
+        self._sees_all("G uses all components.")
 
     def names(self, count: int) -> tuple[str, ...]:
         if self.labels is None:

@@ -272,7 +272,7 @@ class DolfinxModel:
         return matrix
 
     def _readings(self, points: Any) -> Any:
-        """Return G: each point belongs to the lowest rank that has a cell with it."""
+        """Return G: each point is on the lowest rank that has a cell with it."""
         x, comm = np.zeros((len(points), 3)), self.mesh.comm
         x[:, : np.shape(points)[1]] = points
         rows = self.api.readings(self.V, x)
@@ -280,7 +280,7 @@ class DolfinxModel:
         first = np.min(owners, axis=0)
         if (first == comm.size).any():
             lost = np.flatnonzero(first == comm.size)[0]
-            raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside of the mesh.")
+            raise ModelError(f"DolfinxModel: sensor {lost} at {x[lost]} lies outside the mesh.")
         G = petsc_module().Mat().createAIJ(((None, len(x)), self.create_u().getSizes()), comm=comm)
         G.setUp()
         # How many shape functions a row has depends on the element, so none are preallocated.

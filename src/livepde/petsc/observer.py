@@ -128,7 +128,7 @@ class PetscObserver:
     def step(
         self, state: ObserverState, t: float, u_alpha: Any
     ) -> tuple[ObserverState, ObserverReport]:
-        """Return the state after a sample: u_alpha at t, its values outside of omega unused."""
+        """Return the state after a sample: u_alpha at t, its values outside omega unused."""
         if not t > state.t:
             raise LawError(f"PetscObserver: t must be later than {state.t}; got {t}.")
         solver, data = self.solver, u_alpha.copy()

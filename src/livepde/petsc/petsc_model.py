@@ -12,7 +12,7 @@ __all__ = ["PetscModel", "petsc_module"]
 
 MISSING = (
     "livepde.petsc needs petsc4py, mpi4py and, for UFL, DOLFINx; deploy/petsc.sh sets up an "
-    "environment with Debian's, as docs/parallel.md says."
+    "environment with Debian's packages: see docs/parallel.md."
 )
 
 

@@ -38,7 +38,7 @@ def _snapshots(data: xr.Dataset, times: Sequence[float] | int) -> list[int]:
     """
     available = data["snapshot"].values
     if not len(available):
-        raise ConfigurationError("the dataset holds no snapshots: run with at least one sample.")
+        raise ConfigurationError("the dataset contains no snapshots: run with at least one sample.")
     if isinstance(times, int):
         spread = np.linspace(0, 1, min(times, len(available))) ** 2 * (len(available) - 1)
         return [int(k) for k in np.unique(spread.round())]
@@ -190,7 +190,7 @@ def loops(runs: Mapping[str, xr.Dataset], rows: Sequence[str], *, title: str = "
 
 
 def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
-    """Draw one quantity of a closed loop, and what belongs to it, over times of shape (times,)."""
+    """Draw one quantity of a closed loop, with limits and targets, over times of shape (times,)."""
     for end, (meaning, style, colour) in LOOP_LINES.items():
         if f"{name}_{end}" in data:
             said = ax.get_legend_handles_labels()[1]

@@ -49,7 +49,7 @@ def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
 
 
 def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
-    """Return how many modes of a field the data have told at snapshot k, their number, and `left`.
+    """Return how many modes of a field the data determine at snapshot k, their number, and `left`.
 
     `left` is the root mean square over all modes of the remaining share of the prior standard
     deviation: a mode with the share s counts 1 - s^2 among those that were told.

@@ -79,7 +79,7 @@ def overview(
     """
     figure_class()
     if not data.sizes.get("time"):
-        raise ConfigurationError("the run holds no samples yet, so there is nothing to draw.")
+        raise ConfigurationError("the run contains no samples yet, so there is nothing to draw.")
     wide = [] if measured is None else _measured_panels(data, *measured)
     panels = _panels(data, times)
     columns = 1 if len(panels) == 1 else 2

@@ -23,8 +23,8 @@ BESIDE = {  # end of a name -> what such a variable says of the one without it
     "_std": "standard deviation of {}",
     "_low": "lower end of the 95 % interval of {}",
     "_high": "upper end of the 95 % interval of {}",
-    "_left": "share of the prior standard deviation of {} that is left",
-    "_modes": "number of modes of {} that the data have told of",
+    "_left": "standard deviation of {}, as a share of the prior's",
+    "_modes": "number of modes of {} that the data determine",
     "_left_out": "share of modes that the law leaves out in the variance of {}",
 }
 LONG_NAMES = {
@@ -34,9 +34,9 @@ LONG_NAMES = {
     "z": "z of the vertices",
     "sensor": "assimilated channel",
     "withheld": "withheld channel",
-    "innovation": "measured minus expected, one step ahead",
-    "withheld_error": "measured minus expected of withheld channels, one step ahead",
-    "status": "how the step went",
+    "innovation": "measured minus predicted, one step ahead",
+    "withheld_error": "measured minus predicted of withheld channels, one step ahead",
+    "status": "outcome of the step",
     "correlation": "correlation of the last estimates",
 }
 DIFFERENCES = ("innovation", "withheld_error")
@@ -153,7 +153,7 @@ def cf(
 
 
 def bounded(data: xr.Dataset) -> xr.Dataset:
-    """Return a copy with the 95 % interval of each scalar beside its standard deviation."""
+    """Return a copy with the 95 % interval of each scalar next to its standard deviation."""
     found = {}
     for name, variable in data.data_vars.items():
         found[name] = variable.copy(deep=False)

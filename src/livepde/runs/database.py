@@ -45,13 +45,13 @@ DAMAGE = (
 )
 AGAIN = "run the case again into another folder"
 REMEDIES = {  # primary result code of SQLite -> what to do
-    sqlite3.SQLITE_FULL: "make room",
-    sqlite3.SQLITE_IOERR: "make room or mend the disk",
-    sqlite3.SQLITE_READONLY: "let the folder and its files be written",
-    sqlite3.SQLITE_CANTOPEN: "let the folder and its files be read and written",
-    sqlite3.SQLITE_PERM: "let the folder and its files be read and written",
-    sqlite3.SQLITE_BUSY: "stop the other program that holds it",
-    sqlite3.SQLITE_LOCKED: "stop the other program that holds it",
+    sqlite3.SQLITE_FULL: "free disk space",
+    sqlite3.SQLITE_IOERR: "free disk space or repair the disk",
+    sqlite3.SQLITE_READONLY: "grant write access to the folder and its files",
+    sqlite3.SQLITE_CANTOPEN: "grant read and write access to the folder and its files",
+    sqlite3.SQLITE_PERM: "grant read and write access to the folder and its files",
+    sqlite3.SQLITE_BUSY: "stop the other program that uses it",
+    sqlite3.SQLITE_LOCKED: "stop the other program that uses it",
 }
 CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
@@ -118,7 +118,7 @@ def _connect(path: Path, options: str) -> sqlite3.Connection:
 
 
 def log_of(path: Path) -> Path:
-    """Return the write-ahead log beside a journal; it need not be there."""
+    """Return the write-ahead log of a journal; it need not exist."""
     return path.with_name(path.name + "-wal")
 
 
@@ -190,8 +190,8 @@ def told(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> str:
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
     if code & 0xFF in CORRUPT:
         return damaged(path, str(error))
-    remedy = remedy_of(error) or "mend the folder"
-    return f"{path}: {error}. What was written before is safe; {remedy}, and go on with --resume."
+    remedy = remedy_of(error) or "check the folder"
+    return f"{path}: {error}. Earlier results are safe. To continue, {remedy}, then add --resume."
 
 
 def remedy_of(error: Exception) -> str:

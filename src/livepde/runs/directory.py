@@ -79,10 +79,10 @@ def refuse_taken(path: Path) -> None:
     if not path.exists():
         return
     if not path.is_dir():
-        raise RunError(f"{path} is a file: name a folder for the run, nothing was written.")
+        raise RunError(f"{path} is a file. Specify a folder for the run. Nothing was written.")
     if any(path.iterdir()):
-        what = "already holds a run" if (path / RECORD).exists() else "is not empty"
-        raise RunError(f"{path} {what}: choose another folder, nothing was written.")
+        what = "already contains a run" if (path / RECORD).exists() else "is not empty"
+        raise RunError(f"{path} {what}. Choose another folder. Nothing was written.")
 
 
 def _only_begun(path: Path, case: str) -> bool:
@@ -95,7 +95,7 @@ def _only_begun(path: Path, case: str) -> bool:
 
 
 def _nearest(folder: Path) -> str:
-    """Return a hint on the nearest run directory: below the folder, beside it, or in runs/."""
+    """Return a hint on the nearest run directory: below the folder, next to it, or in runs/."""
     if folder.is_file():  # a case, or a file of a run
         folder = folder.parent
     near = difflib.get_close_matches(folder.name, run_names(folder.parent), n=1)
@@ -104,7 +104,7 @@ def _nearest(folder: Path) -> str:
         known = run_names(place)
         named = [name for name in known if name == folder.name] or known[-1:]
         likely += [place / name for name in named]
-    return f"did you mean '{likely[0]}'?" if likely else "'livepde run CASE' makes one in runs/."
+    return f"did you mean '{likely[0]}'?" if likely else "'livepde run CASE' creates one in runs/."
 
 
 def run_names(folder: Path) -> list[str]:
@@ -116,7 +116,7 @@ def _refuse_links(path: Path) -> None:
     """Raise `RunError` if a file of a run is a link: writing to it would change another file."""
     for item in path.iterdir():
         if item.is_symlink():
-            raise RunError(f"{item} is a link: a run is gone on with in files of its own only.")
+            raise RunError(f"{item} is a link: a run is resumed in regular files only.")
 
 
 @contextmanager
@@ -127,7 +127,7 @@ def _room_to_write(folder: Path) -> Iterator[None]:
     except RunError:
         raise
     except OSError as error:
-        why = f"{error.strerror or error}; make room or mend the folder."
+        why = f"{error.strerror or error}; free disk space or check the folder."
         raise RunError(f"{folder} cannot be written: {why}") from error
 
 
@@ -190,7 +190,7 @@ class RunWriter:
         except RunError:
             raise
         except OSError as error:
-            raise RunError(f"{path}: cannot be made: {error.strerror or error}.") from error
+            raise RunError(f"{path}: cannot be created: {error.strerror or error}.") from error
         return writer
 
     @classmethod
@@ -297,7 +297,7 @@ class Run:
 
     @property
     def notes(self) -> list[str]:
-        """Notes of the run: warnings and remarks beside its numbers."""
+        """Notes of the run: warnings and remarks in addition to its numbers."""
         return [str(note) for note in self.record.get("notes", [])]
 
     @property
@@ -310,7 +310,7 @@ class Run:
                 bound = tuple(item["bound"]) if isinstance(item["bound"], list) else item["bound"]
                 found.append(Check(item["name"], value, bound, item["sense"]))
         except (LookupError, TypeError, ValueError):
-            raise RunError(f"{self.path / RECORD} is damaged: its checks are none.") from None
+            raise RunError(f"{self.path / RECORD} is damaged: its checks are not valid.") from None
         return found
 
     @cached_property
@@ -323,13 +323,15 @@ class Run:
                 return kept.dataset()
         if not path.is_file():
             told = "".join(f" {note}" for note in self.notes)
-            raise RunError(f"{self.path} holds no estimates; its status is '{self.status}'.{told}")
+            raise RunError(
+                f"{self.path} contains no estimates; its status is '{self.status}'.{told}"
+            )
         import xarray as xr
 
         try:
             content = path.read_bytes()
             if hashlib.sha256(content).hexdigest() not in self.record.get(CONTENT, []):
-                raise ValueError("its bytes are not those that were written")
+                raise ValueError("its content has changed since it was written")
             # What is written here decodes in silence: a warning tells of bytes that changed.
             with warnings.catch_warnings(action="error", category=xr.SerializationWarning):
                 raw = io.BytesIO(content)
@@ -344,7 +346,7 @@ class Run:
         ) as error:
             remedy = "run the case again, into another folder"
             if journal.is_file():
-                remedy = "delete it: they are read from the journal then"
+                remedy = "delete it, so that they are read from the journal"
             raise RunError(f"{path} is damaged: {error}; {remedy}.") from error
 
     @contextmanager
@@ -370,8 +372,8 @@ class Run:
         copy = self.path / CASE
         if not copy.is_file():
             raise RunError(
-                f"{self.path} was not made from a case file: only runs of 'livepde run' can be "
-                "taken again."
+                f"{self.path} was not made from a case file. Only runs of 'livepde run' can be "
+                "processed again."
             )
         for word in self.record.get("command", [])[2:]:
             original = Path(str(word))
@@ -381,7 +383,7 @@ class Run:
                     return original
         if hashlib.sha256(copy.read_bytes()).hexdigest() != self.record.get(COPY):
             raise RunError(
-                f"{copy} is not the case that was run; name the case file to 'livepde run' again."
+                f"{copy} is not the case that was run. Give the case file to 'livepde run' again."
             )
         return copy
 
@@ -396,7 +398,7 @@ class Run:
         return _data_of(self.record.get("command", []))
 
     def refuse_other(self, command: Sequence[str], case: str, settings: Sequence[str]) -> None:
-        """Raise `RunError` unless the run can go on with this case, these settings and data."""
+        """Raise `RunError` unless the run can be resumed with a case, settings and data."""
         begun = (self.path / JOURNAL).is_file() or not (self.path / ESTIMATES).exists()
         if not (self.path / CASE).is_file() or not begun:
             raise RunError(f"{self.path} has no case and journal: it cannot be resumed.")
@@ -405,13 +407,13 @@ class Run:
         same = kept == case or _parts(kept)[0] == _parts(case)[0]
         if not same or begun_with != now:
             raise RunError(
-                f"{self.path} was run with another case or other settings: resume it with those, "
+                f"{self.path} was run with another case or other settings. Resume it with these, "
                 "or choose another folder."
             )
         named = _data_of(command)
         if named != self.data_file:
             raise RunError(
-                f"{self.path} was run with {_said(self.data_file)}, not with {_said(named)}: "
+                f"{self.path} was run with {_named(self.data_file)}, not with {_named(named)}: "
                 "resume it so, or choose another folder."
             )
 
@@ -440,7 +442,7 @@ def open_run(path: str | os.PathLike[str]) -> Run:
     folder = Path(path)
     for page in folder.glob("*"):
         if page.suffix in WRITTEN_LATER and page.is_symlink():
-            raise RunError(f"{page} is a link: what is written to it would land elsewhere.")
+            raise RunError(f"{page} is a link: data written to it would go elsewhere.")
     try:
         with (folder / RECORD).open("rb") as file:
             text = file.read(LONGEST + 1)
@@ -449,15 +451,15 @@ def open_run(path: str | os.PathLike[str]) -> Run:
         record = json.loads(text)
     except (FileNotFoundError, NotADirectoryError):
         why = f"no {RECORD}" if folder.is_dir() or not folder.exists() else "it is a file"
-        raise RunError(f"{folder} holds no run ({why}); {_nearest(folder)}") from None
+        raise RunError(f"{folder} contains no run ({why}); {_nearest(folder)}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise RunError(f"{folder / RECORD} is damaged: {error}.") from error
     if not isinstance(record, dict) or record.get("format") != FORMAT:
         raise RunError(f"{folder / RECORD} is not a record of this version of livepde.")
     if record.pop(OWN, "") != _digest(record):
         raise RunError(
-            f"{folder / RECORD} is damaged: it is not as it was written; take it from a copy, or "
-            "run the case again, into another folder."
+            f"{folder / RECORD} is damaged: its content has changed since it was written; "
+            "restore it from a copy, or run the case again into another folder."
         )
     return Run(folder, record)
 
@@ -480,7 +482,7 @@ def drawn_into(folder: Path, figures: Mapping[str, FigureFactory], notes: list[s
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file; it appears whole or not at all, and in the place of a link."""
+    """Write a text file; it appears whole or not at all, and replaces a link."""
     write_bytes(path, text.encode())
 
 
@@ -592,5 +594,5 @@ def _data_of(command: Sequence[Any]) -> str | None:
     return None
 
 
-def _said(data: str | None) -> str:
+def _named(data: str | None) -> str:
     return f"--data {data}" if data else "the data of its case"

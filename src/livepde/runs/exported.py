@@ -60,10 +60,10 @@ def export(run: Run, target: Path, *, at: float | None = None, force: bool = Fal
     need(target, NEEDS.get(ending, []))
     if at is not None and ending not in AT_ONE_TIME:
         raise ConfigurationError(
-            f"{target}: holds all times; a time is chosen for {' and '.join(AT_ONE_TIME)}."
+            f"{target}: contains all times; a time is only chosen for {' and '.join(AT_ONE_TIME)}."
         )
     if not run.dataset.sizes["time"]:
-        raise RunError(f"{run.path} holds no estimates yet: there is nothing to export.")
+        raise RunError(f"{run.path} contains no estimates yet, so there is nothing to export.")
     into_place(target, lambda path: FORMATS[ending](run, path, at), force=force)
 
 
@@ -79,7 +79,7 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
 
 
 def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
-    """Write a file or folder beside its target, and move it there when it is complete.
+    """Write a file or folder next to its target, and move it there when it is complete.
 
     Parameters
     ----------
@@ -114,9 +114,9 @@ def refuse_file(target: Path, force: bool) -> None:
     if not target.exists():
         return
     if target.is_dir() and not {".zgroup", "zarr.json"} & {path.name for path in target.iterdir()}:
-        raise RunError(f"{target} is a folder: name a file.")
+        raise RunError(f"{target} is a folder. Specify a file.")
     if not force:
-        raise RunError(f"{target} exists: name another file, or add --force to write over it.")
+        raise RunError(f"{target} exists. Choose another file, or add --force to replace it.")
 
 
 def _conventional(run: Run) -> xr.Dataset:
@@ -174,12 +174,12 @@ def _over_time(run: Run) -> pd.DataFrame:
 
 
 def _series(run: Run, path: Path, at: float | None) -> None:
-    """Write the fields of all times as XDMF, with their numbers in an HDF5 file beside it."""
+    """Write the fields of all times as XDMF, with their numbers in an HDF5 file next to it."""
     import h5py  # type: ignore[import-untyped]
     from meshio.xdmf import TimeSeriesWriter
 
     class Writer(TimeSeriesWriter):  # type: ignore[misc]
-        """Keeps the HDF5 file beside the XDMF file, not in the current folder."""
+        """Keeps the HDF5 file next to the XDMF file, not in the current folder."""
 
         def __enter__(self) -> Any:
             self.h5_filename = str(self.filename.with_suffix(".h5"))
@@ -204,7 +204,7 @@ def _vtk(run: Run, path: Path, at: float | None) -> None:
 
 def _with_fields(run: Run) -> xr.Dataset:
     if not run.dataset.sizes.get("snapshot"):
-        raise RunError(f"{run.path} holds no fields: there is nothing to draw.")
+        raise RunError(f"{run.path} contains no fields, so there is nothing to draw.")
     return run.dataset
 
 

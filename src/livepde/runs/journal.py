@@ -454,7 +454,7 @@ class Journal:
     # --- reading -------------------------------------------------------------------------------
 
     def _meta(self) -> dict[str, str]:
-        """Return the header; raise `RunError` if the file is no journal of this version."""
+        """Return the header; raise `RunError` if the file is not a journal of this version."""
         found = self._read("SELECT sql FROM sqlite_schema WHERE sql IS NOT NULL")
         if {str(sql) for (sql,) in found} == set(SCHEMA):
             meta = dict(self._sound("meta", self._read("SELECT * FROM meta")))

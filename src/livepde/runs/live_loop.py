@@ -284,7 +284,7 @@ class Live:
             why = f"the journal cannot be written ({error.__cause__}): {self.journal.remedy}"
             if not self._unwritten:
                 about = {"kind": "disk", "channel": "", "t": self.identifier.t}
-                LOG.warning("disk: %s, and the run goes on", why, extra=about)
+                LOG.warning("disk: %s; the run continues", why, extra=about)
             self._unwritten = self._unwell = why
             self._told = "disk", "unwell"
             if self.stopping.wait(LOOK):
@@ -296,7 +296,7 @@ class Live:
                 again = self._recover()
                 # This is a write, too: the disk may be away again.
                 away = f"{self._clock() - begun:.1f} s ({error.__cause__})"
-                self._tell("disk", f"nothing could be written for {away}")
+                self._tell("disk", f"the disk was not writable for {away}")
             except RunError as still:
                 error, again = still, None
         self._unwritten = ""
@@ -516,8 +516,8 @@ class Live:
         if refused > 0.0:
             self._wild = True
             text = (
-                f"t = {estimate.t:g}: {refused:g} readings lie far outside of all before them, and "
-                "are not used; further ones are in the report"
+                f"t = {estimate.t:g}: {refused:g} outliers, far outside the range so far, were "
+                "rejected; the report lists later ones"
             )
             self._tell("wild", text)
 
@@ -588,25 +588,25 @@ class Live:
 
     @property
     def replaying(self) -> str:
-        """How many samples since the checkpoint were taken again; empty if none are to be."""
+        """Progress of the replay of samples since the checkpoint; empty without one."""
         again, total = self._replay
         return f"replaying {again} of {total} since the checkpoint" if total else ""
 
     @property
     def why(self) -> str:
-        """Reason why the run is not well, in one sentence; empty if it is.
+        """Reason why the run is unhealthy, in one sentence; empty if it is healthy.
 
         While the same ailment lasts, the sentence is that of its beginning.
         """
         return self._ill()[1]
 
     def _ill(self) -> tuple[str, str]:
-        """Return the kind of the first active ailment and its sentence; empty if all is well."""
+        """Return the kind of the first active ailment and its sentence; empty if there is none."""
         ailing, why = self._ailing()
         return ailing, self._unwell if ailing == self._told[0] else why
 
     def _ailing(self) -> tuple[str, str]:
-        """Return the kind of the first active ailment and its reason; empty if all is well."""
+        """Return the kind of the first active ailment and its reason; empty if there is none."""
         found = ((kind, why) for kind, ailment in self.ailments.items() if (why := ailment()))
         return next(found, ("", ""))
 
@@ -622,14 +622,14 @@ class Live:
         if self.journal.in_place:
             return ""
         return (
-            "the journal's file is no longer the one in the run directory, and what is written "
-            "ends with this process: stop it, and run the case into a new folder"
+            "the journal in the run directory was replaced, so new results will be lost when this "
+            "process ends: stop it, and run the case into a new folder"
         )
 
     def _silence(self) -> str:
         if not self.silent:
             return ""
-        return f"nothing has come from the source for more than {self.silence:g} s"
+        return f"no data from the source for more than {self.silence:g} s"
 
     def _refusing(self) -> str:
         waits = not (self.busy or self.feed.done)
@@ -637,13 +637,13 @@ class Live:
         if not (long or self._refused >= REFUSED):
             return ""
         if not self._refused:
-            return f"no sample has been taken for more than {self.silence:g} s"
-        return f"rows come and none is taken; the last one: {self._refusal}"
+            return f"no sample was accepted for more than {self.silence:g} s"
+        return f"rows arrive, but none is accepted; the last one: {self._refusal}"
 
     def _failing(self) -> str:
         last = self.result.last
         if self._failed > 1:
-            return f"the last steps have failed; the last one: {self._failure}"
+            return f"the last steps failed; the last one: {self._failure}"
         return "" if last is None or last.status.ok else f"the last step: {last.status}"
 
     def _look(self) -> None:
@@ -658,7 +658,7 @@ class Live:
         if why:
             self._tell(self._told[1], why)
         elif kind == "unwell":  # "heard" has reported the end of a silence
-            self._tell("well", "all is well again")
+            self._tell("well", "recovered")
 
     def _take(self) -> None:
         """Take the first waiting sample; it stays in the queue if the journal cannot keep it."""
@@ -695,7 +695,7 @@ class Live:
                 raise Interrupted
 
     def _estimate(self, taken: Taken) -> Estimate | None:
-        """Take a step; return None if the sample was refused or set aside."""
+        """Take a step; return None if the sample was rejected or skipped."""
         before, begun = self.identifier.place, time.monotonic()
         self._tell_pause(taken.t)
         try:
@@ -736,7 +736,7 @@ class Live:
             text = (
                 f"no sample for {length:g} until t = {t:g}: the interval was divided into "
                 f"{LONG_SUBSTEPS} substeps longer than dt_max = {control.dt_max:g}; check the "
-                "time, or state a longer steps.dt_max"
+                "time, or increase `steps.dt_max`"
             )
             self._tell("pause", text)
 
@@ -747,9 +747,9 @@ class Live:
         self.feed.withdraw(self._waiting[-1].t if self._waiting else self.journal.last)
 
     def _set_aside(self, t: float, why: str) -> None:
-        """Withdraw a sample whose step fails, and report it; the stream goes on."""
+        """Withdraw a sample whose step fails, and report it; the run continues."""
         self._failed += 1
-        self._failure = f"t = {t:g} was set aside: {why}"
+        self._failure = f"the sample at t = {t:g} was skipped: {why}"
         self._tell("aside", self._failure)
         self._counts["aside", ""] += 1
         self.journal.count("aside")
@@ -793,7 +793,7 @@ class Live:
             return
         verdict, self._looked = self._with_errors(estimate), len(self.result)
         before = self._level
-        # The first level that is found is told at once.
+        # The first level that is found is reported at once.
         known = before in (NOT_JUDGED, verdict.level) or (
             self._next != ""
             and (LEVELS.index(self._next) > LEVELS.index(before))
@@ -804,8 +804,8 @@ class Live:
             self._level = verdict.level
         self._keep_verdict(verdict if known else self._verdict)
         if self._level != before:
-            said = verdict.sentences[0] if verdict.sentences else "nothing speaks against it"
-            message = f"{verdict.level}: {said.removeprefix('Not judged: ')}"
+            first = verdict.sentences[0] if verdict.sentences else "no problems detected"
+            message = f"{verdict.level}: {first.removeprefix('Not judged: ')}"
             # Each sound run begins as not judged, and is trusted then: that is no warning.
             self._tell("verdict", message, harmless=verdict.level == LEVELS[0])
 
@@ -837,20 +837,20 @@ class Live:
         self.journal.judge({**verdict.to_dict(), **look})
 
     def _put(self, estimate: Estimate) -> None:
-        """Hand an estimate to all sinks; a sink that fails is removed, and the run goes on."""
+        """Hand an estimate to all sinks; a sink that fails is removed, and the run continues."""
         self._put_last = estimate.t
         for sink in list(self.sinks):
             try:
                 sink.put(estimate)
             except (OSError, LivepdeError) as error:
                 self.sinks.remove(sink)
-                self._tell("sink", f"{type(sink).__name__} is given up: {error}")
+                self._tell("sink", f"{type(sink).__name__} failed and was removed: {error}")
 
     def _listen(self, heard: bool) -> None:
         now = self._clock()
         if heard:
             if self.silent:
-                self._tell("heard", f"the source is heard again after {now - self._heard:.0f} s")
+                self._tell("heard", f"data source reconnected after {now - self._heard:.0f} s")
             self._longest = max(self._longest, now - self._heard)
             self._heard, self.silent = now, False
         elif now - self._heard > self.silence:

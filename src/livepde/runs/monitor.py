@@ -1,4 +1,4 @@
-"""A small HTTP endpoint beside a run: probes of the process, /health, /metrics for Prometheus."""
+"""A small HTTP endpoint of a run: probes of the process, /health, /metrics for Prometheus."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Metrics(Sink):
         self._estimate = gauge("estimate", "Estimated unknown, in its unit", "unknown")
         about = "Standard deviation of an unknown, in its unit"
         self._deviation = gauge("deviation", about, "unknown")
-        about = "Measured minus expected of the last sample, in the unit of the sensors"
+        about = "Measured minus predicted of the last sample, in the unit of the sensors"
         self._innovation = gauge("innovation", about, "sensor")
         about = "Time of the last sample since the start of the model"
         self._time = gauge("model_time_seconds", about)
@@ -62,11 +62,11 @@ class Metrics(Sink):
         build.labels(__version__).set(1)
         self._unit = gauge("unknown_info", "1, with the unit of an unknown", "unknown", "unit")
         self._second = second
-        self._samples = Counter("livepde_samples", "Samples taken", registry=self.registry)
+        self._samples = Counter("livepde_samples", "Samples processed", registry=self.registry)
         self._failed = Counter("livepde_failed_steps", "Steps that failed", registry=self.registry)
 
     def put(self, estimate: Estimate) -> None:
-        """Take one estimate."""
+        """Publish one estimate."""
         for label, (value, std) in estimate.parameters.items():
             self._estimate.labels(label).set(value)
             self._deviation.labels(label).set(std)
@@ -92,9 +92,9 @@ class _Health:
 
         found = self._health()
         for name, key, text in (
-            ("ok", "ok", "1 while samples come, are taken, and steps succeed"),
-            ("silent", "silent", "1 while nothing comes from the source"),
-            ("waiting_samples", "waiting", "Samples that wait for their step"),
+            ("ok", "ok", "1 while samples arrive, are accepted, and steps succeed"),
+            ("silent", "silent", "1 while no data arrive from the source"),
+            ("waiting_samples", "waiting", "Samples waiting for their step"),
         ):
             if key in found:
                 yield GaugeMetricFamily(f"livepde_{name}", text, float(found[key]))
@@ -111,7 +111,7 @@ class _Health:
         if "seconds" in found:
             text = "Seconds spent in steps"
             yield CounterMetricFamily("livepde_step_seconds", text, found["seconds"])
-        text = "Rows, values and samples that were late, broken, missing, merged, ..."
+        text = "Rows, values and samples that were late, malformed, missing, merged, ..."
         remarks = CounterMetricFamily("livepde_remarks", text, labels=["kind", "channel"])
         for kind, channel, number in found.get("counts", ()):
             remarks.add_metric([kind, channel], number)
@@ -119,7 +119,7 @@ class _Health:
 
 
 class Monitor:
-    """Serves /livez, /readyz, /health and /metrics from threads of its own.
+    """Serves /livez, /readyz, /health and /metrics from its own threads.
 
     /livez answers 200 as long as the process does, /readyz and /health while the run goes well,
     else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes

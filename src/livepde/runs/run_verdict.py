@@ -1,4 +1,4 @@
-"""Verdict of a run: findings from its dataset and its journal, beside those of its law."""
+"""Verdict of a run: findings from its dataset and its journal, with the findings of its law."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ from livepde.verdict import (
     discretised,
     flat,
 )
+from livepde.verdict.sentences import FINDINGS, LIKELY, Sentence, percent
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -62,10 +63,10 @@ SHORTEST = 20  # values at least to tell whether an estimate wanders
 LEFT_OUT = 0.25  # of a field's mean variance is that of modes that the law leaves out
 RESTS = 0.1  # scatter of an estimate over its size that may be: it rests
 INPUT_KINDS = {
-    "start": "first values far off all that follow, and off the other channels, count as missing",
-    "spike": "values far off those before and after were refused as spikes",
-    "interpolated": "gaps were interpolated between the values before and after",
-    "missing": "missing values were not between known ones: the last value was held",
+    "start": "first values were outliers and count as missing",
+    "spike": "spikes were rejected",
+    "interpolated": "missing values were interpolated",
+    "missing": "missing values were replaced by the last one",
 }
 
 
@@ -88,17 +89,17 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
         Whether the law has judged innovations and refused readings itself.
     """
     gradient = note(data, "residual") is not None
-    own = [] if judged else [*_model_error(data), *_said("refused", "caution", _refused(data))]
+    own = [] if judged else [*_model_error(data), *_each("refused", "caution", _refused(data))]
     return [
         *own,
         *_unknowns(data),
-        *_said("held", "do not trust", _held(data)),
-        *_said("left out", "note", _left_out(data)),
+        *_each("held", "do not trust", _held(data)),
+        *_each("left out", "note", _left_out(data)),
         *_discretised(data),
         *_rests(data),
-        *_said("guards", "caution", [] if gradient else _guards(data)),
-        *_said("gain", "caution", _gain(data)),
-        *_said("jump", "caution", _jumps(data)),
+        *_each("guards", "caution", [] if gradient else _guards(data)),
+        *_each("gain", "caution", _gain(data)),
+        *_each("jump", "caution", _jumps(data)),
     ]
 
 
@@ -108,7 +109,7 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
     Notes: where more than 2 % of the values were held, the verdict of the estimate has a caution.
     """
     found, driving = [], [*channels]
-    # Wild first values are told of sensors, too: the initial state may have been made of them.
+    # Outliers at the start matter for sensors, too: the initial state may be made of them.
     others = [name for kind, name in journal.counts if kind == "start"]
     for name in dict.fromkeys([*driving, *others]):
         counts = {
@@ -120,7 +121,7 @@ def input_findings(journal: Journal, channels: Iterable[str]) -> list[Finding]:
         if not parts:
             continue
         held = counts.get("missing", 0) / max(len(journal), 1)
-        text = f"Channel {name}: {'; '.join(parts)}."
+        text, _ = FINDINGS["input, counts"].filled(name=name, counts=", ".join(parts))
         found.append(Finding("input", "note", text, name, held))
     return found
 
@@ -132,15 +133,10 @@ def clock_findings(journal: Journal) -> list[Finding]:
         return []
     often = "once" if count == 1 else f"{count} times"
     shifted = journal.counts.get(("shifted", ""), 0)
-    text = (
-        f"Times of rows went back {often}, and rows were not used until their times were new "
-        "again. Later times are only right if the clock was right afterwards."
-    )
-    remedy = "If the clock was wrong, state its correction with `intake.shift`."
+    text, remedy = FINDINGS["clock"].filled(often=often)
     severity: Severity = "caution"
     if shifted >= SHIFTED:
-        text += f" {shifted} times the clock stayed set back: intervals there are too short."
-        remedy += " Synchronise it gradually."
+        text, remedy = FINDINGS["clock, shifted"].filled(often=often, shifted=shifted)
         severity = "do not trust"
     return [Finding("clock", severity, text, "", count, remedy=remedy)]
 
@@ -167,40 +163,37 @@ def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[
         if factor := unit_factor(float(t[k - 1]), float(t[k]), usual, later):
             found.append(_unit_changed(k, at, factor))
             break  # of later steps nothing is known
-        after = "The state is estimated again from there on, and the unknowns are kept."
+        after = " The state is re-estimated from there on. The unknowns are kept."
+        after = after if anchors else ""
         if float(t[k]) in leaps:
-            found.append(_leapt(k, at, times, after if anchors else ""))
+            found.append(_leapt(k, at, times, after))
             continue
-        text = f"No sample for {times} until {at}, {length / usual:.0f} usual intervals."
-        text = f"{text} {after}" if anchors else text
+        sentence = FINDINGS["pause"]
+        text, _ = sentence.filled(times=times, at=at, count=length / usual, after=after)
         found.append(Finding("pause", "note", text, "", length))
     return found
 
 
 def _unit_changed(k: int, at: str, factor: float) -> Finding:
     """Return that times count in another unit from a sample on."""
-    text = (
-        f"From sample {k + 1} on ({at}) times are {factor:g} times as large as those before: they "
-        f"seem to be in another unit, such as {FACTORS[factor]} after seconds."
+    text, remedy = FINDINGS["clock, unit"].filled(
+        sample=k + 1, at=at, factor=factor, unit=FACTORS[factor]
     )
-    remedy = f"Divide the times from that row on by {factor:g}, or split the table there."
-    cause = Cause("clock", "time", f"the unit of time changes at {at}", 1.0, remedy)
+    likely, _ = LIKELY["clock, unit"].filled(at=at)
+    cause = Cause("clock", "time", likely, 1.0, remedy)
     return Finding("clock", "do not trust", text, "time", factor, causes=(cause,))
 
 
 def _leapt(k: int, at: str, times: str, after: str) -> Finding:
     """Return that a clock leapt forward before a sample."""
-    text = (
-        f"Time leaps by {times} at {at} (sample {k + 1}), and the readings continue as after one "
-        f"usual interval: the clock was set. {after}"
-    )
-    remedy = "If the later times are right, add the leap to the earlier ones; else take it off."
-    cause = Cause("clock", "time", f"the clock leapt by {times} at {at}", math.nan, remedy)
-    return Finding("clock", "caution", text.rstrip(), "time", k, causes=(cause,))
+    text, remedy = FINDINGS["clock, leap"].filled(sample=k + 1, at=at, times=times, after=after)
+    likely, _ = LIKELY["clock, leap"].filled(at=at, times=times)
+    cause = Cause("clock", "time", likely, math.nan, remedy)
+    return Finding("clock", "caution", text, "time", k, causes=(cause,))
 
 
-def _said(what: str, severity: Severity, sentences: Iterable[str]) -> list[Finding]:
-    return [Finding(what, severity, sentence) for sentence in sentences]
+def _each(what: str, severity: Severity, sentences: Iterable[Sentence]) -> list[Finding]:
+    return [Finding(what, severity, one.text, remedy=one.remedy) for one in sentences]
 
 
 def _model_error(data: xr.Dataset) -> list[Finding]:
@@ -208,16 +201,13 @@ def _model_error(data: xr.Dataset) -> list[Finding]:
     ratio = _last(data, "innovation_ratio")
     if not ratio > MODEL_ERROR:
         return []
-    text = (
-        "The model does not explain the data: the sensors miss what is expected of them by "
-        f"{math.sqrt(ratio):.1f} times what noise and uncertainty allow (innovation ratio "
-        f"{ratio:.1f}, bound {MODEL_ERROR:g}). The intervals were widened but should still not be "
-        "trusted."
+    text, _ = FINDINGS["misfit, innovations"].filled(
+        times=math.sqrt(ratio), ratio=ratio, limit=MODEL_ERROR
     )
     return [Finding("misfit", "do not trust", text, evidence=ratio)]
 
 
-def _refused(data: xr.Dataset) -> list[str]:
+def _refused(data: xr.Dataset) -> list[Sentence]:
     values = note(data, "refused")
     if values is None:
         return []
@@ -225,11 +215,7 @@ def _refused(data: xr.Dataset) -> list[str]:
     share = refused / max(int(np.isfinite(data["innovation"].values).sum()), 1)
     if share <= REFUSED:
         return []
-    return [
-        f"{share:.1%} of the readings were not used ({refused:.0f}): they lie more than law.gate "
-        "standard deviations from what was expected. Look at these sensors, state a larger noise, "
-        "or open the gate."
-    ]
+    return [FINDINGS["refused, run"].filled(share=percent(share, 1), count=round(refused))]
 
 
 def _unknowns(data: xr.Dataset) -> list[Finding]:
@@ -245,21 +231,16 @@ def _unknowns(data: xr.Dataset) -> list[Finding]:
     return found
 
 
-def _held(data: xr.Dataset) -> list[str]:
+def _held(data: xr.Dataset) -> list[Sentence]:
     """Return whether latent values were held at `within` prior standard deviations."""
     at = _times(data, "bounded")
     # Where a last fit has converged, what counts is where it ended.
     if not len(at) or not data.attrs.get("bounded_at_end", 1.0):
         return []
-    return [
-        f"In {len(at)} samples, last at {when(data, at[-1])}, the data asked for unknowns farther "
-        "from the prior than its standard deviation allows (within, by default 10 of them), and "
-        "they were held there: the prior is much too narrow, or a unit, a sensor or the model "
-        "is wrong."
-    ]
+    return [FINDINGS["held"].filled(count=len(at), at=when(data, at[-1]))]
 
 
-def _left_out(data: xr.Dataset) -> list[str]:
+def _left_out(data: xr.Dataset) -> list[Sentence]:
     """Return fields whose variance is to a large part that of modes the law leaves out."""
     found = []
     for name in field_names(data):
@@ -270,66 +251,44 @@ def _left_out(data: xr.Dataset) -> list[str]:
             continue
         std = float(np.sqrt((data[f"{name}_std"].values[-1] ** 2).mean()))
         unit = str(data[name].attrs.get("units", ""))
-        much = f"{share:.0%}" if share < 0.99 else "more than 99%"
+        of_modes = std * math.sqrt(max(1.0 - share, 0.0))
         found.append(
-            f"{name}: {much} of its variance is that of details finer than the {count} modes "
-            "of the law, which no data narrow: its standard deviation (root mean square) is "
-            + f"{std:.2g} {unit}".rstrip()
-            + f", and of the {count} modes alone {std * math.sqrt(max(1.0 - share, 0.0)):.2g}. "
-            "Give law.modes a larger number, or the field a longer length."
+            FINDINGS["left out"].filled(
+                share=percent(share) if share < 0.99 else "More than 99 %",
+                name=name,
+                count=count,
+                std=f"{std:.2g} {unit}".rstrip(),
+                modes=f"{of_modes:.2g} {unit}".rstrip(),
+            )
         )
     return found
 
 
-def _jumps(data: xr.Dataset) -> list[str]:
-    alarms, found = jumps(data), []
+def _jumps(data: xr.Dataset) -> list[Sentence]:
+    alarms, found = jumps(data), list[Sentence]()
     for jump in alarms[:MOST_JUMPS]:
         at = when(data, jump.t)
         went = [
-            f"{label} from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
+            f"{label} has changed from {digits(before, std)[0]} to {' ± '.join(digits(after, std))}"
             for label, (before, after, std) in jump.moved.items()
         ]
-        since = f"; since then {', '.join(went)}."
-        if not went:
-            since = (
-                ", but no number has changed for good: a passing disturbance, or a change that the "
-                "model does not know."
-            )
-        found.append(
-            f"Jump at {at}: the samples no longer fitted what was known, so the unknowns were "
-            f"allowed to move{since}"
-        )
+        sentence = FINDINGS["jump" if went else "jump, nothing moved"]
+        found.append(sentence.filled(at=at, moved=", ".join(went)))
     if len(alarms) > MOST_JUMPS:
-        found.append(
-            f"{len(alarms) - MOST_JUMPS} more jumps: the unknowns may rather move all the time "
-            "(evolution), or a process is missing in the model."
-        )
+        found.append(FINDINGS["jump, more"].filled(count=len(alarms) - MOST_JUMPS))
     return found
 
 
-def _guards(data: xr.Dataset) -> list[str]:
+def _guards(data: xr.Dataset) -> list[Sentence]:
     tempered, held = _times(data, "tempered"), _times(data, "held")
     restarted, runaway = _times(data, "restarted"), _times(data, "runaway")
-    found = []
+    found = list[Sentence]()
     if len(tempered) or len(held):
-        found.append(
-            f"{len(tempered)} samples were used with more than their noise and {len(held)} not at "
-            "all, because the law could not be linearised where they would have moved the unknowns "
-            f"(last at t = {max([*tempered, *held]):g}): look at the sensors then, state a larger "
-            "noise, or start from a better prior."
-        )
-    if len(restarted):
-        found.append(
-            f"The estimate ran away and was restarted from before: {len(restarted)} times, last at "
-            f"t = {restarted[-1]:g}. Look at sensors and inputs before that time; bounds or a "
-            "transform keep an unknown where the model can be simulated."
-        )
-    if len(runaway):
-        found.append(
-            f"{len(runaway)} predictions missed a sensor by more than all that it has ever varied, "
-            f"and a restart did not help (last at t = {runaway[-1]:g}): look at inputs, boundary "
-            "values and their units."
-        )
+        counts, last = {"tempered": len(tempered), "skipped": len(held)}, max([*tempered, *held])
+        found.append(FINDINGS["guards, nonlinear"].filled(**counts, t=last))
+    for kind, at in (("guards, restarted", restarted), ("guards, lost", runaway)):
+        if len(at):
+            found.append(FINDINGS[kind].filled(count=len(at), t=at[-1]))
     return found
 
 
@@ -345,9 +304,9 @@ def _rests(data: xr.Dataset) -> list[Finding]:
     held = np.isin(times, at)
     begin = times[held & ~np.append(False, held[:-1])]
     since = when(data, begin[-1])
-    text = f"Nothing but noise excited the unknowns from {since} on: they were held"
     before = f", as {len(begin) - 1} times before" if len(begin) > 1 else ""
-    return [replace(found, text=f"{text}{before}.")]
+    text, _ = FINDINGS["rest, now"].filled(since=since, before=before)
+    return [replace(found, text=text)]
 
 
 def _discretised(data: xr.Dataset) -> list[Finding]:
@@ -380,7 +339,7 @@ def _times(data: xr.Dataset, name: str, more: float = 0.0) -> Array:
     return found
 
 
-def _gain(data: xr.Dataset) -> list[str]:
+def _gain(data: xr.Dataset) -> list[Sentence]:
     """Return the findings on a law with a fixed gain, which has no covariance."""
     if note(data, "residual") is None or note(data, "gain") is not None:
         return []
@@ -388,11 +347,7 @@ def _gain(data: xr.Dataset) -> list[str]:
     wandering = [name for name in names if name in data and _wanders(data[name].values)]
     if not wandering:
         return []
-    return [
-        f"{', '.join(wandering)}: the estimate wanders by more than {WANDERS:g} of what it has "
-        "learned: the gain is too large for the noise, and the estimate follows it. Take "
-        "gain='auto', or a smaller one."
-    ]
+    return [FINDINGS["gain"].filled(names=", ".join(wandering), share=percent(WANDERS))]
 
 
 def _wanders(values: np.ndarray[Any, Any]) -> bool:
@@ -424,7 +379,7 @@ def verdict(data: xr.Dataset) -> Verdict:
 
 
 def _steps(data: xr.Dataset) -> Verdict:
-    """Return what a run that has kept no verdict says of its steps."""
+    """Return the findings on the steps of a run that has stored no verdict."""
     codes = data["status"].values.astype(int)
     counts = np.bincount(codes, minlength=len(STATUS_CODES)).tolist()
     found = step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
@@ -444,7 +399,7 @@ def verdict_table(found: Verdict) -> Table:
         )
         for finding in found.findings[:MOST]
     ]
-    columns = ("severity", "finding", "of", "evidence", "measure", "likely causes")
+    columns = ("severity", "finding", "subject", "evidence", "measure", "likely causes")
     promise = PROMISES[found.level]
     if found.level == "caution" and found.errors is not None:
         promise += ": use the intervals with model errors"
@@ -452,7 +407,7 @@ def verdict_table(found: Verdict) -> Table:
 
 
 def doubts(data: xr.Dataset) -> list[str]:
-    """Return all that speaks against trusting the estimates, as sentences, each once."""
+    """Return all findings against the estimates as sentences, each once."""
     return verdict(data).every_sentence
 
 
@@ -462,5 +417,5 @@ def severities(data: xr.Dataset) -> dict[str, Severity]:
 
 
 def unexplained(data: xr.Dataset) -> bool:
-    """Return whether a run says that its model does not explain the data."""
+    """Return whether a run has found a model misfit."""
     return any(finding.what == "misfit" for finding in verdict(data).findings)

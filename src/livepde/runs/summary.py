@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ROLES",
+    "STATES",
     "TOTALS",
     "ChannelErrors",
     "Jump",
@@ -46,6 +47,14 @@ ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, t
 IGNORED = "ignored"  # role of channels that are shown and count in no total
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
+STATES = {
+    "pinned": "well determined",
+    "partly": "partly determined",
+    "flat": "not identifiable",
+    "at its bound": "at its bound",
+    "moves": "changes with time",
+}
+"""How well the data determine a number, as `determination` returns it -> words."""
 CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
 
 
@@ -300,7 +309,7 @@ def _wall(data: xr.Dataset) -> Table:
 
 
 def _first_order(data: xr.Dataset, names: Sequence[str]) -> str:
-    """Return the part of a title that says which values are medians; empty if none is."""
+    """Return the part of a title that names values which are medians; empty if none is."""
     found = [name for name in names if "comment" in data[name].attrs]
     if not found:
         return ""
@@ -371,15 +380,15 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
         if not math.isfinite(left):
             continue
         state = determination(data[label].attrs, float(data[label][-1]), left)
-        others = _traded(data, label)
+        others, words = _traded(data, label), STATES[state]
         if others and state != "pinned":
-            state += f", traded off with {', '.join(others)}"
-        rows.append((label, _share(left), state))
+            words += f", correlated with {', '.join(others)}"
+        rows.append((label, _share(left), words))
     for name in field_names(data):
         if f"{name}_modes" in data:
             told, count, left = modes_told(data, name)
-            rows.append((name, _share(left), f"{told:.1f} of {count} modes told"))
-    return Table("What the data have told", ("unknown", "prior std. dev. left", "state"), rows)
+            rows.append((name, _share(left), f"{told:.1f} of {count} modes determined"))
+    return Table("Identifiability", ("unknown", "std. dev. / prior", "state"), rows)
 
 
 def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
@@ -421,7 +430,7 @@ def _jumped(data: xr.Dataset) -> Table:
             (at, label, digits(before, std)[0], " ± ".join(digits(after, std)))
             for label, (before, after, std) in jump.moved.items()
         ] or [(at, "–", "–", "–")]
-    return Table("Jumps", ("when", "unknown", "before", "since then"), rows)
+    return Table("Jumps", ("time", "unknown", "before", "after"), rows)
 
 
 def arrivals(journal: Journal) -> list[Table]:
@@ -429,4 +438,4 @@ def arrivals(journal: Journal) -> list[Table]:
     rows = [(kind, channel or "(row)", n) for (kind, channel), n in journal.counts.items()]
     if not rows:
         return []
-    return [Table("Irregular rows and values", ("what", "channel", "number"), rows)]
+    return [Table("Irregular rows and values", ("event", "channel", "number"), rows)]

@@ -45,7 +45,7 @@ class Discarded(io.BytesIO):
 
 
 class Request(HTTPRequestParser):  # type: ignore[misc]
-    """A request whose body is not kept if its header is refused: strangers fill no disk."""
+    """A request whose body is not stored if its header is refused: unknown clients fill no disk."""
 
     def __init__(self, adj: Any, refusal: Refusal) -> None:
         super().__init__(adj)

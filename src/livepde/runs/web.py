@@ -24,8 +24,8 @@ __all__ = ["Address", "Server"]
 
 COOKIE = "livepde_token"
 SHORTEST_TOKEN = 16  # characters, where anyone may try
-NOT_HERE = "this page is for this machine only: ask for localhost"
-NO_TOKEN = "add ?token=... as it was printed where this was started"
+NOT_HERE = "this page is for this machine only: use localhost"
+NO_TOKEN = "add the ?token=... that was printed when the server started"
 HEADERS = [
     ("X-Content-Type-Options", "nosniff"),
     ("X-Frame-Options", "DENY"),
@@ -73,11 +73,11 @@ class Address:
             object.__setattr__(self, "token", secrets.token_urlsafe(24))
             object.__setattr__(self, "made", True)
         if not re.fullmatch(r"[A-Za-z0-9._~-]*", self.token):
-            raise RunError("A token has letters, digits and '-', '_', '.', '~' only.")
+            raise RunError("A token may contain letters, digits and '-', '_', '.', '~' only.")
         if self.token and not alone and len(self.token) < SHORTEST_TOKEN:
             raise RunError(
-                f"A token for visitors from elsewhere has at least {SHORTEST_TOKEN} characters; "
-                "without one a good one is made."
+                f"A token for other machines needs at least {SHORTEST_TOKEN} characters; "
+                "if it is left out, one is generated."
             )
 
     @classmethod
@@ -88,12 +88,12 @@ class Address:
         if number and not number.isdigit():
             host, number = text, ""
         if number and (len(number) > 5 or int(number) > 65535):
-            raise RunError(f"'{text}' is no address: a port is a number up to 65535.")
+            raise RunError(f"'{text}' is not an address: a port is a number up to 65535.")
         return cls(host or cls.host, int(number) if number else port, token)
 
 
 class Server:
-    """A WSGI application, served from threads of its own.
+    """A WSGI application, served from its own threads.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class Server:
 
 
 def _headed(application: WSGIApplication, address: Address) -> WSGIApplication:
-    """Return an application with our headers, and a cookie for visitors with the token."""
+    """Return an application with our headers, and a cookie for clients with the token."""
 
     def answer(environ: WSGIEnvironment, begin: StartResponse) -> Iterable[bytes]:
         if why := _why_not(environ, address):
@@ -189,7 +189,7 @@ def _host(environ: Mapping[str, Any]) -> str:
 
 
 def _known(environ: Mapping[str, Any]) -> list[str]:
-    """Return the tokens that a visitor has sent with the request."""
+    """Return the tokens that a client has sent with the request."""
     found = [str(environ.get("HTTP_AUTHORIZATION", "")).removeprefix("Bearer ").strip()]
     try:
         cookie = SimpleCookie(str(environ.get("HTTP_COOKIE", "")))

@@ -33,8 +33,8 @@ __all__ = [
 
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
-COMMA = "if that is a decimal comma, say decimal = ','."
-NO_POINT = "with decimal = ',' a point is none of decimals."
+COMMA = "if that is a decimal comma, set decimal = ','."
+NO_POINT = "with decimal = ',', a point is not a decimal mark."
 FIRST_CELLS = 5  # of a column, in one of which a format of dates has to fit
 MOST = 0.8  # share of cells that a format of dates has to fit
 ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d", "%d-%b-%Y")
@@ -128,7 +128,9 @@ class Clock:
         if dates:
             stamp = self.stamp(value)
             if stamp is None:
-                raise SampleError(f"{what}: got {value!r}; the times are dates, as 2025-04-01.")
+                raise SampleError(
+                    f"{what}: got {value!r}; the times are dates, such as 2025-04-01."
+                )
             return stamp * self.second
         if isinstance(value, str | date):
             raise SampleError(f"{what}: got {str(value)!r}; the times are numbers, not dates.")
@@ -167,7 +169,7 @@ def read_times(
 def with_second_passes(
     times: Array, cells: Sequence[Any], clock: Clock, repeats: Callable[[int, int], bool]
 ) -> Array:
-    """Return times of dates whose hours that clocks show twice are told apart.
+    """Return times of dates; hours that clocks show twice are distinguished.
 
     A date without a zone of its own that is not later than those before it belongs to the second
     pass of such an hour, unless its row repeats an earlier one.
@@ -196,7 +198,7 @@ def with_second_passes(
 
 
 def is_naive(cell: Any, clock: Clock) -> bool:
-    """Return whether a cell is a date without a zone of its own."""
+    """Return whether a cell is a date without a zone."""
     try:
         cell = _parsed(cell, clock.format)
     except ValueError:
@@ -262,12 +264,12 @@ def _stamps(cells: Sequence[str], form: str) -> Array:
 
 
 def _are_even(steps: Array) -> bool:
-    """Return whether the longest of several steps is hardly longer than their median."""
+    """Return whether the longest of several steps is barely longer than their median."""
     return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
 
 
 def _known_formats() -> Iterator[str]:
-    """Yield the formats of dates that loggers and spreadsheets write, beside ISO."""
+    """Yield the formats of dates that loggers and spreadsheets write, except ISO."""
     for mark, hour in product("/-. ", HOURS):
         for order in ORDERS if mark != "." else POINTED:
             yield order.replace("-", mark) + hour
@@ -288,7 +290,7 @@ def guessed_format(text: str) -> str:
 
 
 def _are_dates(cells: list[Any], clock: Clock, before: bool | None) -> bool:
-    """Return whether times are dates: the first tells; if it is neither, those before, or most."""
+    """Return whether times are dates: by the first; if it is neither, by those before, or most."""
 
     def number(cell: Any) -> bool:
         return number_of(cell, clock.decimal) is not None
@@ -314,9 +316,9 @@ def _remedy(cell: Any, clock: Clock, dates: bool) -> str:
         return "expected a number, as in the other rows."
     if clock.format:
         return f"expected a date as time_format has it, {clock.format!r}."
-    expected = "expected a date and time as 2025-04-01 12:00"
+    expected = "expected a date and time such as 2025-04-01 12:00"
     format = guessed_format(cell) if isinstance(cell, str) else ""
-    return expected + (f"; say time_format, perhaps {format!r}." if format else ".")
+    return expected + (f"; set time_format, perhaps {format!r}." if format else ".")
 
 
 def _day_after(value: Any) -> date | None:

@@ -138,7 +138,7 @@ def read_csv(
     except (OSError, csv.Error) as error:
         raise DataError(f"{path} cannot be read as a CSV file: {error}.") from error
     if not rows:
-        raise DataError(f"{path}: holds no rows beside its header.")
+        raise DataError(f"{path}: has no rows below its header.")
     stamps = [" ".join(parts) for parts in zip(*(cells[name] for name in clock.names), strict=True)]
     times, dates = read_times(stamps, clock, lambda k: f"{path}, row {rows[k]}, column")
 
@@ -207,7 +207,7 @@ def header_of(path: Path, separator: str, encoding: str, skip: int) -> list[str]
 def _check_text(path: Path) -> None:
     """Refuse a workbook, some of which can be taken for text, and a device, which has no end."""
     if stat.S_ISCHR(path.stat().st_mode):
-        raise DataError(f"{path} is a device, not a file: name a file.")
+        raise DataError(f"{path} is a device, not a file. Specify a file.")
     with path.open("rb") as file:
         if file.read(4).startswith(BOOKS):
             raise DataError(f"{path} is a workbook, not text: save its sheet as 'CSV UTF-8'.")
@@ -225,13 +225,13 @@ def _check_header(
     seems = how_written(path, encoding)
     if seems.skip > skip and seems.separator == separator:
         raise SampleError(
-            f"{path}: line {skip + 1} is no header, but a title: say "
+            f"{path}: line {skip + 1} is a title, not a header: set "
             f"{_as_written(path, separator, encoding, clock, '', skip)}."
         )
     if others:
         raise SampleError(
             f"{path}: the header is one field with {separator!r} between fields, and "
-            f"{header[0].count(others[0]) + 1} with {others[0]!r}: say "
+            f"{header[0].count(others[0]) + 1} with {others[0]!r}: set "
             f"{_as_written(path, others[0], encoding, clock, f'separator = {others[0]!r}', skip)}."
         )
 
@@ -420,21 +420,21 @@ def _whole(lines: Iterable[list[str]], begin: int) -> Iterator[tuple[int, list[s
             yield before
         before = item
     if before is None or before[1] != [END]:
-        raise csv.Error("a quote does not end")
+        raise csv.Error("a quote is not closed")
 
 
 def _not_text(path: Path, separator: str, encoding: str, clock: Clock, skip: int) -> DataError:
-    """Return an error about a file that is no text in this encoding."""
+    """Return an error about a file that is not text in this encoding."""
     content, row, byte = path.read_bytes(), 1, ""
     try:
         content.decode(encoding)
     except UnicodeDecodeError as error:
         row, byte = content.count(b"\n", 0, error.start) + 1, f"byte 0x{content[error.start]:02x} "
     likely = _likely(content, encoding)
-    said = _as_written(path, separator, likely, clock, f"encoding = {likely!r}", skip)
+    options = _as_written(path, separator, likely, clock, f"encoding = {likely!r}", skip)
     return DataError(
-        f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): say "
-        f"{said}; or save it as 'CSV UTF-8'."
+        f"{path} is not text in {encoding.removesuffix('-sig').upper()} ({byte}in row {row}): set "
+        f"{options}, or save it as 'CSV UTF-8'."
     )
 
 

@@ -173,8 +173,8 @@ class Reading:
         used = {time, *(column.names[0] for column in found.values())}
         if self.strict and (more := [name for name in names if name not in used]):
             raise SampleError(
-                f"{where}: column '{more[0]}' is no channel of this identifier, which has "
-                f"{list(self.channels)}: drop it, or leave out strict."
+                f"{where}: column '{more[0]}' is not a channel of this identifier, which has "
+                f"{list(self.channels)}: remove it, or leave out strict."
             )
         return found
 
@@ -194,7 +194,7 @@ class Reading:
             return ""
         what = f"{' and '.join(map(repr, called))} may be the column" if called else "no column is"
         raise SampleError(
-            f"{where}: {what} {'of times' if called else 'called time'}; name it, as in "
+            f"{where}: {what} {'of times' if called else 'called time'}; specify it, as in "
             f"time={(called or free or ['t'])[0]!r}."
         )
 
@@ -260,7 +260,7 @@ class Reading:
         return tabulated(times, values, columns, self._clock(time, unit), where="data")
 
     def _file(self, path: Path) -> DataTable:
-        """Return the samples of a file, whose ending tells its format."""
+        """Return the samples of a file; its extension gives the format."""
         where = str(path)
         if path.suffix in JSON_LINES:
             names = _first_keys(path)
@@ -278,7 +278,7 @@ class Reading:
         time = self._time(where, written.header)
         if len(written.time_formats) > 1:
             raise SampleError(
-                f"{where}: the order of day, month and year in '{time}' cannot be known: read the "
+                f"{where}: the order of day, month and year in '{time}' is ambiguous: read the "
                 "table with pandas.read_csv and a date_format, and give the table."
             )
         columns = self._columns(where, time, written.header, {}, written.decimal)
@@ -300,7 +300,7 @@ def _numbers(name: str, series: Any) -> Array:
     try:
         found: Array = series.to_numpy(dtype=float, na_value=np.nan)
     except (TypeError, ValueError):
-        raise SampleError(f"data: column '{name}' does not hold numbers only.") from None
+        raise SampleError(f"data: column '{name}' must contain numbers only.") from None
     return found
 
 

@@ -106,7 +106,7 @@ class _Content:
 
     @classmethod
     def open(cls, path: Path) -> _Content | None:
-        """Open a file, None if there is none; raises `DataError` for what is no file."""
+        """Open a file, None if there is none; raises `DataError` for what is not a file."""
         try:
             # To open a pipe without a writer would hold the program up.
             if not stat.S_ISREG(path.stat().st_mode):
@@ -220,8 +220,8 @@ class _Content:
         if not last or last in chunk:
             return []
         text = (
-            f"{self.path.name} was written again; rows that came and went after byte {offset} "
-            "between two looks cannot be known"
+            f"{self.path.name} was rewritten; rows that appeared and disappeared after byte "
+            f"{offset} between two reads are lost"
         )
         return [Line(self.number, 0, b"", "rewritten", text)]
 
@@ -379,8 +379,8 @@ class GrowingFile:
         if place is None or not place.start:
             return []
         text = (
-            f"{self.path.name} is another file than before; rows after byte {place.start} of that "
-            "one are not there any more"
+            f"{self.path.name} was replaced by another file; rows after byte {place.start} of the "
+            "earlier file are lost"
         )
         return [Line(content.number, 0, b"", "rewritten", text)]
 
@@ -474,7 +474,7 @@ class GrowingFile:
         return found
 
     def _folder(self) -> list[Path]:
-        """Return the files beside this one, the oldest first."""
+        """Return the other files in the folder of this one, the oldest first."""
         found = []
         with os.scandir(self.path.parent) as entries:
             for entry in islice(entries, SIBLINGS):

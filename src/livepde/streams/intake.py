@@ -297,22 +297,22 @@ class Intake:
     @property
     def why(self) -> str:
         """Reason to doubt the clocks of the source, in one sentence; empty if there is none."""
-        remedy = "if a clock is wrong, state its correction with intake.shift"
+        remedy = "if a clock is wrong, specify its correction with `intake.shift`"
         for name, late in self._times.went_back.items():
             return (
-                f"the times of {name} went back to t = {late:g}, and its rows are late until they "
-                f"are later than t = {self._last:g}; {remedy}"
+                f"the times of {name} went back to t = {late:g}, and its rows count as late up to "
+                f"t = {self._last:g}; {remedy}"
             )
         if unsteady := self._times.unsteady:
             return (
-                f"the clock of {', '.join(unsteady)} goes back again and again: the time between "
-                f"samples is not known then; {remedy}, and synchronise it gradually"
+                f"the clock of {', '.join(unsteady)} goes back again and again, so the time "
+                f"between samples is unknown; {remedy}, and synchronise it gradually"
             )
         # One row far ahead is counted when it is refuted; several are a matter of health.
         if self._begun and len({one.t for one in self._ahead}) > 1:
             return (
-                f"rows are far ahead of t = {self._newest:g}, from t = {self._ahead[0].t:g} on, "
-                f"and wait until those after them agree; {remedy}"
+                f"rows from t = {self._ahead[0].t:g} on are far ahead of t = {self._newest:g}, and "
+                f"wait until later rows confirm them; {remedy}"
             )
         return ""
 
@@ -510,7 +510,7 @@ class Intake:
                 found.remark("disordered", "", text)
             self._add(moment, values, held.token, found)
             if self._times.use(t, values):
-                text = f"times that went back go on at t = {t:g}: the clock was set back before it"
+                text = f"times that went back continue at t = {t:g}: the clock was set back before"
                 found.remark("shifted", "", text)
         self._newest = max(self._newest, t)
         found.row = about
@@ -530,7 +530,9 @@ class Intake:
                 text = f"t = {held.t:g} was accepted with {before:g}, and came again with {value:g}"
                 found.remark("conflict", name, text)
         if self._times.refuse(held.t, held.values):
-            text = f"times went back from t = {self._newest:g} to {held.t:g}: such rows are late"
+            text = (
+                f"times went back from t = {self._newest:g} to {held.t:g}: these rows count as late"
+            )
             found.remark("clock", "", text)
 
     def _values(self, row: Mapping[str, Any], found: IntakeOutcome) -> dict[str, float]:
@@ -576,7 +578,7 @@ class Intake:
         return t - (self.origin or 0.0) * self.clock.second, again
 
     def _moment(self, t: float) -> float | None:
-        """Return the moment that a time belongs to, None if its sample was released."""
+        """Return the moment of a time, None if its sample was released."""
         near = [s for s in self._open if abs(s - t) <= self.policy.tolerance]
         if near:
             return min(near, key=lambda s: abs(s - t))
@@ -620,11 +622,13 @@ class Intake:
         lacking = [c for c in self.columns if self._lacks(c, sample.values)]
         for channel in lacking:
             text = f"no value for t = {t:g}"
-            text += "; that of the sensor is taken" if self.columns[channel].noise_of else ""
+            text += "; the noise of the sensor is used" if self.columns[channel].noise_of else ""
             found.remark("missing", channel, text, sample.tokens[-1])
         needed = [channel for channel in lacking if self.columns[channel].needed]
         if needed:
-            found.remark("skipped", needed[0], f"t = {t:g} is left out", sample.tokens[-1])
+            found.remark(
+                "skipped", needed[0], f"the sample at t = {t:g} was skipped", sample.tokens[-1]
+            )
             sample.values = self._held(sample.values)
             self._hold_first(sample.values)
             if not (self._recent and sample.values):
@@ -661,7 +665,7 @@ class Intake:
             }
 
     def _lacks(self, channel: str, values: Mapping[str, float]) -> bool:
-        """Return whether a sample has no value of a channel; noise belongs to a reading."""
+        """Return whether a sample has no value of a channel; noise requires a reading."""
         if self.policy.habit(channel).between == "hold" and self._recent:  # it holds until the next
             return False
         of = self.columns[channel].noise_of
@@ -683,10 +687,10 @@ class Intake:
         if not kinds:
             return
         if "spike" in kinds:
-            text = f"t = {t:g}: {given:g} is far off the values before and after"
+            text = f"t = {t:g}: {given:g} is far from the values before and after"
             found.remark("spike", channel, text, sample.tokens[-1])
         if "interpolated" in kinds and habit.interpolated:
-            text = f"t = {t:g}: between the values before and after"
+            text = f"t = {t:g}: interpolated between the values before and after"
             found.remark("interpolated", channel, text, sample.tokens[-1])
         else:  # a spike of a channel that is not interpolated leaves a gap
             value = NAN
@@ -728,4 +732,6 @@ def _microseconds(stamp: float) -> float:
     try:
         return since_1970(origin_at(stamp))
     except (ValueError, OverflowError, OSError):
-        raise SampleError("the first time is no date in UTC; its year must be 1 to 9999") from None
+        raise SampleError(
+            "the first time is not a date in UTC; its year must be 1 to 9999"
+        ) from None

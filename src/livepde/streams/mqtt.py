@@ -98,7 +98,7 @@ class Broker:
         return client
 
     def connect(self, client: Client) -> None:
-        """Connect, and go on reconnecting in a thread of its own when the broker goes away."""
+        """Connect; if the connection is lost, reconnect in a separate thread."""
         from paho.mqtt.packettypes import PacketTypes
         from paho.mqtt.properties import Properties
 
@@ -130,7 +130,7 @@ class _Peer:
         """Connect; raise if the broker does not want us."""
         self._broker.connect(self._client)
         if not self._started.wait(PATIENCE):
-            self._refusal = self._refusal or "it does not answer"
+            self._refusal = self._refusal or "no answer"
         if self._refusal:
             self._leave()
             raise DataError(f"MQTT: the broker at {self._broker.address}: {self._refusal}.")
@@ -196,8 +196,8 @@ def _check_filter(topic: str) -> None:
     alone = all(sign in ("+", "#") for sign in signs)
     if not topic or "\0" in topic or not alone or "#" in levels[:-1]:
         raise DataError(
-            f"MQTT: got the topic '{topic}'; '+' stands for one whole level, as in plant/+/level, "
-            "'#' for all that follow, at the end."
+            f"MQTT: got the topic '{topic}'; '+' replaces one whole level, as in plant/+/level, "
+            "and '#' at the end all that follow."
         )
 
 
@@ -210,8 +210,8 @@ def _check_overlap(one: str, other: str) -> None:
         if level != against and (None in (level, against) or "+" not in (level, against)):
             return
     raise DataError(
-        f"MQTT: the topics '{one}' and '{other}' bring some messages twice: let each message "
-        "belong to one."
+        f"MQTT: the topics '{one}' and '{other}' receive some messages twice: let each message "
+        "match one topic."
     )
 
 
@@ -335,7 +335,7 @@ class MqttSource(_Peer, RowSource):
             return Row({}, token=token, broken=f"not a number ({type(error).__name__})")
         values = found if isinstance(found, dict) else {"value": found}
         if self._time not in values and old:
-            return Row({}, token=token, broken="kept by the broker without a time")
+            return Row({}, token=token, broken="retained by the broker without a time")
         moment = values.get(self._time, datetime.now(UTC).isoformat())
         return Row({self._time: moment, column: values.get("value")}, token=token)
 
@@ -347,7 +347,7 @@ class MqttSource(_Peer, RowSource):
 
     @property
     def done(self) -> bool:
-        """A broker never says that nothing more will come."""
+        """A broker never reports the end of its messages."""
         return False
 
     def poll(self, wait: float) -> Sequence[Row]:
@@ -367,8 +367,8 @@ class MqttSource(_Peer, RowSource):
     def _check(self) -> None:
         if self._taken_over:
             raise DataError(
-                f"MQTT: another client has taken the session '{self._broker.client_id}': give each "
-                "run a client_id of its own."
+                f"MQTT: another client uses the session '{self._broker.client_id}': give each "
+                "run its own `client_id`."
             )
         with self._lock:
             # The broker sends no more than `ahead` messages before one is acknowledged.
@@ -378,8 +378,8 @@ class MqttSource(_Peer, RowSource):
             if count >= self._broker.ahead and quiet:
                 raise DataError(
                     f"MQTT: {count} messages wait for later ones, and no more are sent "
-                    "before the first is acknowledged: make the intake's wait shorter, or send "
-                    "rows with several channels."
+                    "before the first is acknowledged: reduce `intake.wait`, or send rows with "
+                    "several channels."
                 )
 
     def acknowledge(self, tokens: Iterable[Any]) -> None:
@@ -399,7 +399,7 @@ class MqttSource(_Peer, RowSource):
 
 
 class MqttSink(_Peer):
-    """Publishes estimates: one JSON object for each sample, and each number to a topic of its own.
+    """Publishes estimates: one JSON object for each sample, and each number to its own topic.
 
     Never waits for the broker: while it is away the newest estimates are kept and the others
     counted.
@@ -449,7 +449,9 @@ class MqttSink(_Peer):
             if len(self._waiting) == self._waiting.maxlen:
                 self.dropped += 1
                 if self.dropped == 1:
-                    log.warning("the broker is away for too long: old estimates are not sent")
+                    log.warning(
+                        "the broker was unreachable for too long: old estimates are not sent"
+                    )
             self._waiting.append(estimate)
             self._changed.notify()
 
@@ -486,7 +488,7 @@ class MqttSink(_Peer):
         self, client: Client, userdata: Any, mid: int, reason: Any, properties: Any
     ) -> None:
         if reason.is_failure:
-            log.warning("the broker at %s takes no estimate: %s", self._broker.address, reason)
+            log.warning("the broker at %s accepts no estimate: %s", self._broker.address, reason)
         self._free.release()
 
     def close(self) -> None:
@@ -499,7 +501,7 @@ class MqttSink(_Peer):
         # A message gives its place back when the broker has confirmed it.
         for _ in range(UNCONFIRMED):
             if not self._free.acquire(timeout=max(until - time.monotonic(), 0.0)):
-                log.warning("the broker at %s did not take all estimates", self._broker.address)
+                log.warning("the broker at %s did not accept all estimates", self._broker.address)
                 break
         self._given_up.set()
         self._leave()

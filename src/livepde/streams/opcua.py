@@ -72,7 +72,7 @@ class OpcuaSource(RowSource):
         with optional("opcua", "OPC UA needs asyncua", DataError):
             import asyncua  # noqa: F401
         if "@" in url:
-            raise DataError("OPC UA: a url with a password is written down: use username instead.")
+            raise DataError("OPC UA: the url contains a password: use `username` instead.")
         if not interval > 0.0:
             raise DataError(f"OPC UA: interval must be a time > 0; got {interval}.")
         self.dropped = self.undated = 0
@@ -93,7 +93,7 @@ class OpcuaSource(RowSource):
             self._started.result(3 * PATIENCE)
         except (DataError, OutOfTime) as error:
             self.close()
-            raise DataError(f"OPC UA: {url}: {str(error) or 'it does not answer'}.") from error
+            raise DataError(f"OPC UA: {url}: {str(error) or 'no answer'}.") from error
 
     # --- the thread of the connection ------------------------------------------------------------
 
@@ -114,7 +114,7 @@ class OpcuaSource(RowSource):
             if not self._started.done():
                 self._started.set_exception(DataError(reason))
                 return
-            log.warning("the server at %s is lost: %s", self._url, reason)
+            log.warning("connection to the server at %s lost: %s", self._url, reason)
             if await self._stopped(self._wait):
                 return
             self._wait = min(2.0 * self._wait, LONGEST_WAIT)
@@ -140,14 +140,14 @@ class OpcuaSource(RowSource):
                 if not isinstance(answer, int):
                     raise DataError(f"node '{name}': {answer.name}")
             if self._started.done():
-                log.info("the server at %s is back", self._url)
+                log.info("reconnected to the server at %s", self._url)
             else:
                 self._started.set_result(None)
             self._wait = LOOK
             while not await self._stopped(LOOK):
                 await client.check_connection()
                 if changes.ended:
-                    raise DataError(f"it has ended the subscription ({changes.ended})")
+                    raise DataError(f"the server ended the subscription ({changes.ended})")
 
     async def _stopped(self, wait: float) -> bool:
         """Wait, and return whether to stop."""
@@ -204,7 +204,7 @@ class OpcuaSource(RowSource):
         broken = not self._thread.is_alive()  # asked first: its last rows come before the error
         rows = drained(self._rows, wait)
         if broken and not rows:
-            raise DataError(f"OPC UA: {self._url}: the connection has broken down, see the log.")
+            raise DataError(f"OPC UA: {self._url}: the connection failed, see the log.")
         return rows
 
     def close(self) -> None:

@@ -20,7 +20,7 @@ FEWEST = 20  # rows before a leap, and differences over its length
 
 @dataclass(frozen=True)
 class ClockLeap:
-    """A step of time after which the readings continue as if hardly any time had passed.
+    """A step of time after which the readings continue as if almost no time had passed.
 
     Attributes
     ----------

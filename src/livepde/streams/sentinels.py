@@ -1,4 +1,4 @@
-"""Values that stand for no reading: -127 of a sensor that is unplugged, 85 at power-on, -9999."""
+"""Placeholders for missing readings: -127 of an unplugged sensor, 85 at power-on, -9999."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ MOST = 4  # sentinels of a column
 
 
 class Sentinel(NamedTuple):
-    """A value that may stand for no reading: how often it occurs, and the range of the rest."""
+    """A possible placeholder for missing readings: its frequency, and the range of the rest."""
 
     value: float
     times: int
@@ -41,7 +41,7 @@ class Sentinel(NamedTuple):
 
 
 def sentinels(values: Array) -> list[Sentinel]:
-    """Return the values of a column that may stand for no reading.
+    """Return the values of a column that may be placeholders.
 
     >>> [found.value for found in sentinels(np.array([20.0, 21, 22, 21, 20, 22, 21, 23, -127]))]
     [-127.0]

@@ -308,7 +308,7 @@ class Follow(RowSource):
         self._headers[token] = self._header
         twice = sorted(set(cells) - set(self._header))
         if twice:
-            text = "two columns are called '{}', and none of them is taken: rename one"
+            text = "two columns are called '{}', and neither is used: rename one"
             return Row({}, token=token, broken=text.format(twice[0]))
         if before is None or before == self._header:
             return None
@@ -322,7 +322,7 @@ class Follow(RowSource):
 
 
 class Lines(RowSource):
-    """JSON lines from standard input, or whatever gives lines; read in a thread of its own."""
+    """JSON lines from standard input, or another iterable of lines; read in its own thread."""
 
     def __init__(self, lines: Iterable[str]) -> None:
         self._queue: queue.Queue[str | bytes | None] = queue.Queue(BATCH)

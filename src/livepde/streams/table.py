@@ -161,7 +161,7 @@ def read_json_lines(
     places = [f"{path}, line {k}" for k in numbered]
     rows = list(map(_object, numbered.values(), places))
     if not rows:
-        raise SampleError(f"{path}: holds no samples.")
+        raise SampleError(f"{path}: contains no samples.")
     for row, place in zip(rows, places, strict=True):
         check_columns(place, [clock.name], list(row))
     decimals = decimal_marks(columns)
@@ -208,7 +208,7 @@ def tabulated(
     """
     moments = times.tolist() if hasattr(times, "tolist") else list(times)
     if not moments:
-        raise SampleError(f"{where}: holds no samples.")
+        raise SampleError(f"{where}: contains no samples.")
     check_columns(where, decimal_marks(columns), list(values))
     found, dates = read_times(moments, clock, lambda k: f"{where}, sample {k}, times")
 
@@ -216,7 +216,7 @@ def tabulated(
         try:
             column: Array = np.asarray(values[name], dtype=float)
         except (TypeError, ValueError):
-            raise SampleError(f"{where}: column '{name}' does not hold numbers only.") from None
+            raise SampleError(f"{where}: column '{name}' must contain numbers only.") from None
         if column.shape != (len(moments),):
             raise SampleError(
                 f"{where}: column '{name}' has shape {column.shape}; there are {len(moments)} "
@@ -548,14 +548,16 @@ def _disorder(where: str, repeated: bool, set_back: bool) -> TimeOrderError:
     if repeated:
         how, remedy = "that of the one before", "drop repeated rows."
     if set_back:
-        remedy = "if clocks were set back, write dates with an offset, as 2025-10-26 02:30+01:00."
+        remedy = (
+            "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30+01:00."
+        )
     return TimeOrderError(f"{where}: the time is {how}; {remedy}")
 
 
 def check_columns(
     where: str, needed: Iterable[str], known: list[str], *, told: bool = True
 ) -> None:
-    """Raise `SampleError` if a column is not there; with `told` the error names those there are."""
+    """Raise `SampleError` if a column is missing; with `told` the error names the existing ones."""
     for name in needed:
         if name not in known:
             ending = hint(name, known) if told else "."

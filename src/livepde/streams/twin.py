@@ -193,7 +193,7 @@ class Twin:
     def _check_initial_state(self) -> None:
         begun = self.model.form_initial is not None
         if begun and self.u0 is not None:
-            raise ConfigurationError("the model has an initial state of its own: leave out u0.")
+            raise ConfigurationError("the model has its own initial state: leave out u0.")
         if self.u_true is None and self.u0 is None and not begun:
             raise ConfigurationError("give u_true(x, t), or the initial state u0.")
 

@@ -36,7 +36,17 @@ from livepde.verdict.findings import (
     too_few,
 )
 from livepde.verdict.ledger import Ledger
-from livepde.verdict.missing_terms import GAIN, LOSS, REACH
+from livepde.verdict.missing_terms import FIXED, GAIN, LOSS, REACH
+from livepde.verdict.sentences import (
+    ESTIMATED,
+    FINDINGS,
+    LIKELY,
+    Sentence,
+    amount_of,
+    estimating,
+    percent,
+    significance,
+)
 
 __all__ = ["Position", "assess"]
 
@@ -138,14 +148,14 @@ def _unseen(dictionary: Dictionary, at: Position) -> list[str]:
             shift = float(hidden[d] * abs(moved[0, d]))
             if shift > BEYOND:
                 found.append((shift, d, name))
-    said = []
+    undetected = []
     for shift, d, name in sorted(found, reverse=True)[:UNSEEN]:
         text, remedy = _words(dictionary.directions[d], float(hidden[d]), at)
-        said.append(
-            f"If {text}, that is not seen, and moves {name} by {shift:.1f} standard "
-            f"deviations. {remedy}"
+        undetected.append(
+            f"Undetectable: {text}, which would shift {name} by {shift:.1f} standard deviations. "
+            f"{remedy}"
         )
-    return said
+    return undetected
 
 
 def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
@@ -163,16 +173,13 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     # Slow noise alone would look so: no cause may be named, but the intervals have to be wider.
     if evidence.whitened < limit:
         worst = float(evidence.correlation.max(initial=0.0))
-        text = (
-            f"Successive errors follow each other (correlation up to {worst:.2f}), by which what "
-            "looks like a cause may be chance: the intervals are widened for it."
-        )
+        text, _ = FINDINGS["following, causes"].filled(correlation=worst)
         e = math.exp(min(evidence.total, 700.0))
         yield Finding("following", "caution", text, evidence=e, measure="e-value")
         return
     order = [(w, d) for w, d in order if _possible(dictionary.directions[d], w, d, evidence, at)]
     if not order:
-        text = "The model does not explain the data, and no single cause that is possible does."
+        text, _ = FINDINGS["misfit, no cause"].filled(p=significance(evidence.whitened))
         e_value = math.exp(min(evidence.whitened, 700.0))
         yield Finding("misfit", "do not trust", text, evidence=e_value, measure="e-value")
         return
@@ -182,23 +189,17 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
     # A misfit whose cause is understood and moves no unknown leaves the estimate usable.
     grave = max((abs(size) for size in shift.values()), default=math.inf) >= MOVES
     understood = evidence.share[w, d] >= EXPLAINED
-    chance_of = f"(one such run in {_many(evidence.whitened)} would look so by chance)"
+    p = significance(evidence.whitened)
     e_value = math.exp(min(evidence.whitened, 700.0))
     # The state forgets where it began, so that later readings determine the unknowns without it.
     # What they show has another cause, and is no matter of the start.
     later = evidence.log_e[at.ledger.age < at.ledger.age[0]]
     forgotten = recent or (understood and unsuspicious(later))
     if causes[0].kind == "initial" and not grave and forgotten:
-        text = (
-            f"The readings do not fit the initial state {chance_of}, which moves no unknown by a "
-            "standard deviation."
-        )
+        text, _ = FINDINGS["start"].filled(p=p)
         yield Finding("start", "note", text, "", e_value, "e-value", causes, shift=shift)
         return
-    text = (
-        "The model does not explain the data: what is left of the readings is not noise "
-        f"{chance_of}."
-    )
+    text, _ = FINDINGS["misfit"].filled(p=p)
     yield Finding(
         "misfit",
         "do not trust" if grave or not understood else "caution",
@@ -236,19 +237,12 @@ def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int,
 
 def _past(at: Position) -> Finding:
     count = int(at.ledger.age[-1])
-    text = (
-        f"The data did not fit the model earlier; in the last {count} samples nothing speaks "
-        "against it, and what was wrong moves no unknown by a standard deviation any more."
-    )
+    text, _ = FINDINGS["past"].filled(count=count)
     return Finding("past", "note", text, evidence=float(count))
 
 
-def _many(log_e: float) -> str:
-    return f"{math.exp(log_e):.0f}" if log_e < math.log(1e6) else "more than a million"
-
-
 def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
-    """Return window and number of the directions that tell something, the best first, each once.
+    """Return window and number of the directions with evidence, the best first, each once.
 
     Windows of different length are compared by the share of the whole run's evidence.
     """
@@ -340,73 +334,53 @@ def _jump(label: str) -> str:
     return f"law.jumps={json.dumps([label.partition('[')[0]])}"
 
 
-def _words(direction: ScoreDirection, size: float, at: Position) -> tuple[str, str]:
+def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
     """Return a cause of a size, and its remedy, in words."""
     name, amount = direction.subject, _amount(direction, size, at)
-    unit = f" {direction.unit}" if direction.unit else ""
-    interval = float(at.ledger.times[1])
-    time = f" {at.time_unit}" if at.time_unit else ""
-    typical, of = float(np.median(at.noise)), f" {at.unit}" if at.unit else ""
-    side = "above" if size > 0 else "below"
-    low = "high" if size < 0 else "low"
-    words = {
-        "offset": (
-            f"sensor {name} reads {abs(amount):.2g}{unit} too {'much' if size > 0 else 'little'}",
-            f"Free it: channels.{name}.offset.",
-        ),
-        "drift": (
-            f"sensor {name} drifts, by {amount / DRIFT:+.2g}{unit} a sample",
-            f'Calibrate {name}, or leave it out: `role = "ignored"`.',
-        ),
-        "gain": (
-            f"the scale of sensor {name} is {abs(100 * amount):.2g} % too "
-            f"{'large' if size > 0 else 'small'}",
-            f"Free it: channels.{name}.gain; and check its unit.",
-        ),
-        "lag": (
-            f"sensor {name} is {abs(size) * LAG * interval:.2g}{time} "
-            f"{'late' if size > 0 else 'early'}",
-            f"Check the clock, the averaging and the response time of {name}.",
-        ),
-        "position": (
-            f"sensor {name} sits {abs(amount):.2g}{unit} away from where it is said to be, towards "
-            f"{'larger' if size > 0 else 'smaller'} {'xyz'[direction.axis]}",
-            f"Free it: channels.{name}.at_std.",
-        ),
-        "jump": (
-            f"{name} has changed during the run",
-            "Let it: law.jumps = true, or an evolution of the unknown.",
-        ),
-        "boundary": (
-            f"boundary value {name} is {low} by {abs(size) * OFFSET * typical:.2g}{of}",
-            f"Check {name}: its unit, its place, its offset, and gaps in it.",
-        ),
-        "source": (
-            f"a {'source' if size > 0 else 'sink'} is missing in the model",
-            "Add a source to the process, or free one.",
-        ),
-        "loss": (
-            "a loss to the surroundings is missing in the model",
-            "Add a loss term, or free it.",
-        ),
-        "flux": (
-            f"a flux {'into' if size > 0 else 'out of'} the process at boundary {name} is missing",
-            f"Check the boundary condition at {name}.",
-        ),
-        "channel": (
-            f"channel {name} is {abs(10 * size):.2g} % {'larger' if size > 0 else 'smaller'} than "
-            "the data say",
-            f"Check the scale and unit of {name}.",
-        ),
-        "initial": (
-            f"the initial state lies {side} the one that is stated",
-            "State a larger `initial.std`, or leave out the first samples."
-            if at.start_uncertain
-            else "State how uncertain the initial state is: "
-            'initial = { from = "readings", std = ... }, or from = a number.',
-        ),
-    }
-    return words[direction.kind]
+    kind, more = direction.kind, size > 0.0
+    level = "high" if more else "low"
+    values: dict[str, str] = {"name": name}
+    match kind:
+        case "offset":
+            values |= {"amount": amount_of(abs(amount), direction.unit), "side": level}
+        case "drift":
+            rate = amount_of(abs(amount) / DRIFT, direction.unit)
+            values["rate"] = f"{'+' if more else '-'}{rate}"
+        case "gain" | "channel":
+            share = f"{100.0 * abs(amount):.2g} %"
+            values |= {"share": share, "side": "large" if more else "small"}
+        case "lag":
+            time = f"{abs(amount):.2g} {at.time_unit}".rstrip()
+            values |= {"amount": time, "side": "late" if more else "early"}
+        case "position":
+            values |= {"amount": amount_of(abs(amount), direction.unit)}
+            values["where"] = _displaced(direction, amount)
+        case "boundary":
+            kind = "boundary, constant" if name == FIXED else kind
+            side = "high" if amount > 0.0 else "low"
+            values |= {"amount": amount_of(abs(amount), at.unit), "side": side}
+        case "source":
+            values["side"] = "source" if more else "sink"
+        case "flux":
+            values["side"] = "into" if more else "out of"
+        case "initial":
+            kind = "initial, uncertain" if at.start_uncertain else kind
+            values["side"] = "higher" if more else "lower"
+    found = LIKELY[kind].filled(**values)
+    if kind not in ESTIMATED:
+        return found
+    width, unit = f"{2.0 * abs(amount):.2g}", direction.unit.replace("degC", "K")
+    value = f'"{width} {unit}"' if unit else width
+    return found._replace(remedy=estimating(kind, name, value))
+
+
+def _displaced(direction: ScoreDirection, amount: float) -> str:
+    """Return on which side of its stated place a sensor may be, in words."""
+    axis, end = "xyz"[direction.axis], direction.at + amount
+    if direction.at * end >= 0.0:
+        side = "closer to" if abs(end) < abs(direction.at) else "farther from"
+        return f"{side} {axis} = 0 than configured"
+    return f"displaced towards {'larger' if amount > 0.0 else 'smaller'} {axis}"
 
 
 def _following(at: Position, window: int) -> Iterator[Finding]:
@@ -417,18 +391,11 @@ def _following(at: Position, window: int) -> Iterator[Finding]:
     name = at.sensors[found.sensor]
     size = float(mean_squares(at.ledger)[window, found.sensor])
     if at.moving and size < 1.0:
-        text = (
-            f"Successive errors of sensor {name} follow each other (correlation "
-            f"{found.correlation:.2f}) and are smaller than expected: with a noise that is stated "
-            "too large unknowns that move are followed late. The intervals are wide enough for it."
-        )
+        sentence = FINDINGS["following, large noise"]
+        text, _ = sentence.filled(name=name, correlation=found.correlation)
         yield Finding("following", "note", text, name, found.p_value, "p-value")
         return
-    text = (
-        f"Successive errors of sensor {name} follow each other (correlation "
-        f"{found.correlation:.2f}): something slow is not in the model, or the noise is not white. "
-        "The intervals are widened for it."
-    )
+    text, _ = FINDINGS["following"].filled(name=name, correlation=found.correlation)
     yield Finding("following", "caution", text, name, found.p_value, "p-value")
 
 
@@ -441,17 +408,16 @@ def _records(at: Position, evidence: CauseEvidence) -> Iterator[Finding]:
     change = constancy(at.ledger, wider)
     if change is not None and change.p_value < RECORD:
         name = at.unknowns[int(np.argmax(np.abs(change.change)))]
-        text = f"{name} has changed after {change.after:.0%} of the samples."
-        remedy = "Let it: law.jumps = true, or an evolution of the unknown."
-        said = f"{name} has changed during the run"
-        cause = Cause("jump", name, said, remedy=remedy, setting=_jump(name))
+        text, _ = FINDINGS["constancy"].filled(name=name, after=percent(change.after))
+        likely, remedy = LIKELY["jump"].filled(name=name)
+        cause = Cause("jump", name, likely, remedy=remedy, setting=_jump(name))
         p = change.p_value
         yield Finding("constancy", severity, text, name, p, "p-value", (cause,))
     found = disagreement(at.ledger, wider)
     if found is not None and found[0] < RECORD:
         name = at.sensors[int(np.argmax(found[1]))]
-        text = f"The sensors disagree on the unknowns, {name} the most."
-        cause = Cause("position", name, f"sensor {name} is not where, or what, the case says")
+        text, _ = FINDINGS["disagreement"].filled(name=name)
+        cause = Cause("position", name, LIKELY["disagreement"].filled(name=name).text)
         yield Finding("disagreement", severity, text, name, found[0], "p-value", (cause,))
 
 
@@ -460,7 +426,9 @@ def _noise(at: Position) -> Iterator[Finding]:
     ratio = np.sqrt(levels(at.ledger)[0])
     typical = float(np.median(ratio))
     if typical > LARGER or typical < SMALLER:
-        text = f"The readings scatter by {typical:.2g} times the stated noise."
+        small = FINDINGS["noise, small"].filled(share=f"{100.0 * typical:.2g} %")
+        large = FINDINGS["noise, large"].filled(ratio=typical)
+        text, _ = small if typical < SMALLER else large
         yield Finding("noise", "note", text, evidence=typical)
 
 
@@ -473,29 +441,23 @@ def _stuck(at: Position) -> Iterator[Finding]:
         name, count = at.sensors[int(i)], int(ledger.stuck[i]) + 1
         if name in at.aside:  # its readings are not used
             continue
-        text = f"Sensor {name} has shown the same value {count} times in a row and does not follow."
-        remedy = f'Check {name}. If it is faulty, set `role = "ignored"`.'
+        text, _ = FINDINGS["stuck"].filled(name=name, count=count)
         setting = channel_setting(name, "role", '"ignored"')
-        said = f"sensor {name} stands still"
-        cause = Cause("stuck", name, said, remedy=remedy, setting=setting)
+        likely, remedy = LIKELY["stuck"].filled(name=name)
+        cause = Cause("stuck", name, likely, remedy=remedy, setting=setting)
         yield Finding("stuck", "do not trust", text, name, float(count), "number", (cause,))
 
 
 def _aside(at: Position) -> Iterator[Finding]:
     """Return which sensors are not used, because their readings contradict all else."""
-    time = f" {at.time_unit}" if at.time_unit else ""
     for name, (since, off) in at.aside.items():
-        unit = f" {at.unit.replace('degC', 'K')}" if at.unit else ""
-        text = (
-            f"{name} is set aside since t = {since:g}{time}: its readings disagree with the model "
-            f"and with the other sensors or its own past, at last by {off:+.3g}{unit}."
+        text, remedy = FINDINGS["aside"].filled(
+            name=name,
+            since=f"{since:g} {at.time_unit}".rstrip(),
+            off=f"{off:+.3g} {at.unit.replace('degC', 'K')}".rstrip(),
         )
         setting = channel_setting(name, "role", '"ignored"')
-        cause = Cause("sensor", name, f"sensor {name} is broken or displaced", setting=setting)
-        remedy = (
-            f"Check {name}. If it shows a value that is no reading, add it to `missing`. If it is "
-            'faulty, set `role = "ignored"`.'
-        )
+        cause = Cause("sensor", name, LIKELY["aside"].filled(name=name).text, setting=setting)
         yield Finding("aside", "caution", text, name, abs(off), "number", (cause,), remedy)
 
 
@@ -503,11 +465,7 @@ def _disturbed(at: Position) -> Iterator[Finding]:
     """Return whether most readings contradict the model, or did so until a short while ago."""
     if not at.strain:
         return
-    text = (
-        "Most readings contradict the model, or did so in the last samples: the process or an "
-        "input has changed. They correct the state; the unknowns are kept as they were before."
-    )
-    remedy = "Allow jumps with `law.jumps = true`, or model the change with `evolution`."
+    text, remedy = FINDINGS["changed"]
     # A few readings correct a state that is wrong after a pause: unknowns may stay well.
     severity: Severity = "do not trust" if at.apart or at.strain > BRIEF else "caution"
     yield Finding("changed", severity, text, evidence=float(at.strain), remedy=remedy)
@@ -521,11 +479,9 @@ def _refused(at: Position) -> Iterator[Finding]:
         return
     worst = int(np.argmax(refused / np.maximum(shown, 1)))
     name = at.sensors[worst]
-    text = (
-        f"{share:.1%} of the readings were not used ({refused.sum()}, most of them of {name}): "
-        "they lie more than law.gate standard deviations from what was expected."
+    text, remedy = FINDINGS["refused"].filled(
+        share=percent(share, 1), count=refused.sum(), name=name
     )
-    remedy = f"Look at {name}, state a larger noise, or open the gate."
     yield Finding("refused", "caution", text, name, float(share), remedy=remedy)
 
 
@@ -533,9 +489,5 @@ def _prior(at: Position) -> Iterator[Finding]:
     squared, freedom = at.distance
     p = chance(squared, freedom) if freedom else 1.0
     if p < PRIOR:
-        text = (
-            f"The unknowns lie {math.sqrt(squared):.1f} prior standard deviations from their prior "
-            "mean, farther than it allows: the prior is too narrow, or a unit, a sensor or the "
-            "model is wrong."
-        )
+        text, _ = FINDINGS["prior"].filled(distance=math.sqrt(squared))
         yield Finding("prior", "caution", text, evidence=p, measure="p-value")

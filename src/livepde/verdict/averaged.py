@@ -220,7 +220,7 @@ def _alone(model: LinearModel, axes: _Axes, size: float) -> _Tried:
 
 
 def _beside(model: LinearModel, axes: _Axes, causes: Causes, asked: float) -> _Tried:
-    """Return a family of a size with each of the causes beside it."""
+    """Return a family of a size together with each of the causes."""
     S, s, _ = model.left
     usual = np.sqrt(np.diag(model.squares)[causes.columns] / len(model.z))
     some = np.flatnonzero(usual > 0.0)

@@ -1,4 +1,4 @@
-"""Running sums over channels beside the filter: inputs in gaps, and sensors that are withheld."""
+"""Running sums over channels outside the filter: inputs in gaps, and validation sensors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from livepde.linalg import Array, IntArray
 from livepde.verdict.evidence import chance
 from livepde.verdict.findings import FEWEST, Cause, Finding, Severity, channel_setting
 from livepde.verdict.model_errors import FAILED, OF_SIGNAL
+from livepde.verdict.sentences import FINDINGS, LIKELY, table_of
 from livepde.verdict.shifts import Shifts
 
 __all__ = ["InputLedger", "WithheldLedger"]
@@ -88,27 +89,15 @@ class InputLedger:
         samples = max(int(self.counts[0]), 1)
         each = shifts.by("input").items()
         by = ", ".join(f"{label} by {-shift:+.2g}" for label, shift in each)
-        moved = (
-            f" Straight lines across the gaps would move the estimates roughly so: {by}."
-            if by
-            else " By how much that moves the estimates is not known."
-        )
         for name in itertools.compress(names, self.unstated.tolist()):
-            text = (
-                f"Channel {name} had no value at the initial time: its first one was held over the "
-                "first interval."
-            )
-            remedy = f"Send a sample with {name} at the initial time."
+            text, remedy = FINDINGS["input, start"].filled(name=name)
             yield Finding("input", "note", text, name, remedy=remedy)
         for name, count in zip(names, self.counts[1:].tolist(), strict=True):
             share = count / samples
             if share <= HELD:
                 continue
-            text = (
-                f"Channel {name} had no value in {count} of {samples} samples, and its last one "
-                f"was held.{moved}"
-            )
-            remedy = f"Interpolate {name} where the next value is known, or read it more often."
+            sentence = FINDINGS["input, gaps" if by else "input, gaps, unknown shift"]
+            text, remedy = sentence.filled(name=name, count=count, samples=samples, shifts=by)
             yield Finding("input", "caution", text, name, share, remedy=remedy)
 
 
@@ -187,18 +176,12 @@ class WithheldLedger:
             if p > CHANCE:
                 continue
             size, mean = math.sqrt(squares / count), errors / count
-            text = (
-                f"Withheld sensor {name} is missed by {size:.2g} (mean {mean:+.2g}), "
-                f"{math.sqrt(ratio):.1f} times what prediction and noise allow."
+            text, _ = FINDINGS["withheld"].filled(
+                name=name, size=size, mean=mean, ratio=math.sqrt(ratio)
             )
-            cause = self._unit(k, name) or Cause(
-                "withheld",
-                name,
-                f"the model does not hold at {name}, or its place or calibration is wrong",
-                remedy=f'Check {name}. If it is faulty, set `role = "ignored"`; if it is sound, '
-                "the model misses the process there.",
-            )
-            # Missed a little it says that the model is not exact, missed grossly that it is wrong.
+            likely, remedy = LIKELY["withheld"].filled(name=name)
+            cause = self._unit(k, name) or Cause("withheld", name, likely, remedy=remedy)
+            # A small error shows that the model is not exact, a gross one that it is wrong.
             gross = size > FAILED * math.sqrt(noise) and size > OF_SIGNAL * self._scatter(k)
             severity: Severity = "do not trust" if gross or cause.kind == "unit" else "caution"
             yield Finding("withheld", severity, text, name, p, "p-value", (cause,))
@@ -210,7 +193,7 @@ class WithheldLedger:
         return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
 
     def _unit(self, k: int, name: str) -> Cause | None:
-        """Return the cause that a sensor has another unit, if its values say so."""
+        """Return the cause that a sensor has another unit, if its values indicate that."""
         count, _, _, _, errors, p, pp, pz, _ = self.sums[:, k]
         mean_p, mean_z = p / count, (errors + p) / count
         spread = pp / count - mean_p**2
@@ -221,8 +204,9 @@ class WithheldLedger:
         for unit, taken, scale, origin in UNITS:
             off = abs(mean_z - (scale * mean_p + origin))
             if abs(slope / scale - 1.0) < 4.0 * SIMILAR and off < rest:
-                text = f"{name} is in {unit} and taken for {taken}"
-                remedy = f'Say so: channels.{name}.unit = "{unit}".'
+                text, remedy = LIKELY["unit"].filled(
+                    name=name, unit=unit, expected=taken, table=table_of(name)
+                )
                 setting = channel_setting(name, "unit", f'"{unit}"')
                 return Cause("unit", name, text, remedy=remedy, setting=setting)
         return None

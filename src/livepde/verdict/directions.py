@@ -44,6 +44,8 @@ class ScoreDirection:
         Coordinate of a position.
     least, most
         Bounds of the amount in its unit: a sensor is inside the body, and not beyond the next one.
+    at
+        Coordinate of the sensor along the axis; NaN if it is not a position.
     """
 
     kind: str
@@ -53,6 +55,7 @@ class ScoreDirection:
     axis: int = 0
     least: float = -np.inf
     most: float = np.inf
+    at: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +167,7 @@ class Dictionary:
         self.shifts = ForwardShifts.of(shifts) if "position" in amplitudes else None
 
     def _add(self, part: str, directions: list[ScoreDirection]) -> None:
-        """Append directions, and note where they stand."""
+        """Append directions, and note their places."""
         start = len(self.directions)
         self.directions += directions
         self.parts[part] = slice(start, len(self.directions))
@@ -224,7 +227,7 @@ def _within_reach(
         sensor, k = number % len(at), one.axis
         least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
         most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
-        bounded.append(replace(one, least=least, most=most))
+        bounded.append(replace(one, least=least, most=most, at=float(at[sensor, k])))
     return bounded
 
 

@@ -138,7 +138,7 @@ def following(ledger: Ledger, window: int) -> Following | None:
 
 
 def quiet(ledger: Ledger, log_e: Array) -> bool:
-    """Return whether nothing speaks against the model in the windows that begin anew.
+    """Return whether there is no evidence against the model in the windows that restart.
 
     Parameters
     ----------
@@ -251,7 +251,7 @@ def _record(ledger: Ledger, wider: float) -> tuple[Array, Array]:
 
 
 def _inverse(F: Array) -> tuple[Array, int]:
-    """Return the pseudo-inverse of an information, and in how many directions it tells at all."""
+    """Return the pseudo-inverse of an information, and its rank."""
     values, axes = np.linalg.eigh(F)
     told = values > LEAST_SHARE * max(float(values[-1]), 1.0)
     inverse = (axes[:, told] / values[told]) @ axes[:, told].T

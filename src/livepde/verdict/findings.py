@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 from livepde.verdict.model_errors import ModelErrors
+from livepde.verdict.sentences import FINDINGS, percent, quoted
 
 __all__ = [
     "FEWEST",
@@ -19,7 +18,6 @@ __all__ = [
     "NOT_JUDGED",
     "NUMBERS",
     "PROMISES",
-    "TELLING",
     "Cause",
     "Finding",
     "Level",
@@ -43,9 +41,9 @@ NUMBERS: dict[Level, int] = {NOT_JUDGED: -1, "trusted": 0, "caution": 1, "do not
 """Level -> its number in metrics; a larger one is worse, and -1 is none of them."""
 
 PROMISES: dict[Level, str] = {
-    "trusted": "no model error of consequence was found",
+    "trusted": "no significant model error was found",
     "caution": "the model is not exact",
-    NOT_JUDGED: "whether the model holds was not tested",
+    NOT_JUDGED: "the model was not tested",
     LEVELS[-1]: "do not use the estimates as they are",
 }
 """Level -> what it means for the estimates."""
@@ -55,13 +53,13 @@ RANKED = (*DOUBTS, "following", "stuck", "discretisation")
 NAMES: dict[str, Severity] = {"trusted": "note", "caution": "caution", LEVELS[-1]: "do not trust"}
 WORST: dict[Severity, Level] = {"note": "trusted", "caution": "caution", "do not trust": LEVELS[-1]}
 FEWEST = 20  # samples before which there is nothing to judge by
-FLAT = 0.9  # least remaining share of a prior standard deviation of which data told hardly anything
-TELLING = "Longer data, with larger changes nearer to the sensors, would tell more."
+FLAT = 0.9  # remaining share of a prior standard deviation from which data do not identify
 MOST = 5  # findings that are said unasked
 NAMED = 4  # causes that are kept
 HALF = 0.5  # share of a misfit
 CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
+ONCE = ("discretisation", "hold")  # findings on the run as a whole of which there is one at most
 LARGEST = 1e99  # evidence beyond is written as that
 
 
@@ -120,7 +118,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Finding:
-    """One result of a test that speaks against the estimates.
+    """One result of a test against the estimates.
 
     Attributes
     ----------
@@ -162,7 +160,7 @@ class Finding:
         moved = [(name, size) for name, size in self.shift.items() if abs(size) >= 0.5]
         if moved:
             each = [f"{name} by {size:+.1f}" for name, size in moved[:3]]
-            parts.append(f"That would move {', '.join(each)} standard deviations.")
+            parts.append(f"Correcting this would shift {', '.join(each)} standard deviations.")
         remedy = self.remedy or (self.causes[0].remedy if self.causes else "")
         if remedy:
             parts.append(remedy)
@@ -173,9 +171,10 @@ class Finding:
         first, *others = self.causes
         if first.share < HALF:
             each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
-            return [f"No single cause explains it. Candidates: {'; '.join(each)}."]
-        found = [f"Most likely {first.text}{_shown(first.share, 'explains {} of it')}."]
-        found += [f"Else {one.text}{_shown(one.share)}." for one in others[:1]]
+            return [f"No single cause explains this. Candidates: {'; '.join(each)}."]
+        text = first.text if first.text.startswith(first.subject or " ") else _capital(first.text)
+        found = [f"{text}{_shown(first.share, 'explains {}')}."]
+        found += [f"Alternatively, {one.text}{_shown(one.share)}." for one in others[:1]]
         return found
 
     @classmethod
@@ -204,7 +203,11 @@ class Finding:
 
 def _shown(share: float, words: str = "{}") -> str:
     """Return a share in parentheses; empty if it is not known."""
-    return "" if math.isnan(share) else f" ({words.format(f'{share:.0%}')})"
+    return "" if math.isnan(share) else f" ({words.format(percent(share))})"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _number(value: float | None) -> float:
@@ -213,28 +216,24 @@ def _number(value: float | None) -> float:
 
 def channel_setting(name: str, key: str, value: str) -> str:
     """Return the setting of a key of a channel, as `Cause.setting` has it; the value is TOML."""
-    quoted = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-    return f"channels.{quoted}.{key}={value}"
+    return f"channels.{quoted(name)}.{key}={value}"
 
 
 def too_few(what: str, samples: int) -> str:
     """Return why a test was not made, for `Verdict.untested`: there are too few samples."""
-    return f"{what}: there are {samples} samples, {FEWEST} are needed"
+    return f"{what}: {samples} samples, at least {FEWEST} required"
 
 
 def at_bound(label: str, value: float) -> Finding:
     """Return the finding of an unknown that ends at a bound."""
-    text = f"{label} ends at its bound {value:g}: the bound decides, not the data."
+    text, _ = FINDINGS["bound"].filled(label=label, value=value)
     return Finding("bound", "caution", text, label, value)
 
 
 def flat(label: str, left: float) -> Finding:
-    """Return the finding of an unknown of which the data have told hardly anything."""
-    text = (
-        f"{label}: the data have told hardly anything, {left:.0%} of its prior standard deviation "
-        "is left."
-    )
-    return Finding("flat", "caution", text, label, left, remedy=TELLING)
+    """Return the finding of an unknown that the data do not identify."""
+    text, remedy = FINDINGS["flat"].filled(label=label, left=percent(left))
+    return Finding("flat", "caution", text, label, left, remedy=remedy)
 
 
 def _ranked(findings: Iterable[Finding], errors: ModelErrors) -> list[Finding]:
@@ -324,25 +323,28 @@ class Verdict:
     def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
         """Return the verdict that `to_dict` has written."""
         findings = [Finding.from_dict(item) for item in stored["findings"]]
-        # Earlier versions stored no "judged", but said in `untested` that nothing was.
-        told = any(text.startswith(("innovations", "everything")) for text in stored["untested"])
-        judged = stored.get("judged", not told)
+        # Earlier versions stored no "judged", but listed in `untested` that nothing was.
+        untested = any(
+            text.startswith(("innovations", "everything")) for text in stored["untested"]
+        )
+        judged = stored.get("judged", not untested)
         errors = ModelErrors.from_dict(stored.get("errors"))
         return cls.of(findings, stored["untested"], stored["unseen"], judged=judged, errors=errors)
 
     @classmethod
     def unjudged(cls) -> Verdict:
         """Return the verdict where nothing was looked at."""
-        return cls.of((), ("everything: no law has judged the run",), judged=False)
+        return cls.of((), ("everything: no law has tested the run",), judged=False)
 
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
-        """Return the verdict with more findings, none of which is said twice.
+        """Return the verdict with more findings, each of them once.
 
-        One on the same unknown or sensor as an earlier one takes its place: it is of later data.
+        One on the same unknown or sensor as an earlier one replaces it: it is of later data. So
+        does one on the discretisation, which an earlier version may have put in other words.
         """
-        said = {finding.text for finding in self.findings}
-        new = [finding for finding in more if finding.text not in said]
-        later = {(finding.what, finding.subject) for finding in new if finding.subject}
+        texts = {finding.text for finding in self.findings}
+        new = [finding for finding in more if finding.text not in texts]
+        later = {(one.what, one.subject) for one in new if one.subject or one.what in ONCE}
         kept = [one for one in self.findings if (one.what, one.subject) not in later]
         return self._with([*kept, *new])
 
@@ -370,7 +372,7 @@ class Verdict:
         if misfit is None:
             if not causes or not causes[0].share >= HALF:
                 return self
-            text = "The data fit much better if one column is read otherwise."
+            text, _ = FINDINGS["misfit, columns"]
             severity: Severity = "do not trust" if causes[0].kind in GROSS else "caution"
             found = Finding("misfit", severity, text, causes[0].subject, causes=tuple(causes))
             return self.with_findings([found])
@@ -411,7 +413,7 @@ class Verdict:
 
     def _not_judged(self) -> str:
         why = f" ({self.untested[0]})" if self.untested else ""
-        return f"Not judged: whether the model holds was not tested{why}."
+        return f"Not judged: the model was not tested{why}."
 
     @property
     def sentences(self) -> list[str]:

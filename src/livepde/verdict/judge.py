@@ -404,7 +404,7 @@ def _in_windows(effect: Array, growth: Array) -> Array:
 
 
 def _sound(ledger: Ledger, due: Mask) -> Mask:
-    """Return whether nothing spoke against the model in the longest window that ended last."""
+    """Return whether there was no evidence against the model in the last longest window."""
     ends = due[:, -1] & (ledger.age[:, -1] > 0)
     if not ends.any():
         return ledger.sound

@@ -160,7 +160,7 @@ class Ledger:
 
     @property
     def due(self) -> Mask:
-        """Windows that begin anew with the next sample, shape (members, windows)."""
+        """Windows that restart with the next sample, shape (members, windows)."""
         due: Mask = (self.age >= LENGTHS[: self.age.shape[1]]) | (self.age == 0)
         return due
 

@@ -41,7 +41,7 @@ MOST_ENDS = 4  # boundaries of the mesh that are looked at
 
 
 class Now(NamedTuple):
-    """Where a response stands: state, latent parameter, inputs, usual interval and rest state.
+    """Point of a response: state, latent parameter, inputs, usual interval and rest state.
 
     Attributes
     ----------

@@ -59,7 +59,7 @@ class Allowed:
 
     @property
     def effect(self) -> float:
-        """By how much the value may be off, relative to it."""
+        """Largest error of the value, relative to it."""
         off = max(abs(self.low - self.value), abs(self.high - self.value))
         size = max(abs(self.value), abs(self.plain_low), abs(self.plain_high))
         return off / size if size > 0.0 else math.inf
@@ -80,9 +80,9 @@ class Allowed:
     def text(self) -> str:
         """The unknown with its interval, and its effect in per cent."""
         unit = f" {self.unit}" if self.unit else ""
-        off = f"up to {self.effect:.2g} times its size off"
+        off = f"error up to {self.effect:.2g} times its value"
         if self.effect < 1.0:
-            off = f"up to {100.0 * self.effect:.2g} % off"
+            off = f"error up to {100.0 * self.effect:.2g} %"
         return f"{self.label} is between {self.low:.4g} and {self.high:.4g}{unit} ({off})"
 
 
@@ -169,20 +169,21 @@ class ModelErrors:
         fit = f"Residuals are {self.misfit:.2g} times the noise and {signal:.2g} % of the signal."
         if self.failed:
             return f"The fit failed. {fit}"
-        # Of many unknowns those are said that may be off the most.
+        # Of many unknowns those are listed whose error may be largest.
         some = [one.text for one in self.asked[:MOST]]
-        more = f"; {len(self.asked) - MOST} more are in the table" if len(self.asked) > MOST else ""
-        why = "model errors" if doubted else "model errors that these data would not show"
-        return f"{fit} Allowing for {why}, {', '.join(some)}{more}." if some else fit
+        rest = len(self.asked) - MOST
+        more = f" The table lists {rest} more." if rest > 0 else ""
+        why = "model errors" if doubted else "model errors that these data cannot reveal"
+        return f"{fit} Allowing for {why}, {', '.join(some)}.{more}" if some else fit
 
     @property
     def remedy(self) -> str:
         """What to do with such intervals."""
         if self.failed:
-            return "Do not use the estimates: find what is wrong with the model or the data."
+            return "Do not use the estimates. Find the error in the model or the data first."
         if self.effect > USELESS:
-            return "These intervals are too wide to use: find the error first."
-        return "Use these intervals instead of the plain ones."
+            return "These intervals are too wide to use. Find the error first."
+        return "Use these intervals: the others assume an exact model."
 
     def to_dict(self) -> dict[str, Any]:
         """Return the value as JSON can hold it."""

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from livepde.verdict.findings import Finding, Severity
+from livepde.verdict.sentences import FINDINGS
 
 __all__ = ["NOT_KNOWN", "REFINE", "Shifts", "discretised", "held_inputs", "known"]
 
@@ -19,17 +20,14 @@ GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of ev
 SHARED = 1.0  # the same by one kind of error, from which it is named
 SETTING = 1.0  # the same if inputs are readings: no interval holds that
 HOLD = "hold"
-SAID = 5  # unknowns in a sentence
+LISTED = 5  # unknowns in a sentence
 REFINE = {
     "step": (
         "the time step",
-        "Take a smaller dt_max (steps.dt_max), or a scheme of second order.",
+        "Reduce `steps.dt_max`, or use a second-order scheme.",
     ),
-    "mesh": ("the mesh", "Take more elements (mesh.cells), where the state bends most."),
-    "input": (
-        "the straight lines between readings of the input channels",
-        "Read these channels more often.",
-    ),
+    "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
+    "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
 }
 """Kind of a discretisation error -> its name, and the remedy."""
 
@@ -40,7 +38,7 @@ Other = TypeVar("Other")
 
 @dataclass(frozen=True, eq=False)
 class Shifts(Generic[Number]):
-    """Shifts of the unknown numbers by errors that are followed beside the filter.
+    """Shifts of the unknown numbers by errors that are estimated online.
 
     Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
     members.
@@ -96,13 +94,10 @@ def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
     parts = sorted(sizes, key=lambda kind: -sizes[kind])
     parts = [kind for kind in parts if sizes[kind] >= min(largest, SHARED)]
     each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
-    text = (
-        f"The discretisation has shifted the unknowns by {total:.1f} standard deviations: "
-        f"{', '.join(each)}. The intervals were widened by that."
-    )
+    text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(each))
     remedy = " ".join(REFINE[kind][1] for kind in parts)
     # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
-    # and says more on the mesh and the step than on the data.
+    # and depends more on the mesh and the step than on the data.
     unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
     severity: Severity = "caution" if unsure else "note"  # the interval holds it
     yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
@@ -114,16 +109,11 @@ def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
     if not total > SETTING:
         return
     moved = {label: -shift for label, shift in shifts.by(HOLD).items()}
-    text = (
-        'Inputs are held between their readings (`between = "hold"` or `"next"`), but change as '
-        "smoothly as measured values do. As straight lines they would move the unknowns by "
-        f"{total:.1f} standard deviations{_listed(moved)}. The intervals do not contain this shift."
-    )
-    remedy = 'If these inputs are measured at single moments, use `between = "line"`.'
+    text, remedy = FINDINGS["hold"].filled(total=total, each=_listed(moved))
     yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
 
 
 def _listed(shifts: Mapping[str, float]) -> str:
     """Return the shifts of the first unknowns in parentheses."""
     parts = [f"{label} by {shift:+.2g}" for label, shift in shifts.items() if math.isfinite(shift)]
-    return f" ({', '.join(parts[:SAID])})" if parts else ""
+    return f" ({', '.join(parts[:LISTED])})" if parts else ""

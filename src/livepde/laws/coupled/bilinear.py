@@ -46,7 +46,7 @@ class BilinearSolver(MonolithicSolver):
 
     @cached_property
     def _coupling(self) -> tuple[_Coupling, _Coupling | None]:
-        """A(w) over omega as a function of w, and outside of it as one of u."""
+        """A(w) over omega as a function of w, and outside it as one of u."""
         forms = self.terms.forms
         return _Coupling.of(forms.A_in), None if forms.A_out is None else _Coupling.of(forms.A_out)
 

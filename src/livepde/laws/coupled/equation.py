@@ -232,7 +232,7 @@ class StageTerms:
 
     @cached_property
     def parts(self) -> tuple[slice, slice]:
-        """Where u and q stand in y."""
+        """Places of u and q in y."""
         return slice(0, self.n), slice(self.n, self.size)
 
     @cached_property
@@ -558,7 +558,7 @@ class StageSolver(ABC):
         return Inside(A, A.T, forms.B_in.vector("v", moment, u=w))
 
     def outside(self, moment: Moment, u: Array, q: Array) -> tuple[Array, Array]:
-        """Return A(u) q and B(u) outside of omega, shape (n,)."""
+        """Return A(u) q and B(u) outside omega, shape (n,)."""
         forms = self.terms.forms
         if forms.A_out is None or forms.B_out is None:
             return np.zeros_like(u), np.zeros_like(u)

@@ -52,7 +52,7 @@ class StageForms:
 
     @cached_property
     def _outside(self) -> IntArray | None:
-        """The elements outside of omega; None where there are none."""
+        """The elements outside omega; None where there are none."""
         omega = self.split.omega
         if omega is None:
             return None
@@ -73,12 +73,12 @@ class StageForms:
 
     @cached_property
     def A_out(self) -> AnyForm | None:
-        """A outside of omega; None where there is nothing."""
+        """A outside omega; None where there is nothing."""
         return None if self._outside is None else self.model.form_A.on(self._outside)
 
     @cached_property
     def B_out(self) -> AnyForm | None:
-        """B outside of omega; None where there is nothing."""
+        """B outside omega; None where there is nothing."""
         return None if self._outside is None else self.model.form_B.on(self._outside)
 
     def argument(self, u: Array, r: Array) -> Array:
@@ -114,7 +114,7 @@ class StageForms:
 
     @cached_property
     def hidden(self) -> sp.csr_array:
-        """Matrix nu P^T N_op P over omega, and nu N_op outside of it (MN2), shape (n, n)."""
+        """Matrix nu P^T N_op P over omega, and nu N_op outside it (MN2), shape (n, n)."""
         n, P = self.model.X.dim, self.split.P
         if not self.nu:
             return sp.csr_array((n, n))
