@@ -93,6 +93,17 @@ def test_the_core_needs_no_compiler():
     assert any(line.startswith("pyamg") for line in project["optional-dependencies"]["solvers"])
 
 
+def test_the_recipe_for_conda_agrees_with_the_wheel():
+    recipe = (ROOT / "deploy" / "conda" / "recipe.yaml").read_text()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    run = recipe.partition("  run:\n")[2].partition("\ntests:")[0]
+    found = {line.removeprefix("python-") for line in re.findall(r"- (.*)", run)}
+    expected = {re.sub(r"^([\w-]+)", r"\1 ", line) for line in project["dependencies"]}
+    assert found == expected | {f"python {project['requires-python']}"}
+    assert f'version: "{livepde.__version__}"' in recipe
+    assert f"livepde = {project['scripts']['livepde']}" in recipe
+
+
 # --- how to cite -----------------------------------------------------------------------------
 
 
