@@ -47,7 +47,8 @@ help:  ## List the targets
 	@echo
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: $(READY)  ## Watch the paper's first experiment identify q(x) and u(t, x) online
+demo: $(READY)  ## Identify a furnace wall from thermocouples, then run the paper's first experiment
+	@$(BIN)/livepde run examples/first_hour/furnace.toml
 	@$(BIN)/livepde demo
 
 test: $(READY)  ## Run the tests of what users rely on, and the doctests
