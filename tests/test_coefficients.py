@@ -59,6 +59,22 @@ def test_estimates_are_those_of_the_form_in_the_unknowns():
         assert found[name].std == pytest.approx(expected[name].std, rel=1e-5)
 
 
+def test_members_of_a_fleet_are_single_runs():
+    model = rod(named=True)
+    sensors = lp.Points({"T_1": 0.2, "T_2": 0.6}, noise=0.01)
+    starts = [np.array([1.0, 2.0]), np.array([0.5, 3.0])]
+    fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, q0=starts, u0=0.0)
+    alone = [lp.Identifier(model, sensors, lp.SensitivityLaw(), q0=q0, u0=0.0) for q0 in starts]
+    rng = np.random.default_rng(5)
+    for k in range(1, 11):
+        z, Q = rng.normal(0.2, 0.05, (2, 2)), np.array([1.0, 2.0])
+        together = fleet.step(0.05 * k, z, {"Q": Q})
+        each = [one.step(0.05 * k, z[m], {"Q": Q[m]}) for m, one in enumerate(alone)]
+    for name in UNKNOWNS:
+        expected = [one[name].mean for one in each]
+        np.testing.assert_allclose(together[name].mean, expected, rtol=1e-9)
+
+
 def test_fluxes_and_errors_of_sensors_may_be_added():
     more = rod(named=True).with_unknowns({"o": lp.Normal(0.0, std=1.0)})
     more = more.with_terms(A=[lp.On("left", lambda q, u, v, x: q.o * u * v)])
