@@ -11,8 +11,10 @@ from factories import short_rod
 
 from livepde import cases
 from livepde.cases.remedies import with_settings
+from livepde.cases.variants import GAINED, Variant, recommended, run_variant
 from livepde.errors import CaseError
 from livepde.samples import noise_channel
+from livepde.verdict import Cause, Finding, Verdict
 
 ROWS = 41
 
@@ -149,3 +151,23 @@ def test_a_late_sensor_is_fitted_as_if_it_were_not(tmp_path):
     found = late.identifier.run(late.stream).last
     (one, std), (other, _) = found.parameters["alpha"], whole.parameters["alpha"]
     assert abs(one - other) < 2.0 * std
+
+
+def test_the_setting_of_a_cause_has_the_size_that_was_fitted():
+    linear = Cause("lag", "T_10", "T_10 is 71 s late", 0.9, "", 'channels.T_10.late="71 s"', 71.0)
+    fitted = Cause("lag", "T_10", "T_10 is 80 s late", 0.9, "", 'channels.T_10.late="80 s"', 80.0)
+    misfit = Finding("misfit", "caution", "The residuals are large.", causes=(linear,))
+    (found,) = Verdict((misfit,)).with_causes([fitted]).findings[0].causes
+    assert found.setting == fitted.setting
+
+
+def test_a_late_column_is_compared_with_the_readings_that_it_uses(tmp_path):
+    path = changed(tmp_path, late_by("T_10", 3))
+    step = pd.read_csv(path.parent / "rod.csv").iloc[:, 0].diff().median()
+    base = run_variant(path, (), Variant("as stated"))
+    # Between the rows of the others: the first reading of T_30 is before the start.
+    late = run_variant(path, (), Variant("late", (f'channels.T_10.late="{2.9 * step} s"',)))
+    assert late.readings["T_30"] == base.readings["T_30"] - 1
+    assert late.gained(base) > GAINED
+    assert late.same_readings == pytest.approx(base.log_evidence, rel=0.1)
+    assert recommended(base, [late]) is late

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from factories import observe
+import scipy.sparse as sp
+from factories import observe, short_rod
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import trapezoid
@@ -19,6 +22,7 @@ from skfem import (
 )
 
 import livepde as lp
+from livepde import cases
 from livepde.fem import Inputs, Moment, box
 from livepde.streams import AbsoluteNoise, Twin
 
@@ -461,3 +465,24 @@ def test_the_component_must_exist():
 def test_a_component_that_says_nothing_is_refused(build):
     with pytest.raises(lp.errors.ObservationError, match="of='u' says nothing"):
         build()
+
+
+def test_derivatives_of_stated_errors_are_those_of_a_complex_step(tmp_path):
+    errors = {"gain": 0.1, "offset": "0.2 K", "correlated": {"std": "0.1 K", "time": "100 s"}}
+    settings = {f"channels.T_10.{key}": value for key, value in errors.items()}
+    settings |= {"channels.T_30.offset": "0.2 K", "channels.T_10.at_std": "1 cm"}
+    prepared = cases.load(short_rod(tmp_path, 11), settings=settings).prepare()
+    problem = prepared.identifier.problem
+    stated = problem.observed
+    stepped = replace(stated.observation, derivatives=None).bind(
+        stated.state, stated.X, stated.parameter
+    )
+    rng = np.random.default_rng(1)
+    u, q = rng.normal(size=stated.state.dim), rng.normal(size=stated.parameter.dim)
+    found, expected = (one.jacobian(u, q, Moment()) for one in (stated, stepped))
+    for one, other in zip(found, expected, strict=True):
+        dense, known = sp.csr_array(one).toarray(), sp.csr_array(other).toarray()
+        np.testing.assert_allclose(dense, known, atol=1e-12)
+    np.testing.assert_allclose(
+        stated.predict(u, q, Moment()), stepped.predict(u, q, Moment()), rtol=1e-14
+    )

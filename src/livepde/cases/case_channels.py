@@ -31,6 +31,7 @@ from livepde.fem import (
     with_constants,
 )
 from livepde.identifier import Sample
+from livepde.linalg import Array
 from livepde.observation import (
     Averages,
     Calibrated,
@@ -634,19 +635,26 @@ def _calibrated(
     case: CaseContent, base: Observation, names: Sequence[str], **options: Any
 ) -> Observation:
     """Return the readings: gain * (reading of the base) + offset + correlated."""
-    channels = case.spec.channels
+    channels = [case.spec.channels[name] for name in names]
+    gains = [(k, n) for k, n in enumerate(names) if channels[k].gain is not None]
+    added = {
+        kind: [(k, n) for k, n in enumerate(names) if getattr(channels[k], kind) is not None]
+        for kind in ("offset", "correlated")
+    }
+    known = list(zip(names, channels, strict=True))
+    units = np.eye(len(names))
+    columns = {f"{kind}[{n}]": units[k] for kind, some in added.items() for k, n in some}
 
-    def reading(y: Any, q: Any, x: Any) -> Any:
-        shown = []
-        for value, name in zip(y, names, strict=True):
-            channel = channels[name]
-            if channel.gain is not None:
-                value = q.gain[name] * value
-            if channel.offset is not None:
-                value = value + q.offset[name]
-            if channel.correlated is not None:
-                value = value + q.correlated[name]
-            shown.append(value)
-        return np.array(shown)
+    def reading(y: Array, q: Any, x: Any) -> Array:
+        slopes, _ = derivatives(y, q, x)
+        z = slopes * y
+        for kind, some in added.items():
+            for k, name in some:
+                z[k] += getattr(q, kind)[name]
+        return z
 
-    return Calibrated(base, reading, **options)
+    def derivatives(y: Array, q: Any, x: Any) -> tuple[Array, dict[str, Array]]:
+        slopes = np.array([q.gain[n] if c.gain is not None else 1.0 for n, c in known])
+        return slopes, columns | {f"gain[{name}]": y[k] * units[k] for k, name in gains}
+
+    return Calibrated(base, reading, derivatives, **options)

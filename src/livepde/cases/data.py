@@ -47,6 +47,7 @@ __all__ = [
     "check_hours",
     "clock_of",
     "data_file",
+    "delays",
     "limits_of",
     "passwords_of",
     "policy_of",
@@ -123,7 +124,7 @@ def read_data(
     source: str | Iterable[str] | None,
 ) -> DataTable | JsonLines:
     """Return the data: of the case's file, another file, or lines of JSON as they come."""
-    late = _late(case)
+    late = delays(case)
     found = _all_read(case, columns, clock, source)
     if isinstance(found, JsonLines):
         refuse_late(case)
@@ -136,7 +137,7 @@ def read_data(
     return _merged(case, not_late(found, late | noise), columns)
 
 
-def _late(case: CaseContent) -> dict[str, float]:
+def delays(case: CaseContent) -> dict[str, float]:
     """Return channel -> how late its times are, of those that state it."""
     unit, channels = case.equation.time_unit, case.spec.channels
     return {
@@ -154,7 +155,7 @@ def refuse_late(case: CaseContent) -> None:
     CaseError
         A channel states how late it is.
     """
-    for name in _late(case):
+    for name in delays(case):
         raise case.error(f"channels.{name}.late", LATE)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,14 +12,18 @@ import numpy as np
 
 from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
+from livepde.cases.data import clock_of, delays
 from livepde.cases.read import parse, settings_in
 from livepde.cases.remedies import with_settings
+from livepde.dates import since_1970
 from livepde.errors import CaseError
+from livepde.identifier import Sample
 from livepde.plots.dataset import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import verdict
 from livepde.runs.summary import channel_errors, rmse
+from livepde.streams import DataTable
 from livepde.verdict import Cause, Verdict
 
 if TYPE_CHECKING:
@@ -39,6 +43,7 @@ __all__ = [
 EVERY = 1_000_000_000  # fields are not compared
 AS_STATED = "as stated"
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
+SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of withheld sensors may grow: about its own error
 
 
@@ -91,6 +96,9 @@ class VariantRun:
         data: variants with another unit of a sensor are comparable.
     readings
         Sensor that it assimilates -> number of the readings that are assimilated.
+    same_readings
+        Log evidence of the case itself with these readings, where late channels leave some out;
+        else NaN.
     misfits
         Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
         one step ahead, second half of the samples.
@@ -108,6 +116,7 @@ class VariantRun:
     verdict: Mapping[str, Any] = field(default_factory=dict)
     log_evidence: float = math.nan
     readings: Mapping[str, int] = field(default_factory=dict)
+    same_readings: float = math.nan
     misfits: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     withheld: Mapping[str, float] = field(default_factory=dict)
@@ -140,10 +149,12 @@ class VariantRun:
         return list(found.values())
 
     def gained(self, base: VariantRun) -> float:
-        """Return log evidence minus that of another run; NaN if other readings count."""
-        if self.error or dict(self.readings) != dict(base.readings):
+        """Return log evidence minus that of the case itself; NaN if other readings count."""
+        if self.error:
             return math.nan
-        return self.log_evidence - base.log_evidence
+        if dict(self.readings) == dict(base.readings):
+            return self.log_evidence - base.log_evidence
+        return self.log_evidence - self.same_readings
 
     def apart(self, base: VariantRun) -> list[str]:
         """Return the unknowns whose intervals in both runs have no point in common."""
@@ -217,21 +228,62 @@ def run_variant(
     try:
         every = parse(settings), parse(variant.settings)
         prepared = load(path, allow_code=allow_code, settings=every).prepare(data)
-        return _ended(variant, prepared, _run(prepared).to_xarray())
+        # Errors of single columns are looked for in the case itself, to be proposed.
+        run = _run(prepared, prepared.stream, columns=not variant.settings)
+        found = _ended(variant, prepared, run.to_xarray())
+        stated = load(path, allow_code=allow_code, settings=every[:1])
+        if delays(stated) == delays(prepared.case):
+            return found
+        same = _evidence_of_same(stated.prepare(data), prepared, found)
+        return replace(found, same_readings=same)
     except Exception as error:  # noqa: BLE001  whatever it is, it is a row of the table
         reason = str(error).strip() or "no reason given"
         return VariantRun(variant, error=f"{type(error).__name__}: {reason}")
 
 
-def _run(prepared: Prepared) -> Result:
-    """Run a case; its verdict does not look for errors of single columns."""
+def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Result:
+    """Run a case; `columns`: whether its verdict looks for errors of single columns."""
     who = prepared.identifier
     result = Result(who.model, who.observed, who.withheld, EVERY, layout=prepared.layout)
-    for sample in prepared.stream:
+    for sample in samples:
         result.add(who.step(sample.t, sample.z, sample.inputs))
     if result.last is not None:
-        result.settle(who.settled(result.last, columns=False))
+        result.settle(who.settled(result.last, columns=columns))
     return result
+
+
+def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float:
+    """Return the log evidence of the case as stated with the readings that a variant has used.
+
+    A late channel loses its first readings, or those of others before it begins. NaN if they
+    cannot be told apart.
+    """
+    known, table = late.stream, stated.stream
+    if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
+        return math.nan
+    apart = _seconds_between(known, table) * clock_of(stated.case).second
+    before, after = delays(late.case), delays(stated.case)
+    values = table.values.copy()
+    for name in found.readings:
+        column = known.values[:, known.names.index(name)]
+        used = np.isfinite(column) & (known.t >= late.assimilate_from)
+        if not used.any():
+            return math.nan
+        # As they stand in the table that the case states.
+        shift = apart + before.get(name, 0.0) - after.get(name, 0.0)
+        width = SAME * max(float(np.ptp(table.t)), 1.0)
+        low, high = known.t[used][0] + shift - width, known.t[used][-1] + shift + width
+        values[(table.t < low) | (table.t > high), table.names.index(name)] = np.nan
+    run = _run(stated, replace(table, values=values), columns=False)
+    own = _ended(Variant(AS_STATED), stated, run.to_xarray())
+    return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan
+
+
+def _seconds_between(one: DataTable, other: DataTable) -> float:
+    """Return the seconds from the origin of another table to that of one; 0 of numbers."""
+    if one.origin is None or other.origin is None:
+        return 0.0
+    return since_1970(one.origin) - since_1970(other.origin)
 
 
 def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun:

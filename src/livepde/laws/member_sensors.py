@@ -46,6 +46,10 @@ class MemberSensors:
         for k in range(len(x)):
             deviates = bool(x.du[k].any() or x.da[k].any())
             U, C = x.U[k], x.C[k]
+            if not len(U) and not deviates:
+                predicted.append(self._predicted(x.u[k], x.q[k], at, k))
+                rows.append(np.zeros((0, self.problem.observed.size)))
+                continue
             # The offset of the estimate is one more row: so predictions stay linear about the
             # point.
             if deviates:
@@ -63,6 +67,11 @@ class MemberSensors:
         each = (self._of_one(x.u[k], x.q[k], U[k], C[k], at, k)[1] for k in range(len(x)))
         return np.array(list(each))
 
+    def _predicted(self, u: Array, q: Array, at: Moments, k: int) -> Array:
+        """Return the readings of one member."""
+        observed, latent = self.problem.observed, self.problem.model.latent
+        return observed.predict(u, latent.value(q), at.member(k))
+
     def _of_one(
         self, u: Array, q: Array, U: Array, C: Array, at: Moments, k: int
     ) -> tuple[Array, Array]:
@@ -73,4 +82,4 @@ class MemberSensors:
         Y: Array = np.asarray((H_u @ U.T).T)
         if H_q is not None:
             Y = Y + self.reduction.directions(q[None], C[None])[0] @ H_q.T
-        return observed.predict(u, physical, moment), Y
+        return self._predicted(u, q, at, k), Y

@@ -168,7 +168,7 @@ class Calibrated(Observation):
 
         z = function(y, q, x),      y = readings of `base`
 
-    The derivatives in y and q are taken by a complex step: exact for analytic functions.
+    Derivatives by a complex step are exact for analytic functions.
 
     Parameters
     ----------
@@ -178,6 +178,10 @@ class Calibrated(Observation):
         (y, q, x) with y of shape (sensors,), the numbers among the unknowns q (q.gain; one for each
         region or name: q.k[1], q.offset["T_10"]), and x for x.t and x.inputs["Q"]; returns readings
         of shape (sensors,).
+    derivatives
+        (y, q, x) -> derivatives of the function in the readings y, shape (sensors,), and in
+        unknowns, {"gain": shape (sensors,)}; for a function that reads each sensor alone. Default:
+        by a complex step, one call for each sensor and each unknown.
 
     Examples
     --------
@@ -187,6 +191,7 @@ class Calibrated(Observation):
 
     base: Observation
     function: Calibration
+    derivatives: Callable[[Array, Any, Place], tuple[Array, Mapping[str, Array]]] | None = None
 
     def __post_init__(self) -> None:
         self._sees_all("give of= to the observations it is made of.")
@@ -261,6 +266,18 @@ class CalibratedObserved(Observed):
         y = self.base.predict(u, q, moment)
         seen = self.available(moment)
         inner_u, inner_q = self.base.jacobian(u, q, moment)
+        if (derivatives := self.observation.derivatives) is not None:
+            known = numbers(self.parameter, q)
+            slopes, columns = derivatives(y, known, Place(np.zeros((0,)), None, moment))
+            slopes = np.where(seen, slopes, 0.0)
+            H_q = np.zeros((self.size, self.parameter.dim))
+            for label, column in columns.items():
+                H_q[seen, self.parameter.labels[label]] = column[seen]
+            if inner_q is not None:
+                H_q += slopes[:, None] * inner_q
+            values = inner_u.data * np.repeat(slopes, np.diff(inner_u.indptr))
+            scaled = (values, inner_u.indices, inner_u.indptr)
+            return sp.csr_array(scaled, shape=inner_u.shape), H_q
         slope = np.zeros((self.size, self.size))
         for k in np.flatnonzero(seen):
             slope[seen, k] = self._slope(_nudged(y, int(k)), q, moment)[seen]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, FunctionSpace, Moment
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
@@ -72,10 +73,6 @@ class _Shift:
             return (-1.0 / a, 0.0) if b == 0.0 else (0.0, 1.0 / b)
         return (2.0 * d - b) / (a * (a + b)), (2.0 * d + a) / (b * (a + b))
 
-    def change(self, weights: tuple[float, float]) -> sp.csr_array:
-        """Return the weighted sum of the differences, shape (1, n)."""
-        return sp.csr_array(weights[0] * self.low + weights[1] * self.high)
-
 
 class PlacedObserved(Observed):
     """Bound point sensors at uncertain positions: linear in u, quadratic in the shifts.
@@ -135,25 +132,57 @@ class PlacedObserved(Observed):
         return False
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
-        z: Array = self._placed(q) @ u
-        direct = self._direct(moment)
-        return z if direct is None else z + direct @ q
+        z = super().predict(u, q, moment)
+        weights = [shift.weights(float(q[shift.column])) for shift in self.shifts]
+        np.add.at(z, self._sensors, np.ravel(weights) * (self._differences @ u))
+        return z
 
     def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
         direct = self._direct(moment)
         H_q = np.zeros((self.size, self.parameter.dim)) if direct is None else direct
-        for shift in self.shifts:
-            slope = shift.change(shift.slopes(float(q[shift.column])))
-            H_q[shift.sensor, shift.column] += float((slope @ u)[0])
-        return self._placed(q), H_q
+        differences = (self._differences @ u).reshape(-1, 2)
+        weights = []
+        for shift, difference in zip(self.shifts, differences, strict=True):
+            d = float(q[shift.column])
+            H_q[shift.sensor, shift.column] += float(difference @ shift.slopes(d))
+            weights.append(shift.weights(d))
+        return self._placed(np.ravel(weights)), H_q
 
-    def _placed(self, q: Array) -> sp.csr_array:
-        """Return G at the shifted positions, shape (sensors, n)."""
-        rows: list[sp.csr_array] = [self.G[[k]] for k in range(self.size)]
-        for shift in self.shifts:
-            change = shift.change(shift.weights(float(q[shift.column])))
-            rows[shift.sensor] = sp.csr_array(rows[shift.sensor] + change)
-        return sp.csr_array(sp.vstack(rows, format="csr"))
+    def _placed(self, weights: Array) -> sp.csr_array:
+        """Return G at the shifted positions, for weights of all differences, shape (sensors, n)."""
+        pattern, parts = self._parts
+        values = parts[0] + weights @ parts[1:]
+        return sp.csr_array((values, pattern.indices, pattern.indptr), shape=pattern.shape)
+
+    @cached_property
+    def _sensors(self) -> IntArray:
+        """Number of the sensor of each row of `_differences`."""
+        return np.repeat([shift.sensor for shift in self.shifts], 2)
+
+    @cached_property
+    def _differences(self) -> sp.csr_array:
+        """Rows `low` and `high` of each shift in turn, shape (2 shifts, n)."""
+        ends = [end for shift in self.shifts for end in (shift.low, shift.high)]
+        return sp.csr_array(sp.vstack(ends, format="csr"))
+
+    @cached_property
+    def _parts(self) -> tuple[sp.csr_array, Array]:
+        """Pattern of G at shifted positions, and the values on it of G and of each difference.
+
+        Shapes (sensors, n) and (1 + 2 shifts, entries).
+        """
+        rows = self._sensors
+        sums = sp.csr_array(
+            (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
+        )
+        pattern = sp.csr_array(abs(self.G) + sums @ abs(self._differences))
+        pattern.sort_indices()
+        row = np.repeat(np.arange(self.size), np.diff(pattern.indptr))
+        values = [np.asarray(self.G[row, pattern.indices])]
+        for k, sensor in enumerate(rows):
+            own = np.asarray(self._differences[np.full_like(row, k), pattern.indices])
+            values.append(np.where(row == sensor, own, 0.0))
+        return pattern, np.array(values)
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:

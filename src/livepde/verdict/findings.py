@@ -375,10 +375,11 @@ class Verdict:
             found = Finding("misfit", severity, text, causes[0].subject, causes=tuple(causes))
             return self.with_findings([found])
         before = {(one.kind, one.subject): one for one in misfit.causes}
-        # What frees a cause is known where the run has named it already.
+        # What frees a cause is known where the run has named it already. A key that corrects a
+        # column has the size that was fitted.
         causes = [
             replace(one, remedy=known.remedy, setting=known.setting)
-            if (known := before.get((one.kind, one.subject)))
+            if not one.setting and (known := before.get((one.kind, one.subject)))
             else one
             for one in causes
         ]
