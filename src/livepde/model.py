@@ -654,11 +654,11 @@ class Model(Shown):
         return {channel: float(there.mean()) for channel, there in values.items() if fits[channel]}
 
     def initial(self, u0: Any, moment: Moment = START) -> Array:
-        """Return coefficients of u0 with the boundary values of a moment; see `initial_values`."""
-        return self.impose(self.initial_values(u0), moment)
+        """Return coefficients of u0: a number, a function of x, coefficients, or a mapping."""
+        return self.impose(self.state_space.interpolate(u0), moment)
 
     def initial_values(self, u0: Any) -> Array:
-        """Return coefficients of u0: a number, a function of x, coefficients, or a mapping.
+        """Return coefficients of the u0 of a run, before boundary values, checked.
 
         A number is the value of all components of the state; a mapping names each of them.
 

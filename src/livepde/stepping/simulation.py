@@ -45,7 +45,7 @@ def simulate(
     values = inputs or (lambda t: {})
     forward = ForwardStage(model)
     none = np.zeros(0)
-    u = model.initial(u0, Moment(times[0], values(times[0])))
+    u = model.impose(model.initial_values(u0), Moment(times[0], values(times[0])))
     yield times[0], u
     for t0, t1 in pairwise(times):
         interval = Interval(t0=t0, t1=t1, inputs0=values(t0), inputs1=values(t1), z0=none, z1=none)
