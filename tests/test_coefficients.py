@@ -70,9 +70,10 @@ def test_members_of_a_fleet_are_single_runs():
         z, Q = rng.normal(0.2, 0.05, (2, 2)), np.array([1.0, 2.0])
         together = fleet.step(0.05 * k, z, {"Q": Q})
         each = [one.step(0.05 * k, z[m], {"Q": Q[m]}) for m, one in enumerate(alone)]
-    for name in UNKNOWNS:
-        expected = [one[name].mean for one in each]
-        np.testing.assert_allclose(together[name].mean, expected, rtol=1e-9)
+    for k, expected in enumerate(each):
+        found = together.member(k)
+        np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
+        np.testing.assert_allclose(found.q_std, expected.q_std, rtol=1e-9)
 
 
 def test_fluxes_and_errors_of_sensors_may_be_added():
