@@ -507,7 +507,7 @@ def test_what_cannot_be_written_is_no_failed_diagnostic():
     assert attempted("The tables", lambda: 1 // 0, 7, notes) == 7
     assert notes == [
         "The tables failed (ZeroDivisionError: integer division or modulo by zero); "
-        "all else is whole."
+        "everything else is complete."
     ]
 
 
