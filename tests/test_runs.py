@@ -371,7 +371,7 @@ def test_each_bit_of_the_estimates_counts(tmp_path, driven):
     for bit in rng.integers(0, 8 * len(whole), 200):
         path.write_bytes(flipped(whole, int(bit)))
         with pytest.raises(
-            lp.errors.RunError, match=r"is damaged: its bytes .* run the case again"
+            lp.errors.RunError, match=r"is damaged: its content has changed .* run the case again"
         ):
             _ = runs.open(tmp_path / "run").dataset
     path.write_bytes(whole)
@@ -507,7 +507,7 @@ def test_what_cannot_be_written_is_no_failed_diagnostic():
     assert attempted("The tables", lambda: 1 // 0, 7, notes) == 7
     assert notes == [
         "The tables failed (ZeroDivisionError: integer division or modulo by zero); "
-        "all else is whole."
+        "everything else is complete."
     ]
 
 

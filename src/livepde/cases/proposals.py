@@ -25,7 +25,7 @@ SAMPLES = 64  # in which a source moves the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
     "gain": "gain of {}",
-    "position": "place of {}",
+    "position": "position of {}",
     "jump": "jumps of {}",
     "source": "source",
     "loss": "loss",
@@ -106,7 +106,7 @@ def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     error = _usual_error(base)
     length = float(np.ptp(prepared.case.mesh.p, axis=1).max())
     sizes = {"offset": error, "position": PLACE * length}
-    words = {"offset": "offsets of all sensors", "position": "places of all sensors"}
+    words = {"offset": "offsets of all sensors", "position": "positions of all sensors"}
     for kind, size in sizes.items():
         causes = [Cause(kind, name, "", size=size) for name in prepared.case.sensors]
         settings = [setting for cause in causes for setting in freed(prepared, cause)]
@@ -116,7 +116,7 @@ def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
 
 def _fewer(case: Case) -> Iterator[Variant]:
     """Iterate over the case with fewer unknowns."""
-    for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain places")):
+    for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain positions")):
         stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
         yield Variant(f"no {word}", tuple(channel_setting(name, key, "") for name in stated))
     used = {

@@ -374,7 +374,7 @@ class Live:
         `new`: the sample has no estimate yet, and its tries are counted.
         """
         if new and self.journal.mark() > TRIES:
-            self._set_aside(taken.t, f"the process has ended {TRIES + 1} times in its step")
+            self._set_aside(taken.t, f"processing it ended the program {TRIES + 1} times")
             return True
         try:
             self._step(taken, again=True)
@@ -420,7 +420,7 @@ class Live:
         if self.journal.accepted > self.journal.estimated:
             return  # stopped within a step: from the checkpoint before, it is taken again
         notes: list[str] = []
-        attempted("What is under way at the end", self._settled, None, notes)
+        attempted("The final fit", self._settled, None, notes)
         for note in notes:
             self._tell("unfinished", note)
         self._keep_state()
@@ -436,7 +436,7 @@ class Live:
                 self.result.settle(last)
                 self._keep_verdict(verdict)
             except Interrupted:
-                self._tell("unfinished", "the fit at the end was left out: the run was stopped")
+                self._tell("unfinished", "the final fit was skipped, because the run was stopped")
         if self.journal.estimated:
             # Nothing was left to do where there is no last estimate: the fields stay the same.
             final = last or self.identifier.settled(self.identifier.estimate())

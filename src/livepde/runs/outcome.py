@@ -65,5 +65,7 @@ def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str
         raise
     except Exception as error:  # noqa: BLE001  whatever it is, it is told
         reason = str(error).split("\n", 1)[0].rstrip(".") or "no reason given"
-        notes.append(f"{what} failed ({type(error).__name__}: {reason[:200]}); all else is whole.")
+        notes.append(
+            f"{what} failed ({type(error).__name__}: {reason[:200]}); everything else is complete."
+        )
         return otherwise
