@@ -107,7 +107,7 @@ def test_sensors_name_their_component(mesh):
         (lp.Subdomain(lambda x: x[0] > 0.9, of="s"), [0.1, 0.0]),
     ):
         assert sensor.bind(*spaces).G @ u == pytest.approx(expected, abs=1e-9)
-    with pytest.raises(lp.errors.SpaceError, match=r"components \['c', 's'\]: say which"):
+    with pytest.raises(lp.errors.SpaceError, match=r"components \['c', 's'\]: specify one"):
         lp.Points([0.25]).bind(*spaces)
     with pytest.raises(lp.errors.SpaceError, match="of='w'"):
         lp.Points([0.25], of="w").bind(*spaces)
@@ -222,6 +222,6 @@ def test_bad_states(mesh):
     model = lp.Model({"a": good, "b": good}, lp.Normal(), A)
     with pytest.raises(lp.errors.SpaceError, match="a function for each"):
         model.initial(lambda x: x[0])
-    with pytest.raises(lp.errors.SpaceError, match="say which one is meant"):
+    with pytest.raises(lp.errors.SpaceError, match="specify one"):
         _ = model.state_block
     assert np.allclose(model.initial(2.0, START), 2.0)

@@ -617,7 +617,7 @@ def told(**changes: Any) -> Any:
         ({"status": lp.laws.Status("singular", "no way")}, "the step failed"),
         (
             {"diagnostics": lp.laws.Diagnostics(innovation_ratio=9.0)},
-            "innovations are 3.0 times as large as expected; look at dt_max",
+            "innovations are 3.0 times as large as expected; check `dt_max`",
         ),
         ({"q_std": np.array([20.0])}, "known to 20 only"),
         ({"q_std": np.array([np.nan])}, "only"),
@@ -627,7 +627,7 @@ def told(**changes: Any) -> Any:
         ({"verdict": Verdict.unjudged()}, ""),  # of few samples the innovations are a test
         (
             {"verdict": Verdict.unjudged(), "diagnostics": lp.laws.Diagnostics()},
-            "Not judged: whether the model",
+            "Not judged: the model was not tested",
         ),
     ],
 )

@@ -532,7 +532,7 @@ def test_a_report_fetches_nothing(tmp_path):
     run = watched_run(tmp_path / "run")
     write_report(run, tmp_path / "run.html")
     page = Page(tmp_path / "run.html")
-    assert page.text.index("Measured and modelled") < page.text.index("Sensors against the model")
+    assert page.text.index("Measured and modelled") < page.text.index("Residuals")
     assert page.fetched == []
     assert not {"link", "iframe", "object", "embed", "base", "img"} & set(page.tags)
     text = (tmp_path / "run.html").read_text(encoding="utf-8")

@@ -439,7 +439,7 @@ def test_a_field_at_points():
     at = estimate["u"].at(0.325)  # between two vertices
     assert at.std == pytest.approx(drawn[:, 6:8].mean(axis=1).std(), rel=0.05)
     assert isinstance(at.mean, float)
-    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5\] lies outside of the"):
+    with pytest.raises(lp.errors.ObservationError, match=r"point 1 at \[1.5\] lies outside the"):
         estimate["u"].at([0.5, 1.5])
     with pytest.raises(lp.errors.ConfigurationError, match=r"expected numbers, shape \(points,\)"):
         estimate["u"].at([[0.5, 1.5]])

@@ -521,7 +521,7 @@ def test_a_step_that_fails_keeps_the_state_and_the_stream_goes_on():
     failed = ident.step(0.1, z)
     assert failed.status.code == "not_converged"
     assert "residual" in failed.status.detail
-    assert "smaller" in failed.status.remedy
+    assert "Reduce `dt_max`" in failed.status.remedy
     assert failed.status.remedy in str(failed.status)
     np.testing.assert_array_equal(failed.q, before.q)
     np.testing.assert_array_equal(failed.u, before.u)

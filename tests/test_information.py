@@ -426,7 +426,7 @@ def test_an_unknown_far_from_its_prior_is_a_failed_step() -> None:
     failed = [estimate for estimate in found if not estimate.status.ok]
     assert failed
     assert {estimate.status.code for estimate in failed} == {"departed"}
-    assert "a std that allows" in str(failed[0].status)
+    assert "increase the standard deviations of the priors" in str(failed[0].status)
     good = [estimate for estimate in found if estimate.status.ok]
     assert max(np.nan_to_num(estimate.diagnostics.departure) for estimate in good) <= 1.0
     # A failed step leaves the unknowns where they were, and takes the sample.

@@ -88,7 +88,7 @@ def test_a_fleet_counts_intervals_that_are_too_long() -> None:
         sample = {"a": 0.7, "b": 0.4}, {"left": 1.0}
         fleet.step(t, *sample)
         estimate = single.step(t, *sample)
-    sentence = "1 intervals between two samples have more than 10000 substeps"
+    sentence = "1 intervals between samples need more than 10000 substeps"
     assert any(sentence in text for text in estimate.verdict.every_sentence)
     assert any(sentence in text for text in fleet.identifier(1).estimate().verdict.every_sentence)
 

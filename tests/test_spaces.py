@@ -178,7 +178,7 @@ def test_bad_unknowns():
             lp.Normal(std=std)
     with pytest.raises(lp.errors.SpaceError, match="lower < upper"):
         lp.Normal(bounds=(1.0, 1.0))
-    with pytest.raises(lp.errors.SpaceError, match=r"mean 3\.0 lies outside"):
+    with pytest.raises(lp.errors.SpaceError, match=r"mean 3\.0 is outside"):
         lp.Piecewise({"a": lambda x: x[0] < 1}, lp.Normal(3.0, bounds=(0.0, 2.0)))
     with pytest.raises(lp.errors.SpaceError, match="at least one region"):
         lp.Piecewise({}, lp.Normal())

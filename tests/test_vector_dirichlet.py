@@ -130,7 +130,7 @@ def test_a_wrong_number_of_components_is_one_sentence(value: Any, message: str):
 
 def test_fields_without_components_say_so():
     scalar = lp.Field(MESH, ElementQuad1(), dirichlet={"left": (1.0, 2.0)})
-    with pytest.raises(lp.errors.SpaceError, match=r"a value for each component, .* no vector"):
+    with pytest.raises(lp.errors.SpaceError, match=r"a value for each component, .* not a vector"):
         lp.Model(scalar, lp.Normal(), lambda q, u, v, x: q * u * v)
     mesh = MeshTri().refined(1)
     normal = lp.Field(mesh, ElementTriRT1(), dirichlet={"boundary": lambda x, t: (1.0, x[1])})
