@@ -21,7 +21,7 @@ def biased(folder):
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     path = biased(tmp_path)
     plain = run_variant(path, [], Variant("as stated"))

@@ -85,7 +85,11 @@ def test_a_source_that_goes_on_has_no_late_columns(tmp_path):
     ("change", "key"),
     [
         (late_by("T_10", 4), "channels.T_10.late="),
-        (lambda table: table.__setitem__("T_left", 1.3 * table["T_left"]), "channels.T_left."),
+        pytest.param(
+            lambda table: table.__setitem__("T_left", 1.3 * table["T_left"]),
+            "channels.T_left.",
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_the_cause_of_a_wrong_column_has_the_key_that_corrects_it(tmp_path, change, key):

@@ -606,7 +606,7 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
         np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_identifier_of_a_fleet_that_has_not_begun():
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2)
     t, z, inputs = samples(fleet, 5)[0]

@@ -30,7 +30,7 @@ def outcome(path, settings, folder):
     return runs.verdict(data), runs.measures(data), output
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_faulty_sensor_counts_only_while_it_is_withheld(faulty):
     found, numbers, _ = outcome(faulty, [], "withheld")
     assert found.level == "do not trust"

@@ -175,9 +175,7 @@ def test_what_is_reported_under_a_transform_says_what_it_is():
 
 def test_bad_questions():
     estimate, _ = run(identifier(a=lp.Normal(0.3, 0.1)))
-    with pytest.raises(
-        lp.errors.ConfigurationError, match=r"no unknown 'b'; there are \['a', 'u'\]"
-    ):
+    with pytest.raises(lp.errors.ConfigurationError, match=r"there are \['a', 'u'\]"):
         estimate["b"].interval()
     with pytest.raises(lp.errors.SpaceError, match="level must lie between 0 and 1"):
         estimate["a"].interval(95)
