@@ -130,7 +130,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
     },
     "EvolutionSpec": {
         "kind": "Kind of the evolution.",
-        "rate": "Of a random walk: growth of the variance per time, in the square of the unit.",
+        "rate": "Of a random walk: standard deviation after one unit of time, growing as sqrt(t).",
         "time": "Of mean reversion: time within which the unknown returns to its prior.",
         "period": "Of a periodic unknown: its period; a time.",
         "harmonics": "Number of harmonics of a periodic unknown.",
