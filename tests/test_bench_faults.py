@@ -191,7 +191,7 @@ def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     assert fed.reasons["leap"] == 2
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_soak_in_small(monkeypatch):
     # Refits of the start take most of the time.
     law = partial(lp.SensitivityLaw, refit=lp.laws.Refit(start=4))

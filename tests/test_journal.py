@@ -384,9 +384,7 @@ class Failing:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", [Rows, AtHand])
-@pytest.mark.parametrize(
-    "first", [2, 40, *(pytest.param(first, marks=pytest.mark.long) for first in (43, 73))]
-)
+@pytest.mark.parametrize("first", [2, 40, 43, 73])
 def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypatch, first, source):
     whole, failing = folders(tmp_path)
     broken = [*rows(40)]

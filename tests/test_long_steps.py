@@ -35,7 +35,7 @@ def closed():
 # --- pauses --------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_pause_of_a_hundred_million_substeps_ends_and_moves_nothing(tmp_path: Path) -> None:
     """The rod comes to rest in it; after it, it is heated as before."""
     times, values = rod()

@@ -61,7 +61,7 @@ def test_the_right_model_raises_no_doubts():
     assert measures(data)["innovation_ratio"] == pytest.approx(1.0, abs=0.3)
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_a_process_that_is_missing_is_said():
     found = doubts(run(rod(lp.Normal(0.2, 0.1)), rod(lp.Normal(0.2), loss=1.0)))
     assert any("Model misfit" in text for text in found[:2])

@@ -283,13 +283,7 @@ def test_every_law_is_among_the_cases():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.long) if name == "sensitivity, large square" else name
-        for name in CASES
-    ],
-)
+@pytest.mark.parametrize("name", CASES)
 def test_identifiers_of_one_model_step_in_threads(name):
     case = CASES[name]
     model = case.model()
