@@ -80,7 +80,7 @@ def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
 def test_the_program_finds_the_fault_from_a_case_and_from_a_run(biased):
     code, output = call("run", biased, "--out", "run")
     assert code == 0, output
-    assert "add --data FILE" in bad("compare", "run")  # the copy in its directory knows no table
+    assert "Add --data FILE" in bad("compare", "run")  # the copy in its directory knows no table
     data = ["--data", biased.parent / "rod.csv"]
     for what in ([biased], ["run", *data]):
         code, output = call("compare", *what, "--json", "--most", "4")
