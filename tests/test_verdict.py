@@ -214,7 +214,7 @@ def test_the_verdict_turns_back_when_a_fault_is_mended():
     assert "trusted" not in levels[begin + 40 : end]
     assert levels[-1] == "trusted"
     assert estimate.verdict.findings[0].what == "past"
-    assert "in the last" in estimate.verdict.sentences[0]
+    assert "Earlier data did not fit the model. The last" in estimate.verdict.sentences[0]
 
 
 @pytest.mark.slow
