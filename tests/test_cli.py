@@ -127,7 +127,8 @@ def test_init_check_run_report(here):
     code, output = call("init", "mine")
     assert code == 0
     assert "livepde run mine/case.toml" in output
-    assert {p.name for p in (here / "mine").iterdir()} == {"case.toml", "rod.csv"}
+    made = {p.name for p in (here / "mine").iterdir()}
+    assert made == {"case.toml", "rod.csv", "livepde.schema.json"}
 
     code, output = call("check", "mine/case.toml")
     assert code == 0
@@ -273,7 +274,7 @@ def test_json_lines_file_can_be_checked(rod, here):
     for arguments in (("--data", "data.jsonl"), ("--set", f"data.file={here}/data.jsonl")):
         code, output = call("check", rod, *arguments, "--advise")
         assert code == 0
-        assert "30 samples can tell" in output
+        assert "that 30 samples allow" in output
         assert "One more sensor helps most at" in output
 
 

@@ -60,7 +60,8 @@ def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
         kept = reader.layout.dataset(list(reader))
     # The last estimate of the result is that of the final fit; the journal has its fields.
     kept, told = (data.isel(time=slice(-1)) for data in (kept, found))
-    xr.testing.assert_identical(kept.assign_attrs(verdict=told.attrs["verdict"]), told)
+    told = told[list(kept)]  # without what is computed from these
+    xr.testing.assert_identical(kept.drop_attrs(), told.drop_attrs())
 
 
 @pytest.mark.long
