@@ -123,7 +123,7 @@ def test_template_runs_and_finds_the_truth(tmp_path):
     assert count == 181
     (row,) = rows
     assert row.left < 0.01
-    assert not row.hardly
+    assert not row.not_identifiable
 
 
 @pytest.mark.slow

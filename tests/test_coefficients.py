@@ -20,7 +20,7 @@ def per_capacity(q):
     return {"diffusivity": q.k / q.C, "per_capacity": 1 / q.C}
 
 
-def rod(named: bool, **options):
+def rod(named: bool, unknowns=UNKNOWNS, **options):
     state = lp.Field(
         lp.interval(0.0, 1.0, 12), lp.linear(lp.interval(0.0, 1.0, 12)), dirichlet={"right": 0.0}
     )
@@ -29,13 +29,13 @@ def rod(named: bool, **options):
             lambda q, u, v, x: q.diffusivity * lp.dot(lp.grad(u), lp.grad(v)),
             lp.On("left", lambda q, _, v, x: -x.inputs["Q"] * q.per_capacity * v),
         ]
-        options["coefficients"] = per_capacity
+        options.setdefault("coefficients", per_capacity)
     else:
         A = [
             lambda q, u, v, x: q.k / q.C * lp.dot(lp.grad(u), lp.grad(v)),
             lp.On("left", lambda q, _, v, x: -x.inputs["Q"] / q.C * v),
         ]
-    return lp.Model(state, UNKNOWNS, A, inputs=["Q"], **options)
+    return lp.Model(state, unknowns, A, inputs=["Q"], **options)
 
 
 def estimates(model):
@@ -122,6 +122,19 @@ def test_both_forms_of_a_ready_made_equation_agree(model, q):
     np.testing.assert_allclose(
         slopes, model.physical_A.matrix("v", "q", q=q, **at).toarray(), rtol=1e-11, atol=1e-13
     )
+
+
+def test_an_unknown_that_varies_in_space_is_evaluated_at_each_step():
+    k = lp.Piecewise({"in": lambda x: x[0] < 0.5, "out": lambda x: x[0] >= 0.5}, UNKNOWNS["k"])
+    models = [rod(named, unknowns={"k": k, "C": UNKNOWNS["C"]}) for named in (True, False)]
+    assert not any(isinstance(member_stage(model), BandedStage) for model in models)
+    found, expected = map(estimates, models)
+    np.testing.assert_allclose(found.q, expected.q, rtol=1e-10)  # 1/C Q and Q/C round differently
+
+
+def test_a_name_is_that_of_one_coefficient():
+    with pytest.raises(ModelError, match="'k' is an unknown"):
+        rod(named=True, coefficients=lambda q: {"k": q.k / q.C})
 
 
 def test_what_does_not_fit_is_refused():

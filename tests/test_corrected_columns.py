@@ -175,3 +175,10 @@ def test_a_late_column_is_compared_with_the_readings_that_it_uses(tmp_path):
     assert late.gained(base) > GAINED
     assert late.same_readings == pytest.approx(base.log_evidence, rel=0.1)
     assert recommended(base, [late]) is late
+
+
+def test_a_late_column_that_loses_nothing_is_compared_with_the_case(tmp_path):
+    path = changed(tmp_path, late_by("T_10", 3))
+    step = pd.read_csv(path.parent / "rod.csv").iloc[:, 0].diff().median()
+    late = run_variant(path, (), Variant("late", (f'channels.T_10.late="{3 * step} s"',)))
+    assert late.same_readings is None

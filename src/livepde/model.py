@@ -126,9 +126,10 @@ class Model(Shown):
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
     coefficients
-        Function q -> {name: number} of further numbers that A reads as q.name. They are computed
-        from unknowns that are numbers, as in lambda q: {"diffusivity": q.k / q.C}. If A is linear
-        in unknowns and these numbers, a step is as fast as if it were linear in the unknowns.
+        Function q -> {name: value} of further coefficients that A reads as q.name, computed from
+        the unknowns, as in lambda q: {"diffusivity": q.k / q.C}. If all of them are numbers and A
+        is linear in unknowns and coefficients, a step is as fast as with an A that is linear in the
+        unknowns. If an unknown in them varies in space, A is evaluated at each step.
 
     Notes
     -----
@@ -191,12 +192,12 @@ class Model(Shown):
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
         # A in the parameter as forms see it; `form_A` is the same in latent coefficients.
-        # Numbers computed from the unknowns, None if there are none, and A in both.
-        self.coefficients = self._coefficients(coefficients, dA)
-        if self.coefficients is None:
-            self.physical_A = self.linear_A = self._form("A", A, triple, "u", dA, "q")
-        else:
-            self.physical_A = self._form("A", self.coefficients.expanded(A), triple, "u", None, "q")
+        computed = self._coefficients(coefficients, dA)
+        terms = A if computed is None else computed.expanded(A)
+        self.physical_A = self.linear_A = self._form("A", terms, triple, "u", dA, "q")
+        # Numbers computed from the unknowns, and A in both; None if there are none.
+        self.coefficients = computed if computed is not None and computed.numeric else None
+        if self.coefficients is not None:
             more = triple | {"q": self.coefficients.space}
             self.linear_A = self._form("A", A, more, "u", None, "q")
         self.form_A = compose(self.physical_A, self.latent)
@@ -288,7 +289,8 @@ class Model(Shown):
             raise ModelError(f"coefficients require {what}.")
         typical = self.latent.value(self.latent.prior)
         found = Coefficients(self.parameter_space, function, typical)
-        _ = found.space  # fails here, not in a step
+        if taken := sorted(set(found.names) & set(self.parameter_space.names)):
+            raise ModelError(f"coefficients: '{taken[0]}' is an unknown; choose another name.")
         return found
 
     def with_unknowns(self, more: Mapping[str, Unknown]) -> Model:

@@ -57,7 +57,7 @@ class Identified:
         return self.posterior / self.prior
 
     @property
-    def hardly(self) -> bool:
+    def not_identifiable(self) -> bool:
         """True if the sensors do not identify it."""
         return self.left > FLAT
 

@@ -97,8 +97,8 @@ class VariantRun:
     readings
         Sensor that it assimilates -> number of the readings that are assimilated.
     same_readings
-        Log evidence of the case itself with these readings, where late channels leave some out;
-        else NaN.
+        Log evidence of the case itself with these readings, NaN if it has not all of them; None if
+        they are those of the case, since no late channel leaves some out.
     misfits
         Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
         one step ahead, second half of the samples.
@@ -116,7 +116,7 @@ class VariantRun:
     verdict: Mapping[str, Any] = field(default_factory=dict)
     log_evidence: float = math.nan
     readings: Mapping[str, int] = field(default_factory=dict)
-    same_readings: float = math.nan
+    same_readings: float | None = None
     misfits: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     withheld: Mapping[str, float] = field(default_factory=dict)
@@ -150,11 +150,11 @@ class VariantRun:
 
     def gained(self, base: VariantRun) -> float:
         """Return log evidence minus that of the case itself; NaN if other readings count."""
-        if self.error:
+        if self.same_readings is not None:
+            return self.log_evidence - self.same_readings
+        if self.error or dict(self.readings) != dict(base.readings):
             return math.nan
-        if dict(self.readings) == dict(base.readings):
-            return self.log_evidence - base.log_evidence
-        return self.log_evidence - self.same_readings
+        return self.log_evidence - base.log_evidence
 
     def apart(self, base: VariantRun) -> list[str]:
         """Return the unknowns whose intervals in both runs have no point in common."""
@@ -252,11 +252,11 @@ def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Res
     return result
 
 
-def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float:
+def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> float | None:
     """Return the log evidence of the case as stated with the readings that a variant has used.
 
-    A late channel loses its first readings, or those of others before it begins. NaN if they
-    cannot be told apart.
+    A late channel loses its first readings, or those of others before it begins. None if the
+    variant uses all; NaN if the case has not all readings of the variant.
     """
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
@@ -274,6 +274,8 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
         width = SAME * max(float(np.ptp(table.t)), 1.0)
         low, high = known.t[used][0] + shift - width, known.t[used][-1] + shift + width
         values[(table.t < low) | (table.t > high), table.names.index(name)] = np.nan
+    if np.array_equal(values, table.values, equal_nan=True):
+        return None
     run = _run(stated, replace(table, values=values), columns=False)
     own = _ended(Variant(AS_STATED), stated, run.to_xarray())
     return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan

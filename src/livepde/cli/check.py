@@ -142,7 +142,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
             _percent(item.left),
             *([_percent(late[item.name])] if item.name in late else []),
             item.unit,
-            "not identifiable" if item.hardly else "",
+            "not identifiable" if item.not_identifiable else "",
         )
         for item in found.unknowns
     ]
@@ -155,7 +155,7 @@ def _show_preview(console: Console, prepared: Prepared) -> Sequence[str]:
     unidentified = [
         f"`{item.name}` is not identifiable from these data. {LONGER_DATA}"
         for item in found.unknowns
-        if item.hardly
+        if item.not_identifiable
     ]
     return [*unidentified, *found.sentences]
 

@@ -52,10 +52,27 @@ class Coefficients:
     typical: Array
 
     @cached_property
+    def _computed(self) -> Mapping[str, Any]:
+        """Values for typical unknowns; arrays of those that are computed from more than numbers."""
+        seen = vars(numbers(self.parameter, self.typical))
+        # Regions of one unknown and nodes of another have no common shape.
+        one = {name: v[:1] if isinstance(v, np.ndarray) else v for name, v in seen.items()}
+        return self.function(Named(**one))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the numbers."""
+        return list(self._computed)
+
+    @property
+    def numeric(self) -> bool:
+        """False if one of them varies in space, since an unknown does that it is computed from."""
+        return all(np.ndim(value) == 0 for value in self._computed.values())
+
+    @cached_property
     def space(self) -> FunctionSpace:
         """Space of the unknowns and of the numbers, of dimension p."""
-        names = self.function(numbers(self.parameter, self.typical))
-        more = dict.fromkeys(names, Normal(0.0, std=1.0))
+        more = dict.fromkeys(self.names, Normal(0.0, std=1.0))
         return FunctionSpace.of({**self.parameter.unknowns, **more}, "q")
 
     def value(self, q: Array) -> Array:
