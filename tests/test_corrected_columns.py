@@ -127,7 +127,7 @@ def test_a_channel_without_values_may_be_late(tmp_path):
 
 
 def test_a_sensor_between_the_rows_of_the_others_changes_no_input(tmp_path):
-    """Half an interval late: its readings have rows of their own, inputs are as before."""
+    """Half an interval late: its readings get separate rows, and inputs do not change."""
     plain = read(short_rod(tmp_path / "plain", ROWS))
     step = float(np.median(np.diff(plain.index)))
     found = read(short_rod(tmp_path / "late", ROWS), **{"channels.T_10.late": f"{step / 2} s"})

@@ -455,11 +455,10 @@ class Live:
                 known = self._untold[-1].t if self._untold else self._put_last
                 if last is not None and last.t > known:
                     self._untold.append(last)
-            except Exception:
+            except Exception:  # laws and sensors of a user may raise anything
                 if not self._unread:
                     raise
-                # Laws and sensors of one's own may raise anything, in a step or when an estimate
-                # is read. One by one it belongs to its own sample, and is treated as such.
+                # Processed one by one, the error is that of a single sample, which is skipped.
                 self._one_at_a_time()
 
     def _go_on(self) -> None:

@@ -38,7 +38,7 @@ class Allowed:
     wider
         Width over that of the noise alone.
     of_sensor
-        Whether it belongs to a sensor, as an offset does, or corrects an input.
+        Whether it is an error of a sensor, such as an offset, or a correction of an input.
     """
 
     label: str
