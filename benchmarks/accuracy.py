@@ -28,15 +28,14 @@ from benchmarks.scoring import (
     step_ratio,
     table_of,
 )
+from livepde.diagnostics.check_report import Check
 from livepde.errors import LivepdeError
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, GradientLaw, Refit, ResidualDamping, SensitivityLaw
 from livepde.linalg import Array
 from livepde.observation import Discrepancy, Observation, Tikhonov
-from livepde.runs.outcome import Check, Outcome
+from livepde.runs.outcome import Outcome
 from livepde.stepping import StepFailed
-
-__all__ = ["LAWS", "ROWS", "accuracy", "run_law"]
 
 LawBuilder: TypeAlias = Callable[[Data], tuple[Observation, AnyLaw] | None]
 

@@ -34,8 +34,6 @@ from livepde.reproduce import seed_excited
 from livepde.runs import Check, Outcome, Table, drive, unexplained
 from livepde.stepping import Advance, simulate
 
-__all__ = ["PROCESSES", "SUSPECTS", "Process", "Suspect", "Told", "alarms", "followed", "warned"]
-
 JUMP = 0.2  # relative change of the coefficient
 NOISE = 0.01  # of the root mean square of the data
 STEP = 0.05  # between two samples

@@ -19,13 +19,12 @@ import numpy as np
 
 from benchmarks import partial, scale
 from benchmarks import step as steps
+from livepde.diagnostics.check_report import Check, Table
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["COSTS", "LEVELS", "SEEDS", "SIZES", "auto"]
+from livepde.runs.outcome import Outcome
 
 SIZES = (64, 256, 1024, 2500, 10_000)  # nodes of the square
 LEVELS = (0.0, 1e-3, 1e-2)  # noise over the root mean square of the readings

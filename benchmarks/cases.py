@@ -23,19 +23,18 @@ import xarray as xr
 from threadpoolctl import threadpool_limits
 
 from livepde.cases import Prepared, load
+from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import CaseError, LivepdeError
 from livepde.laws import Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.progress import watched
-from livepde.result import Result, unknown_of
+from livepde.readout import unknown_of
+from livepde.result import Result
 from livepde.runs import Check, Outcome, Table, measures, verdict
 from livepde.runs.directory import markdown
-from livepde.runs.outcome import Bound, Sense
 from livepde.runs.summary import digits, shown
 from livepde.stepping import ForwardStage, Interval, advance
 from livepde.verdict import MOST
-
-__all__ = ["Job", "Run", "bench_cases", "find_cases", "gallery", "jobs_of", "run_job"]
 
 GALLERY = """\
 # Gallery

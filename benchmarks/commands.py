@@ -15,8 +15,6 @@ from livepde.cli.options import JsonOption
 from livepde.cli.printing import named, report_outcome
 from livepde.runs.outcome import Outcome
 
-__all__ = ["Count", "Program", "Workers", "chosen", "several"]
-
 Measurement: TypeAlias = Callable[..., Outcome]
 
 Out = Annotated[

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.jobs import each
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import (
     Field,
     Inputs,
@@ -40,10 +41,8 @@ from livepde.observation import Points
 from livepde.plots import NORMAL_95
 from livepde.result import Estimate
 from livepde.runs import unexplained
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, Alexander2, ForwardStage, Interval, advance
-
-__all__ = ["PROBLEMS", "Problem", "Twin", "coverage", "twin"]
 
 LEVELS = (0.68, 0.95)
 WITHIN = {0.68: (0.60, 0.76), 0.95: (0.90, 0.98)}  # what the shares over 200 twins have to lie in

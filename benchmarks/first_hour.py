@@ -32,9 +32,8 @@ from benchmarks.honest.linear import Linear, diffusion, fine_times
 from benchmarks.honest.problems.borehole import Borehole
 from benchmarks.jobs import each
 from livepde.cases import load
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["FOLDER", "TABLES", "WALKS", "first_hour", "save", "write"]
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"

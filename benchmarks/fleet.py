@@ -12,6 +12,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Channel, LogNormal, interval
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
@@ -20,10 +21,8 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import heat
 from livepde.observation import Points
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, simulate
-
-__all__ = ["fleet"]
 
 NODES = 100
 SENSORS = (0.2, 0.4, 0.6, 0.8)

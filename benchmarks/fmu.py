@@ -19,6 +19,7 @@ import numpy as np
 
 from livepde.cases import Case, load
 from livepde.cases.new_case import write_template
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError, RunError
 from livepde.exchange import export_fmu
 from livepde.exchange.unit_process import UnitProcess, of_case
@@ -26,10 +27,8 @@ from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.records import STATUS_CODES
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.samples import Sample
-
-__all__ = ["Comparison", "Instance", "compare_fmu", "fmu", "running"]
 
 CLOSE = 1e-10  # relative difference of any output, between the unit and the identifier
 

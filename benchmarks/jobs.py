@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 
 from livepde.progress import watched
 
-__all__ = ["each"]
-
 Job = TypeVar("Job", bound=tuple[Any, ...])
 T = TypeVar("T")
 

@@ -21,8 +21,6 @@ from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.live_loop import Live
 
-__all__ = ["journal"]
-
 CASE = "soil_uniform"
 REPETITIONS = 5
 BOUND = 0.2  # of a step

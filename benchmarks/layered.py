@@ -16,8 +16,6 @@ import numpy as np
 from livepde.fem import Channel, Field, Normal, Piecewise, dot, grad, interval, linear, rectangle
 from livepde.model import Model
 
-__all__ = ["ENDS", "POINTS", "PRIOR", "STD", "STEP", "ends_at", "plate", "rod"]
-
 ENDS = ("source", "channels")
 POINTS = (0.2, 0.4, 0.6, 0.8)
 STEP = 2.0**-8  # a binary number: the differences of all times are exactly this

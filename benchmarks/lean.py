@@ -23,8 +23,6 @@ from livepde.fem import Moment
 from livepde.linalg import Array, Assembler, IntArray, Pattern, compact
 from livepde.model import Model
 
-__all__ = ["Filter", "Matrices", "NotAffineError", "assembled", "initial", "step"]
-
 Factor: TypeAlias = tuple[Array, IntArray]
 
 

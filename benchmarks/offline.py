@@ -26,8 +26,6 @@ from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Advance, ForwardStage, Interval, StepFailed, advance
 
-__all__ = ["Fit", "Trajectory", "fit"]
-
 EVALUATIONS = 60  # at most
 LOST = 1e4  # residual, in standard deviations, where the forward model cannot be computed
 

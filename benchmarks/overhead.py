@@ -30,8 +30,6 @@ from livepde.result import Estimate
 from livepde.runs import JOURNAL, Check, Outcome, Table, drive
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
-__all__ = ["overhead", "rod"]
-
 SAMPLES = 2000
 RATIO = 1.4  # livepde run over Identifier.step in a loop, per sample
 FIRST = 0.8  # seconds of processor time until the first estimate after a step

@@ -24,6 +24,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.sparse.linalg import splu
 
 from benchmarks.jobs import each
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LawError
 from livepde.fem import Field, Normal, Scalar, Sobolev, dot, grad, interval, linear, rectangle
 from livepde.identifier import Identifier
@@ -31,9 +32,6 @@ from livepde.laws import GradientLaw, ResidualDamping
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Subdomain
-from livepde.runs.outcome import Check, Table
-
-__all__ = ["PROCESSES", "Reaction", "Readings", "best", "follow", "omega", "partial", "refused"]
 
 D = 0.1
 END, STEP = 10.0, 0.05

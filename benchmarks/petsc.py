@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import ROOT
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
 from livepde.petsc import DolfinxModel, ImplicitStep, PetscFilter, PetscObserver, number_modes
 from livepde.petsc.vectors import gathered
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["petsc"]
+from livepde.runs.outcome import Outcome
 
 STEP = 0.05
 FIRST = 2  # samples before the clock starts: preconditioners are made

@@ -9,8 +9,6 @@ from typing import TypeVar
 
 from livepde.progress import watched
 
-__all__ = ["shown"]
-
 T = TypeVar("T")
 
 PAUSE = 30.0  # seconds between two lines

@@ -24,6 +24,7 @@ import scipy.sparse.linalg as spla
 
 from benchmarks import lean
 from benchmarks.layered import ENDS, POINTS, STEP, ends_at, plate, rod
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Inputs, Moment
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
@@ -31,10 +32,8 @@ from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler, simulate
-
-__all__ = ["EARLIER", "RODS", "SIZES", "Rod", "fleet", "forward_times", "lean_forward", "rods"]
 
 SIZES = (31, 200, 1_000, 10_000)
 SQUARE = 10_000  # nodes, from which the process is a square

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import ROOT
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
 from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
@@ -35,7 +36,7 @@ from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 __all__ = [

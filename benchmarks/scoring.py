@@ -13,25 +13,12 @@ import numpy as np
 
 from benchmarks.offline import Trajectory
 from benchmarks.problems import WARM_UP, Data
+from livepde.diagnostics.check_report import Table
 from livepde.errors import LivepdeError
 from livepde.fem import FieldBlock
 from livepde.linalg import Array
 from livepde.plots import NORMAL_95
-from livepde.runs.outcome import Table
 from livepde.stepping import StepFailed
-
-__all__ = [
-    "Contender",
-    "Found",
-    "Judge",
-    "Known",
-    "Score",
-    "error_ratio",
-    "measured",
-    "scored",
-    "step_ratio",
-    "table_of",
-]
 
 QUICK = 1.0  # s
 TIMES = 11  # in the second half, at which a parameter that moves is scored

@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.fleet import NODES, NOISE, SENSORS, STEP
 from livepde.atomic_write import write_bytes
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Channel, LogNormal, interval
 from livepde.fleet import Shard
 from livepde.laws import SensitivityLaw
@@ -23,10 +24,8 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import heat
 from livepde.observation import Points
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, simulate
-
-__all__ = ["shard"]
 
 SIZE = 250  # members of a shard: a step of more takes more memory at a time
 TRUTHS = 20  # rods of other coefficients; each member has noise of its own

@@ -31,7 +31,7 @@ from livepde.fem import (
     interval,
     linear,
 )
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.laws import Jumps, SensitivityLaw
 from livepde.model import Model
 from livepde.observation import Points
@@ -40,9 +40,8 @@ from livepde.runs import Check, Journal, Outcome, Table, journal_of
 from livepde.runs.database import log_of
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.live_loop import Live, Retention
+from livepde.samples import Sample
 from livepde.stepping import Advance, simulate
-
-__all__ = ["soak"]
 
 STEPS = 1_000_000
 WARM = 10_000  # steps before memory is looked at

@@ -15,9 +15,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["BASE", "SCRIPT", "startup"]
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 
 BASE = "import scipy.sparse.linalg, skfem"
 IMPORT = "import livepde"

@@ -17,6 +17,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Field, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, GradientLaw, ResidualDamping, SensitivityLaw, Shadows
@@ -24,10 +25,8 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Points, Subdomain
 from livepde.reproduce import seed
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, Scheme, simulate
-
-__all__ = ["MODES", "SIZES", "first_steps", "problem", "step"]
 
 SIZES = (31, 1_000, 10_000, 100_000)  # nodes
 MODES = (1, 10, 50)  # reduced unknowns of the sensitivity law

@@ -16,13 +16,12 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from benchmarks.rods import Rod, forward_times
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array, Mask
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["BOUNDS", "MEMBERS", "RUNS", "usual_step"]
+from livepde.runs.outcome import Outcome
 
 BOUNDS: dict[tuple[int, int], float] = {
     (31, 2): 9.0,

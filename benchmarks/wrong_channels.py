@@ -18,10 +18,9 @@ from benchmarks import ROOT
 from benchmarks.first_hour import FOLDER, TABLES, save
 from benchmarks.jobs import each
 from livepde.cases import load
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 from livepde.verdict import Verdict
-
-__all__ = ["FAULTS", "Fault", "first_named", "with_fault", "wrong_channels"]
 
 Array = NDArray[Any]
 NAMED = 0.8  # of the runs

@@ -27,6 +27,7 @@ import numpy as np
 
 from experiments.manufactured import Manufactured
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Field, dot, grad, interval, linear
 from livepde.laws import ResidualDamping
 from livepde.linalg import Array
@@ -35,11 +36,9 @@ from livepde.progress import watched
 from livepde.reproduce.experiment import failures
 from livepde.reproduce.seed_excited import q_true, u_true
 from livepde.result import Estimate, Result
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
-
-__all__ = ["degenerate"]
 
 CELLS = 20
 OMEGA = 0.3

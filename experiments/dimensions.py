@@ -34,6 +34,7 @@ from typing import Any, Literal
 import numpy as np
 
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import (
     Field,
     FieldBlock,
@@ -52,12 +53,10 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce.experiment import track
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 from livepde.streams.twin import Truth
-
-__all__ = ["dimensions"]
 
 GAIN = 1e5
 STEP, END = 0.05, 1.5

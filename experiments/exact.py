@@ -27,6 +27,7 @@ from experiments.reference_settings import FULL, PAPER, SETTINGS, TWIN
 from experiments.strict import QUICK, apart_table
 from experiments.strict import SETTINGS as UNFINISHED
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.diagnostics.constants import Spaces, constants
 from livepde.fem import START, Field, Moment, Normal, dot, grad, hermite, line, linear
 from livepde.identifier import Identifier
@@ -43,10 +44,8 @@ from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.observation.reconstruction import Pseudoinverse, Tikhonov
 from livepde.progress import watched
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, Newton
-
-__all__ = ["Agreement", "LawRun", "ReferenceSamples", "compare", "exact", "follow", "growth", "law"]
 
 
 class Loaded(Model):

@@ -6,8 +6,6 @@ import sys
 
 from livepde.result import Estimate
 
-__all__ = ["FailedSteps"]
-
 
 class FailedSteps:
     """A count of failed steps, over all runs of a study.

@@ -11,8 +11,6 @@ from livepde.fem import START, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 
-__all__ = ["Manufactured"]
-
 
 class Manufactured(Model):
     """A model with a discrete source, F_k = M (U_k - U_{k-1})/h + B(U_k) + A(U_k) q*.

@@ -32,17 +32,6 @@ import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 
-__all__ = [
-    "Discretisation",
-    "LineSpace",
-    "Setting",
-    "Step",
-    "Trajectory",
-    "fitted",
-    "residuals",
-    "run",
-]
-
 Array: TypeAlias = NDArray[np.float64]
 Kind: TypeAlias = Literal["constant", "P1", "hermite"]
 Ends: TypeAlias = Literal["free", "zero", "clamped"]

@@ -10,8 +10,6 @@ import numpy as np
 
 from experiments.reference import Setting
 
-__all__ = ["FULL", "PAPER", "SETTINGS", "TWIN", "VARYING", "scaled"]
-
 
 def paper_q(x: Any) -> Any:
     """Parameter q* of section 4."""

@@ -30,8 +30,6 @@ from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton
 
-__all__ = ["BaumeisterLaw", "KueglerLaw"]
-
 
 @dataclass(frozen=True)
 class _Linear(Damping):

@@ -16,15 +16,14 @@ from typing import Any
 
 from experiments.related_laws import BaumeisterLaw, KueglerLaw
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LawError
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, ResidualDamping
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Track, failures, track
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["EXPECTED", "LAWS", "law", "relatives"]
+from livepde.runs.outcome import Outcome
 
 PULLS = (0.1, 1.0, 10.0)
 SOURCES: dict[str, tuple[Any, float]] = {  # problem -> (module, gain)

@@ -21,18 +21,17 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
-from livepde.identifier import Sample
 from livepde.laws import ResidualDamping
 from livepde.linalg import Array
 from livepde.observation import Discrepancy, Full, Pseudoinverse, Tikhonov
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.reproduce.experiment import failures
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
+from livepde.samples import Sample
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
-
-__all__ = ["NoisyRun", "WhiteNoise", "noisy_run", "seed_excited_noise"]
 
 Kind = Literal["white", "nodal"]
 

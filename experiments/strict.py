@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Field, dot, grad, interval, linear, maximum, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
@@ -22,11 +23,8 @@ from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.paper import STRICT
 from livepde.progress import watched
-from livepde.runs.outcome import Check, Table
 from livepde.stepping import ImplicitEuler, Newton
 from livepde.streams import RelativeNoise, Twin
-
-__all__ = ["QUICK", "SETTINGS", "Apart", "Square", "apart", "apart_table"]
 
 TIMES = 0.05 * np.arange(101)
 CELLS = {1: 30, 2: 8}

@@ -33,8 +33,9 @@ from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.visitors import IN_MEMORY, LONGEST_BODY, THREADS
 from livepde.runs.web import Address, Server
 from livepde.streams.clock import Clock
+from livepde.streams.growing_file import LONGEST
 from livepde.streams.intake import Intake
-from livepde.streams.sources import LONGEST, Follow, Lines, Rows, json_row
+from livepde.streams.sources import Follow, Lines, Rows, json_row
 from livepde.streams.table import Column
 
 TOKEN = "long-enough-to-be-a-token"

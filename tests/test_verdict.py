@@ -408,8 +408,9 @@ def test_what_was_not_judged_is_judged_from_where_it_is_taken_up():
 @pytest.mark.slow
 def test_a_census_knows_what_the_unknowns_take_up():
     from benchmarks.census import FAULTS
-    from benchmarks.census.run import TRUTHS, scene_of
+    from benchmarks.census.run import scene_of
     from benchmarks.census.trace import VISIBLE, trace
+    from benchmarks.honest.problems import PROBLEMS as TRUTHS
 
     traces = {}
     for name in ("rod", "borehole"):

@@ -15,8 +15,6 @@ from benchmarks.census import rods
 from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS
 
-__all__ = ["FAULTS", "Fault", "Scene", "shortened"]
-
 Array = NDArray[Any]
 HALF = 0.5  # of the run, when what is sudden begins
 

@@ -10,12 +10,11 @@ from scipy.stats import spearmanr
 
 from benchmarks.census.faults import FAULTS
 from benchmarks.census.trace import VISIBLE
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 
 if TYPE_CHECKING:
     from benchmarks.census.run import Score
-
-__all__ = ["outcome"]
 
 WRONG = 3.0  # standard deviations
 SILENT = 0.01  # share of all runs that are wrong and trusted, at most

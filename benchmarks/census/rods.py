@@ -11,8 +11,6 @@ from scipy.integrate import solve_ivp
 from benchmarks.honest.linear import Chebyshev, Linear, fine_times
 from benchmarks.honest.problem import Problem
 
-__all__ = ["advected", "averaged", "contact", "cooled_late", "heated_late", "nonlinear"]
-
 Array = NDArray[np.float64]
 DEGREE = 40
 SPACE = Chebyshev(DEGREE)

@@ -20,8 +20,6 @@ from benchmarks.jobs import each
 from livepde.runs.outcome import Outcome
 from livepde.verdict import Finding, Verdict
 
-__all__ = ["PROBLEMS", "QUICK", "Score", "census", "scene_of"]
-
 PROBLEMS = ("rod", "column", "wall", "profile", "plate", "flux", "warm-rod", "borehole")
 QUICK = ("rod", "column", "profile", "plate", "warm-rod")
 STATED = (1.0, 3.0, 1.0 / 3.0)

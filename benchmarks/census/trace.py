@@ -11,8 +11,6 @@ from benchmarks.census.faults import Array, Scene
 from benchmarks.honest.batch import Batch
 from benchmarks.honest.problem import Problem, Signal
 
-__all__ = ["VISIBLE", "trace"]
-
 VISIBLE = 8.0
 """Trace from which a fault can show, in standard deviations of the noise. A direction of a
 dictionary of 100 in two kinds of windows reaches an e-value of 200 at about five standard errors,

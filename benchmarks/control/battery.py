@@ -31,8 +31,6 @@ from livepde.models.battery import FARADAY
 from livepde.observation import Functionals, Points, Transformed
 from livepde.stepping import Alexander2
 
-__all__ = ["battery", "graphite"]
-
 RADIUS, AREA, FULL = 5e-6, 1.0, 30555.0  # m, m^2, mol/m^3
 CAPACITY = FARADAY * FULL * AREA * RADIUS / 3  # C, of the particle from empty to full
 ONE = CAPACITY / 3600.0  # A, that fills it in an hour

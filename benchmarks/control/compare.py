@@ -16,11 +16,9 @@ from benchmarks.control.problem import Problem
 from benchmarks.control.runs import Run, closed_loop, learned, nominal, offset_free, told
 from livepde import plots
 from livepde.control import LQ, MPC, Controller, Estimator
+from livepde.diagnostics.check_report import Table
 from livepde.linalg import Array
 from livepde.progress import watched
-from livepde.runs.outcome import Table
-
-__all__ = ["FIXED", "HORIZONS", "LEARNED", "OFFSET", "TRUE", "Comparison", "compare"]
 
 TRUE = "true model"
 FIXED = "wrong fixed model"

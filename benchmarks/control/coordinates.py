@@ -14,8 +14,6 @@ from benchmarks.control.problem import Problem
 from livepde.control import ReducedModel
 from livepde.linalg import Array
 
-__all__ = ["Coefficients", "Coordinates"]
-
 FLOOR = 1e-3  # process noise of each coordinate, relative to the largest
 
 

@@ -17,9 +17,7 @@ from livepde.control.mpc import packages, quiet
 from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed
-from livepde.result import unknown_of
-
-__all__ = ["MovingHorizon", "Setting"]
+from livepde.readout import unknown_of
 
 RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # of two stages, the second at the end
 QUIET = {

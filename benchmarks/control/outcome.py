@@ -17,11 +17,10 @@ from benchmarks.control.horizon import Setting
 from benchmarks.control.problem import Problem
 from benchmarks.control.rod import rod
 from benchmarks.control.wall import wall
+from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.runs.outcome import Check, Outcome
-
-__all__ = ["PROBLEMS", "control"]
+from livepde.runs.outcome import Outcome
 
 OF_TRUE = 1.10  # cost over that of the true model, after the jump has been learned
 OF_FIXED = 0.70  # cost over that of the wrong fixed model, then

@@ -16,8 +16,6 @@ from livepde.model import Model
 from livepde.observation import Observation
 from livepde.stepping import ForwardStage
 
-__all__ = ["Plant", "Problem", "Simulated", "Values"]
-
 Values = Callable[[float], Mapping[str, float]]
 """t -> name -> value."""
 

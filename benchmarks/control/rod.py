@@ -22,8 +22,6 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Alexander2
 
-__all__ = ["rod"]
-
 LENGTH = 0.15  # m
 CAPACITY = 3.6e6  # J/(m^3 K): steel
 LOSS = 2000.0  # W/(m^3 K): 10 W/(m^2 K) around a rod of 20 mm

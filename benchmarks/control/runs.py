@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.control.problem import Problem
 from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop
 from livepde.linalg import Array
-from livepde.result import unknown_of
-
-__all__ = ["Run", "Told", "closed_loop", "learned", "nominal", "offset_free", "told"]
+from livepde.readout import unknown_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,6 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Alexander2
 
-__all__ = ["wall"]
-
 HOUR, DAY = 3600.0, 86400.0
 # Name -> end in m, conductivity of the data sheet in W/(m K), heat capacity in J/(m^3 K), cells.
 ROOM: dict[str, tuple[float, float, float, int]] = {

@@ -11,8 +11,6 @@ import numpy as np
 
 from benchmarks.faults.rod import Row
 
-__all__ = ["BYTES", "CSV", "JSON", "broken_line", "csv_line", "json_line"]
-
 LONG_ONES = 0.02  # share of the lines of 2 MB that are written
 
 Break: TypeAlias = Callable[[Row, Callable[[Row], bytes], np.random.Generator], bytes]
@@ -43,6 +41,7 @@ def csv_line(row: Row) -> bytes:
 
 
 def one_of(options: Sequence[Any]) -> Callable[[np.random.Generator], Any]:
+    """Return a draw of one of `options`."""
     return lambda rng: options[int(rng.integers(len(options)))]
 
 

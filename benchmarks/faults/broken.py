@@ -24,15 +24,13 @@ from benchmarks.faults.run import hearing, undisturbed
 from livepde.cases import Case, load
 from livepde.cases.data import data_file, policy_of, source_of
 from livepde.errors import LivepdeError
-from livepde.identifier import Sample
 from livepde.records import Record
 from livepde.runs import Check, Outcome, Table
 from livepde.runs.feeds import Gathered
 from livepde.runs.live_loop import Live
+from livepde.samples import Sample
 from livepde.streams.intake import Intake, IntakeOutcome, Ready
 from livepde.streams.sources import RowSource
-
-__all__ = ["Fed", "broken_messages", "broken_rows", "fed"]
 
 TOGETHER = 100  # messages that are sent before the first of them is acknowledged
 

@@ -17,8 +17,6 @@ from livepde.cases.live_case import LiveCase
 from livepde.runs import Check, Outcome, Table
 from livepde.streams.sources import Rows
 
-__all__ = ["CLOCKS", "clock_faults"]
-
 
 def _moved(rows: Sequence[Row], by: timedelta) -> list[dict[str, Any]]:
     return [{**row, "time": str(datetime.fromisoformat(row["time"]) + by)} for row in rows]

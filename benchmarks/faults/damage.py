@@ -11,8 +11,6 @@ from pathlib import Path
 from livepde.records import Record
 from livepde.runs import JOURNAL, Check, Journal
 
-__all__ = ["Damage", "Found", "same"]
-
 
 @dataclass(frozen=True, eq=False)
 class Found:

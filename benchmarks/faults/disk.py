@@ -23,8 +23,6 @@ from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import JOURNAL, Check, Outcome, Table
 from livepde.runs.database import log_of
 
-__all__ = ["failing_disks"]
-
 FILLED = 4  # times that the disk is full
 SAID = "cannot be written"  # by /health
 BAD_INPUT = 2  # exit code

@@ -16,8 +16,6 @@ from livepde.cases.live_case import LiveCase
 from livepde.runs import Check, Outcome, Table
 from livepde.streams.sources import Follow
 
-__all__ = ["file_faults"]
-
 COUNT, PART, WINDOW = 300, 60, 100  # rows of a file, rows written at a time, rows of a window
 PATIENCE = 60.0  # seconds after which a run that does not look at its file is given up
 

@@ -15,8 +15,6 @@ from livepde.errors import RunError
 from livepde.records import Record
 from livepde.runs import Check, Journal, Outcome, Table
 
-__all__ = ["damaged_journals"]
-
 CUT = 0.25  # share of the journals that are cut off; in the others one bit is changed
 
 

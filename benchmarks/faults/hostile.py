@@ -12,8 +12,6 @@ from benchmarks.faults.plan import Plan
 from benchmarks.faults.rod import case_text
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["HOSTILE", "hostile_case", "hostile_cases"]
-
 SOONEST = 2.0  # seconds of the processor: other programs do not count
 MEMORY = 500e6  # bytes
 PATIENCE = 60.0  # seconds after which a command is ended

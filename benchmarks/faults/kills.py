@@ -24,8 +24,6 @@ from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["KILLED", "kills_of_files", "kills_of_input", "kills_of_topics"]
-
 STRIDE = 0.25  # seconds after a sign of life within which a kill falls
 LEAD = (20, 400)  # rows that are there before they are asked for
 MOMENTS = {"start": 0.25, "step": 0.4, "write": 0.25, "end": 0.1}  # share of the kills

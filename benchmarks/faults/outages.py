@@ -16,8 +16,6 @@ from benchmarks.faults.rod import Row, rod_rows
 from benchmarks.faults.run import Run, hearing, undisturbed
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["outages"]
-
 RESTARTS = 2  # of the broker
 
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from benchmarks.progress import shown
 
-__all__ = ["Plan"]
-
 
 @dataclass(frozen=True)
 class Plan:

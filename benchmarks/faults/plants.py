@@ -19,18 +19,6 @@ import numpy as np
 from benchmarks.faults.rod import STEP, Row
 from livepde.errors import RunError
 
-__all__ = [
-    "BROKER",
-    "PATIENCE",
-    "Feeder",
-    "GrowingFile",
-    "Mosquitto",
-    "Plant",
-    "Topic",
-    "launched",
-    "wait",
-]
-
 PATIENCE = 120.0  # seconds after which a run that does not go on is given up
 BROKER = "/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin:/opt/homebrew/sbin"
 

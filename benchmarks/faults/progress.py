@@ -15,8 +15,6 @@ from benchmarks.faults.rod import STEP, rod_rows
 from benchmarks.faults.run import Run
 from livepde.runs import Check, Outcome, Table
 
-__all__ = ["frequent_kills"]
-
 LIFE = 8.0  # seconds after which a run is killed
 # Name -> substeps of a step, and samples of a run.
 STEPS = {"50 ms": (40, 400), "2 s": (1600, 16)}

@@ -9,8 +9,6 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-__all__ = ["STEP", "Row", "case_text", "rod_rows"]
-
 STEP = 60.0  # seconds from one row to the next
 ALPHA = 2e-5  # m^2/s, of the rod
 SILENCE = 1.0  # seconds after which a source is said to be silent

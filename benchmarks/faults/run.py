@@ -26,8 +26,6 @@ from livepde.errors import RunError
 from livepde.runs import JOURNAL, Journal
 from livepde.runs.database import log_of
 
-__all__ = ["Run", "hearing", "undisturbed", "undisturbed_journal"]
-
 
 class Run:
     """`livepde run` of the case in a folder, as a process that can be killed.

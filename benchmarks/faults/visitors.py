@@ -12,8 +12,6 @@ from livepde.runs import Check, Outcome, Table
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 
-__all__ = ["slow_visitors"]
-
 VISITORS, ROUNDS = 60, 10
 PAUSE = 0.2  # seconds between two questions
 SOON = 1.0  # seconds

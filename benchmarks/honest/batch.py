@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 
 from benchmarks.honest.problem import Latent, Problem
 
-__all__ = ["Batch"]
-
 Array = NDArray[Any]
 MOST = 8  # Gauss-Newton steps
 HALVINGS = 6

@@ -15,8 +15,6 @@ import numpy as np
 import scipy.linalg as sla
 from numpy.typing import NDArray
 
-__all__ = ["Chebyshev", "Linear", "diffusion", "fine_times"]
-
 Array = NDArray[Any]
 SUBSTEPS = 8  # of an interval between two samples
 SMALL = 1e-3  # |z| below which exp(z) - 1 - z is a series

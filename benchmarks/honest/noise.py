@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from benchmarks.honest.problem import Problem
 
-__all__ = ["KINDS", "Data", "Kind", "disturbed"]
-
 Array = NDArray[Any]
 MISSING = 0.3  # share of the readings of each channel that gaps take
 SPIKES = (9999.0, 50.0)  # a value, and a distance in standard deviations, in turns

@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_banded
 
-__all__ = ["Stiff"]
-
 Array = NDArray[Any]
 SUBSTEPS = 4  # of an interval between two samples
 GAMMA = 2.0 - np.sqrt(2.0)

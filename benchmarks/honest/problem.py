@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 import livepde as lp
 
-__all__ = ["Latent", "Problem", "Signal", "constant", "waves"]
-
 Array = NDArray[Any]
 Signal = Callable[[Array], Array]
 """An input channel as a smooth function of the time; it is read at the samples only."""

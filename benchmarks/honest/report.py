@@ -12,9 +12,8 @@ from scipy.stats import binom
 from benchmarks.honest.noise import KINDS
 from benchmarks.honest.problems import PROBLEMS
 from benchmarks.honest.twin import SHARES, Run
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["ENOUGH", "outcome"]
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 
 Array = NDArray[Any]
 Found: TypeAlias = Mapping[tuple[str, str], Sequence[Run]]

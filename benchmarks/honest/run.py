@@ -12,8 +12,6 @@ from benchmarks.honest.twin import twins
 from benchmarks.jobs import each
 from livepde.runs.outcome import Outcome
 
-__all__ = ["QUICK", "honest"]
-
 QUICK = ("rod", "flux", "column", "borehole")
 """Problems of the quick run."""
 

@@ -20,8 +20,6 @@ from livepde.plots import NORMAL_95, interval_95
 from livepde.stepping import StepFailed
 from livepde.streams import FillGaps
 
-__all__ = ["SHARES", "Run", "Smoothed", "twins"]
-
 Array = NDArray[Any]
 SHARES = (0.10, 0.25, 0.50, 0.75, 1.00)
 """Of the run, after which intervals are looked at."""

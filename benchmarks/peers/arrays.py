@@ -18,8 +18,6 @@ from benchmarks.scoring import Contender, Known, Score, measured
 from livepde.linalg import Array
 from livepde.stepping import Alexander2, ImplicitEuler, Interval
 
-__all__ = ["INFLATIONS", "Ensemble", "Stack", "Unscented", "ensemble", "reference", "unscented"]
-
 INFLATIONS = (1.0, 1.02)  # of the anomalies after each update
 
 

@@ -16,8 +16,6 @@ from livepde.fem import Moment
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage, Interval, StepFailed, advance
 
-__all__ = ["Augmented", "best"]
-
 
 class Augmented:
     """Our forward model as peers want it: x = (free coefficients of u, reduced coordinates a)."""

@@ -10,8 +10,6 @@ from benchmarks.peers.augmented import Augmented, best
 from benchmarks.problems import Data
 from benchmarks.scoring import Known, Score, measured
 
-__all__ = ["ensemble", "unscented"]
-
 INFLATIONS = (1.0, 1.02)  # of the ensemble, after each update
 NUGGETS = (1e-6, 1e-4)  # process noise of the state in the unscented filter, relative to the data
 ALPHAS = (0.1, 1.0)  # spread of its sigma points

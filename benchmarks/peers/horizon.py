@@ -13,8 +13,6 @@ from benchmarks.problems import Data
 from benchmarks.scoring import Known, Score, measured
 from livepde.linalg import Array
 
-__all__ = ["moving_horizon"]
-
 ARRIVALS = (1.0, 10.0, 100.0)  # weight of the parameters' last estimate in the moving horizon
 HORIZON = 10
 SETTINGS: Any = {

@@ -13,8 +13,6 @@ from benchmarks.problems import Data
 from benchmarks.scoring import Judge, Score
 from livepde.reproduce import seed_excited
 
-__all__ = ["network"]
-
 EPOCHS = 10_000  # of the network; in each, other collocation points and values
 COLLOCATION = 500
 BATCH = 500

@@ -26,12 +26,11 @@ from benchmarks.problems import PROBLEMS as ALL
 from benchmarks.problems import Data, Problem
 from benchmarks.problems.rod import ROD, ROD_SOURCE
 from benchmarks.scoring import Contender, Found, Score, scored
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LivepdeError
 from livepde.laws import SensitivityLaw
 from livepde.progress import watched
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["PEERS", "PROBLEMS", "ROWS", "Peer", "peers"]
+from livepde.runs.outcome import Outcome
 
 PROBLEMS: Mapping[str, Problem] = {
     **{problem.name: problem for problem in (ROD, ROD_SOURCE)},

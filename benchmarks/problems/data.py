@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from livepde.fem import Inputs
-from livepde.identifier import Sample
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
+from livepde.samples import Sample
 from livepde.stepping import Advance, ForwardStage, ImplicitEuler, Interval, Scheme, advance
-
-__all__ = ["WARM_UP", "Data", "Problem", "Process"]
 
 WARM_UP = 2  # samples whose time does not count: matrices are built that are built once
 LEVELS = (0.0, 0.01, 0.05, 0.1)

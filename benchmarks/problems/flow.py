@@ -14,8 +14,6 @@ from livepde.models import burgers
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
 
-__all__ = ["FLOW", "SIDES"]
-
 TIMES = np.linspace(0.0, 20.0, 401)
 RATE = 0.1  # deviation of the logarithm per square root of time
 POINTS = [0.25, 0.5, 0.75]

@@ -11,8 +11,6 @@ from benchmarks.problems.data import Problem, Process
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import Twin
 
-__all__ = ["SEED", "SEED_EXCITED"]
-
 
 @cache
 def _twin(experiment: ModuleType, std: float) -> Process:

@@ -14,8 +14,6 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
 
-__all__ = ["PLATE"]
-
 TIMES = np.linspace(0.0, 20.0, 401)
 POINTS = [(x, y) for x in (0.2, 0.5, 0.8) for y in (0.2, 0.5, 0.8)]
 STD = 0.06

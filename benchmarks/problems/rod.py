@@ -12,8 +12,6 @@ from livepde.linalg import Array
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
 
-__all__ = ["ROD", "ROD_SOURCE"]
-
 SAMPLES = 300
 NODES, UNKNOWNS = 101, 4
 

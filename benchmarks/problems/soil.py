@@ -14,8 +14,6 @@ from livepde.cases import load
 from livepde.errors import CaseError
 from livepde.linalg import Array
 
-__all__ = ["SOIL"]
-
 
 @cache
 def _process(_: int) -> Process:

@@ -13,8 +13,6 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.stepping import Advance, Alexander2, simulate
 
-__all__ = ["WALL"]
-
 TIMES = np.linspace(0.0, 240.0, 481)  # h
 LAYERS = {"inner": (0.0, 0.1), "middle": (0.1, 0.2), "outer": (0.2, 0.3)}  # m
 FILM = {"left": 8.0, "right": 20.0}  # W/(m^2 K)

@@ -13,17 +13,6 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-__all__ = [
-    "advection",
-    "cell_stiffness",
-    "interpolation",
-    "mass",
-    "projected",
-    "self_advection",
-    "square",
-    "stiffness",
-]
-
 Array = NDArray[Any]
 
 

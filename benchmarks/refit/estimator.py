@@ -17,8 +17,6 @@ from livepde.errors import LivepdeError
 from livepde.result import Result
 from livepde.stepping import StepFailed
 
-__all__ = ["Fit", "livepde_fit", "plain_seconds"]
-
 Array = NDArray[Any]
 PLAIN = {"refit": None}
 """Options of a filter that takes no sample twice."""

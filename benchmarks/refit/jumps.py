@@ -18,8 +18,6 @@ import livepde as lp
 from benchmarks.refit.elements import interpolation
 from livepde.models import advection_dispersion
 
-__all__ = ["AT", "PROCESSES", "JumpTrial", "jump_trials"]
-
 Array = NDArray[Any]
 AT = (80, 140, 200)  # samples before which the unknown v jumps
 SAMPLES = 260

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from benchmarks.refit.problem import Priors, Problem
 from benchmarks.refit.process import LostError, Trajectory
 
-__all__ = ["Objective"]
-
 Array = NDArray[Any]
 LOST = 1e4  # residual, in standard deviations, where the forward model has no solution
 

@@ -15,8 +15,6 @@ import livepde as lp
 from benchmarks.refit.process import Process
 from benchmarks.refit.unknowns import Belief, Coordinates, Unknown, drawn
 
-__all__ = ["Priors", "Problem"]
-
 Array = NDArray[Any]
 Priors = Mapping[str, Belief]
 

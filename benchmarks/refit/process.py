@@ -21,8 +21,6 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-__all__ = ["LostError", "Process", "Trajectory", "stages_of"]
-
 Array = NDArray[Any]
 Factor: TypeAlias = tuple[Array, Array]
 

@@ -13,8 +13,6 @@ from scipy.optimize import least_squares
 from benchmarks.refit.objective import Objective
 from benchmarks.refit.problem import Priors, Problem
 
-__all__ = ["Reference", "enough", "reference"]
-
 Array = NDArray[Any]
 METHODS: tuple[Literal["lm", "trf"], ...] = ("lm", "trf")
 EVALUATIONS = 200  # at most

@@ -9,9 +9,8 @@ import numpy as np
 from benchmarks.refit.jumps import AT, JumpTrial
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.trial import Trial
-from livepde.runs.outcome import Check, Outcome, Table
-
-__all__ = ["outcome"]
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
 
 MEDIAN_PASSES = 9.0
 LEVEL = 0.9  # share of the fits whose passes are bounded, and that outliers must not move

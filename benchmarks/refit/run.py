@@ -12,8 +12,6 @@ from benchmarks.refit.report import outcome
 from benchmarks.refit.trial import Trial, trial
 from livepde.runs.outcome import Outcome
 
-__all__ = ["JUMPS", "PARTS", "refit"]
-
 JUMPS = "jumps"
 PARTS = (*PROBLEMS, JUMPS)
 """What can be run by itself: the problems, and jumps of one unknown."""

@@ -13,8 +13,6 @@ from benchmarks.refit.problem import Array, Priors, Problem
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.reference import Reference, enough, reference
 
-__all__ = ["Trial", "trial", "with_outliers"]
-
 OUTLIERS = 0.2  # share of the readings that are wild
 SIZES = (10.0, 100.0)  # of what is added to them, in standard deviations of the noise
 LEAST = 10  # samples from which outliers can be told from the rest

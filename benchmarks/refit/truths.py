@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from benchmarks.honest.linear import Linear
 from benchmarks.refit.elements import interpolation
 
-__all__ = ["conduction"]
-
 Array = NDArray[Any]
 
 

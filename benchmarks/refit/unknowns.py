@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 import livepde as lp
 
-__all__ = ["Belief", "Coordinates", "Unknown", "drawn"]
-
 Array = NDArray[Any]
 Kind = Literal["log", "logit", "normal"]
 

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from benchmarks.jobs import each
-from livepde.runs.outcome import Check, Outcome
+from livepde.diagnostics.check_report import Check
+from livepde.runs.outcome import Outcome
 
 __all__ = ["PARTS", "silent"]
 

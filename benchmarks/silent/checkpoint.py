@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 import livepde as lp
+from livepde.diagnostics.check_report import Check
 from livepde.errors import RunError
 from livepde.fleet import Shard
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
 
 OTHERS: Mapping[str, Mapping[str, Any]] = {
     "three times the conductivity": {"factor": 3.0},

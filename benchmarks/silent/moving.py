@@ -19,10 +19,8 @@ import numpy as np
 
 import livepde as lp
 from benchmarks.silent.exact_walk import Exact
+from livepde.diagnostics.check_report import Check
 from livepde.linalg import Array
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
 
 SCALE, STD = 3.0, 1.0  # time scale and prior standard deviation of s
 SPACINGS = (0.05, 0.3, 1.0, 2.0)  # of samples, in time scales

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from livepde.control import reduce
+from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError, ModelError
 from livepde.fem import Channel, Field, Normal, dot, grad, interval, linear
 from livepde.identifier import Identifier
@@ -15,9 +16,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
 from livepde.reproduce import boiger2016, seed
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
 
 FAR = (3, 106)  # seed of the noise, and samples up to a stage whose root is 1.7e6 from its start
 DENSE = 1e-7  # residual in the equations below over their largest term; 3e-9 is measured

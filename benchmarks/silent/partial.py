@@ -18,15 +18,13 @@ from benchmarks.partial import (
     follow,
     refused,
 )
+from livepde.diagnostics.check_report import Check
 from livepde.fem import Field, LogNormal, Scalar, dot, grad, interval, linear
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
 from livepde.model import Model
 from livepde.observation import Full
-from livepde.runs.outcome import Check
 from livepde.stepping import Alexander2
-
-__all__ = ["checks"]
 
 DIFFUSIVITY = 0.1  # of the data that `benchmarks.partial` makes with q = 0
 CLOSE = 0.05  # relative error of it from full data: 0.027 is measured

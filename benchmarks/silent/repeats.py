@@ -25,15 +25,13 @@ from benchmarks.faults.plants import BROKER, Mosquitto, Topic
 from livepde.cases import Case, load
 from livepde.cases.data import passwords_of
 from livepde.cases.live_case import LiveCase
+from livepde.diagnostics.check_report import Check
 from livepde.errors import CaseError, RunError
 from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.runs import RunWriter
 from livepde.runs import open as open_run
 from livepde.runs.live_loop import Sink
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
 
 COUNT, FIRST, END = 600, 200, 300  # rows, and those of them that come again
 ALPHA, STEP, NOISE = 2e-5, 60.0, 0.05  # m^2/s, s, K

@@ -15,11 +15,9 @@ import scipy.linalg
 
 import livepde as lp
 from livepde import cases, runs
+from livepde.diagnostics.check_report import Check
 from livepde.linalg import Array
 from livepde.models import heat
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
 
 ALPHA, LENGTH, STEP, NOISE = 1e-4, 0.4, 20.0, 0.05
 AT = (0.1, 0.2, 0.3)

@@ -18,9 +18,7 @@ from numpy.typing import NDArray
 
 import livepde as lp
 from benchmarks.first_hour import FOLDER, KELVIN, furnace
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
+from livepde.diagnostics.check_report import Check
 
 Array = NDArray[Any]
 

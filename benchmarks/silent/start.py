@@ -14,9 +14,7 @@ from scipy.linalg import solve_banded
 from skfem import ElementVector
 
 import livepde as lp
-from livepde.runs.outcome import Check
-
-__all__ = ["checks"]
+from livepde.diagnostics.check_report import Check
 
 D = 0.3  # diffusivity of the rod
 K = 0.05  # diffusivity of the plate

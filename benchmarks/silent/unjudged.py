@@ -19,9 +19,9 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 import livepde as lp
+from livepde.diagnostics.check_report import Check
 from livepde.errors import LawError
 from livepde.runs import verdict, verdict_table
-from livepde.runs.outcome import Check
 
 CELLS, DT, EVERY, SAMPLES = 200, 0.005, 10, 200  # of the data, and steps from sample to sample
 D, Q = 1.0, 5.0

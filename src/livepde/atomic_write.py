@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-__all__ = ["PARTIAL", "replacing", "write_bytes"]
-
 PARTIAL = ".partial"  # how the name of a file ends that is being written
 
 

@@ -28,8 +28,6 @@ from livepde.samples import (
 )
 from livepde.stepping import own_noise
 
-__all__ = ["Channels"]
-
 # Values of the withheld sensors if there are none.
 NOTHING = np.zeros(0)
 

@@ -24,8 +24,6 @@ from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
 from livepde.linalg import Array
 
-__all__ = ["flatten", "packed", "read", "rebuild", "unpacked", "write"]
-
 MAGIC = b"livepde1"
 DIGEST = 16  # bytes
 START = struct.Struct(f"<8sQ{DIGEST}s")

@@ -10,19 +10,6 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "SECONDS",
-    "dated",
-    "instants",
-    "origin_at",
-    "since",
-    "since_1970",
-    "stamp_of",
-    "when",
-    "with_epoch",
-    "without_epoch",
-]
-
 CLOCKS = {"s": "seconds", "min": "minutes", "h": "hours", "d": "days", "day": "days"}
 TIMES = ("time", "snapshot")  # coordinates of a dataset that are times
 OWN = "units_of_run"  # attribute of a time with an epoch: its unit as the run has it

@@ -21,8 +21,6 @@ from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observed
 
-__all__ = ["Fingerprint", "fingerprint"]
-
 ROUNDING = 1e-8  # relative: far above what the order of sums changes, far below any other change
 TIMES = (0.37, 1.91)
 SUMS = 2  # for each vector

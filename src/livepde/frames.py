@@ -29,20 +29,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-__all__ = [
-    "covariance_of",
-    "draws",
-    "estimates",
-    "frame",
-    "model_errors",
-    "over_time",
-    "predictive",
-    "prior_draws",
-    "relative_error",
-    "times",
-    "with_estimates",
-]
-
 STATISTICS = ("value", "std", "low", "high")
 ERRORS = (("innovation", "sensor"), ("withheld_error", "withheld"))
 

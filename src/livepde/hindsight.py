@@ -18,8 +18,6 @@ from livepde.stepping import End, Interval
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Hindsight", "LinearReadings", "with_smoothed"]
-
 
 class Hindsight:
     """Record of the accepted samples of a run and its estimates, for smoothing.

@@ -58,8 +58,6 @@ from livepde.verdict import InputLedger, Verdict, WithheldLedger
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Identifier", "Sample"]
-
 FORMAT = 12  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 

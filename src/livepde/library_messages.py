@@ -7,8 +7,6 @@ import warnings
 from pathlib import Path
 from typing import TextIO
 
-__all__ = ["OneLine", "tame_libraries"]
-
 LOG = logging.getLogger("livepde.libraries")
 
 

@@ -43,8 +43,6 @@ from livepde.records import Layout, name_clashes
 from livepde.showing import Shown, expression, listed
 from livepde.spaces import BorderedSpace, HilbertSpace, product
 
-__all__ = ["Model", "Source", "h1_form", "mass_form"]
-
 Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 
 

@@ -17,8 +17,6 @@ from livepde.model import Model
 from livepde.observation import Observation
 from livepde.stepping import Newton
 
-__all__ = ["STRICT", "identifier", "law", "space"]
-
 STRICT = Newton(tolerance=1e-12, share=0.0)
 """Every step is solved to rounding, not only to what the time step leaves out."""
 

@@ -7,8 +7,6 @@ from typing import Any
 
 from rich.console import Console
 
-__all__ = ["watched"]
-
 
 def watched(stream: Iterable[Any], total: int | None, what: str = "samples") -> Iterator[Any]:
     """Yield the items of a stream behind a bar on standard error."""

@@ -12,8 +12,6 @@ from livepde.fem import FunctionSpace, Normal
 from livepde.laws import Belief
 from livepde.linalg import Array
 
-__all__ = ["ScalarReadout", "unknown_of"]
-
 LEVEL = 0.95
 
 Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]

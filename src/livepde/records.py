@@ -23,33 +23,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from pydantic import TypeAdapter
 
-__all__ = [
-    "DATE",
-    "ESTIMATES",
-    "FIELD_ENDS",
-    "NORMAL_95",
-    "NOTE",
-    "NUMBER_ENDS",
-    "PARAMETER",
-    "SMOOTHED",
-    "STATE_ENDS",
-    "STATISTIC",
-    "STATUS_CODES",
-    "Layout",
-    "Record",
-    "RecordArrays",
-    "Records",
-    "Snapshot",
-    "bare",
-    "field_names",
-    "interval_95",
-    "name_clashes",
-    "refusal",
-    "refused_readings",
-    "scalars",
-    "used_errors",
-]
-
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
 

@@ -50,17 +50,6 @@ if TYPE_CHECKING:
 
     from livepde.plots import RunPlots
 
-__all__ = [
-    "Estimate",
-    "Marginal",
-    "Result",
-    "interval_ends",
-    "kept",
-    "layout_of",
-    "unknown_of",
-    "vertex_order",
-]
-
 MEDIAN = "the median"
 FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 

@@ -16,23 +16,6 @@ from livepde.linalg import Array
 from livepde.observation import Observed
 from livepde.stepping import own_noise
 
-__all__ = [
-    "Readings",
-    "Sample",
-    "by_name",
-    "check_noise",
-    "is_dataset",
-    "is_frame",
-    "is_tabular",
-    "labelled",
-    "noise_channel",
-    "number",
-    "numbers",
-    "plan",
-    "readings",
-    "sample_of",
-]
-
 Readings: TypeAlias = ArrayLike | Mapping[str, Any]
 
 

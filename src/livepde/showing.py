@@ -11,8 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-__all__ = ["Shown", "expression", "listed", "options_of"]
-
 MOST = 8  # names in a line
 LONG = 200  # characters of an expression
 

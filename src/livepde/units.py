@@ -12,8 +12,6 @@ from typing import Any
 
 from livepde.errors import CaseError
 
-__all__ = ["LARGEST", "SI", "SMALLEST", "Affine", "check_unit", "conversion", "convert", "in_si"]
-
 LARGEST = 1e60  # of a number: products of four are finite
 SMALLEST = 1e-60  # of a standard deviation, a rate, a length
 UNIT = 100  # characters of a unit

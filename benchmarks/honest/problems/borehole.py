@@ -11,8 +11,6 @@ from benchmarks.honest.linear import Array, diffusion, fine_times
 from benchmarks.honest.problem import Problem, constant, waves
 from livepde.models import borehole, fluid
 
-__all__ = ["Borehole"]
-
 CELLS = 200
 WALL, FAR = 0.075, 8.0  # m
 DEPTH = 100.0  # m

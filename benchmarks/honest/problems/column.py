@@ -11,8 +11,6 @@ from benchmarks.honest.linear import Array, Chebyshev, fine_times
 from benchmarks.honest.problem import Problem, constant, waves
 from livepde.models import advection_dispersion
 
-__all__ = ["Column"]
-
 DEGREE = 56
 DEPTH = 10.0
 

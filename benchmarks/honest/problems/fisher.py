@@ -12,8 +12,6 @@ from benchmarks.honest.nonlinear import Array, Stiff
 from benchmarks.honest.problem import Problem, constant
 from livepde.models import fisher_kpp
 
-__all__ = ["Fisher", "Population"]
-
 CELLS = 160
 WIDTH = 2.0
 

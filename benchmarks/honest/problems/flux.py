@@ -15,8 +15,6 @@ from benchmarks.honest.linear import SUBSTEPS, Array, Chebyshev, Linear, fine_ti
 from benchmarks.honest.problem import DIFFERENCE, Latent, Problem, constant, waves
 from benchmarks.honest.problems.warm import Conduction
 
-__all__ = ["NonlinearFlux", "RodFlux"]
-
 DEGREE = 40
 CELLS = 80
 PRIOR, STD, RATE = 0.15, 0.03, 0.02

@@ -12,8 +12,6 @@ from benchmarks.honest.linear import Array, diffusion, fine_times
 from benchmarks.honest.problem import Latent, Problem, constant, waves
 from benchmarks.honest.problems.rod import Rod
 
-__all__ = ["Profile", "Wall", "cosines"]
-
 CELLS = 160
 ENDS = (0.0, 0.2, 0.5, 0.7, 1.0)
 NAMES = ("a", "b", "c", "d")

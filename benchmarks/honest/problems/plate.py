@@ -11,8 +11,6 @@ import livepde as lp
 from benchmarks.honest.linear import Array, Linear, fine_times
 from benchmarks.honest.problem import Latent, Problem, constant, waves
 
-__all__ = ["Plate", "Reaction"]
-
 
 def _waves(count: int, x: Array) -> Array:
     """Return the orthonormal cosines of (0, 1) at points, shape (points, count)."""

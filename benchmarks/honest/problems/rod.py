@@ -10,8 +10,6 @@ import livepde as lp
 from benchmarks.honest.linear import Array, Chebyshev, fine_times
 from benchmarks.honest.problem import Problem, constant, waves
 
-__all__ = ["LossyRod", "Rod"]
-
 DEGREE = 40
 
 

@@ -11,8 +11,6 @@ from benchmarks.honest.nonlinear import Array, Stiff
 from benchmarks.honest.problem import Problem, Signal, constant, waves
 from benchmarks.honest.problems.rod import Rod
 
-__all__ = ["Conduction", "WarmRod"]
-
 CELLS = 80
 
 

@@ -18,8 +18,6 @@ from benchmarks.refit.process import Process
 from benchmarks.refit.unknowns import Belief, Unknown
 from livepde.models import advection_dispersion
 
-__all__ = ["Column", "Few", "OffsetColumn"]
-
 Array = NDArray[Any]
 CELLS = 40
 DEPTH = 16.0  # cm

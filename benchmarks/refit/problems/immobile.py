@@ -18,8 +18,6 @@ from benchmarks.refit.problem import Priors, Problem
 from benchmarks.refit.process import Process
 from benchmarks.refit.unknowns import Unknown
 
-__all__ = ["Immobile"]
-
 Array = NDArray[Any]
 CELLS, FINE = 40, 200
 DEPTH = 20.0  # cm

@@ -19,8 +19,6 @@ from benchmarks.refit.process import Process
 from benchmarks.refit.truths import conduction
 from benchmarks.refit.unknowns import Belief, Unknown
 
-__all__ = ["Layers"]
-
 Array = NDArray[Any]
 CELLS, FINE = 40, 200
 DEPTH = 0.5  # m

@@ -19,8 +19,6 @@ from benchmarks.refit.process import Process
 from benchmarks.refit.truths import conduction
 from benchmarks.refit.unknowns import Coordinates, Unknown
 
-__all__ = ["Profile"]
-
 Array = NDArray[Any]
 CELLS, FINE = 40, 160
 MODES = 14

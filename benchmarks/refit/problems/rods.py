@@ -16,8 +16,6 @@ from benchmarks.refit.problem import Priors, Problem
 from benchmarks.refit.process import Process
 from benchmarks.refit.unknowns import Unknown
 
-__all__ = ["Collinear", "Plate"]
-
 Array = NDArray[Any]
 CELLS, SIDE = 30, 14
 SINES = 399

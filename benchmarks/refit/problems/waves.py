@@ -26,8 +26,6 @@ from benchmarks.refit.process import Process
 from benchmarks.refit.unknowns import Unknown
 from livepde.models import burgers, fisher_kpp
 
-__all__ = ["Burgers", "Source"]
-
 Array = NDArray[Any]
 CELLS = 40
 

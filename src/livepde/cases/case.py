@@ -33,21 +33,20 @@ from livepde.cases.laws import law_of
 from livepde.cases.process import conditioned, drive_notes, model_of, process_notes, wall_attributes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
 from livepde.cases.schema import SENSORS
+from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, GradientLaw
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
 from livepde.result import layout_of
 from livepde.runs import Journal
-from livepde.runs.outcome import Bound, Sense
 from livepde.runs.summary import ROLES, TOTALS
+from livepde.samples import Sample
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, DataTable
-
-__all__ = ["Case", "Prepared", "load"]
 
 
 @dataclass(frozen=True, eq=False)

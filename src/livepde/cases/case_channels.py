@@ -30,7 +30,6 @@ from livepde.fem import (
     random_field,
     with_constants,
 )
-from livepde.identifier import Sample
 from livepde.linalg import Array
 from livepde.observation import (
     Averages,
@@ -47,28 +46,13 @@ from livepde.observation import (
     Tikhonov,
 )
 from livepde.observation.placed import POSITION, shift_names
-from livepde.samples import by_name, noise_channel
+from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
 from livepde.units import conversion
 
 if TYPE_CHECKING:
     import pandas as pd
-
-__all__ = [
-    "between_of",
-    "check_initial",
-    "columns_of",
-    "expanded",
-    "initial_errors",
-    "initial_of",
-    "initial_weights",
-    "input_noise_of",
-    "noise_of",
-    "observation_of",
-    "sensor_notes",
-    "unknowns_of",
-]
 
 # The first sample interpolated, under two names; or as if it were exact, and the lines between.
 EXACT = "interpolate-exact"

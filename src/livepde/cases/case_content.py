@@ -25,8 +25,6 @@ from livepde.linalg import Array
 from livepde.models import Equation, Option
 from livepde.units import LARGEST, SMALLEST, conversion, convert
 
-__all__ = ["CaseContent", "inside", "off_nodes", "sides_of", "subdomain"]
-
 CELLS = 2_000_000  # of a mesh that a case describes itself
 
 

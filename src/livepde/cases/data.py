@@ -40,28 +40,6 @@ from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 from livepde.units import conversion
 
-__all__ = [
-    "START",
-    "Data",
-    "assimilation_start",
-    "check_hours",
-    "clock_of",
-    "data_file",
-    "delays",
-    "limits_of",
-    "passwords_of",
-    "policy_of",
-    "publishers_of",
-    "read_data",
-    "reader_of",
-    "refuse_late",
-    "source_of",
-    "source_text",
-    "suspect_start",
-    "wild_start",
-    "without_gaps",
-]
-
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
 UNSET = (

@@ -18,8 +18,6 @@ from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
 from livepde.streams.table import no_file
 
-__all__ = ["check_options", "load_code", "own_code", "resolve"]
-
 
 def resolve(spec: CaseSpec, folder: Path, where: str, allow_code: bool) -> Equation:
     """Return the equation of a case.

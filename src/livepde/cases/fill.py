@@ -11,8 +11,6 @@ from tomlkit.items import InlineTable
 from livepde.cases.read import apply, key_path, read_toml, spec_of, toml_key, toml_line
 from livepde.errors import CaseError
 
-__all__ = ["filled"]
-
 
 def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
     """Return the text of a case with other values: `read.apply`, and the comments stay.

@@ -8,8 +8,6 @@ from typing import Any
 
 from livepde.cases.schema import CaseSpec
 
-__all__ = ["MEANINGS", "SCHEMA_FILE", "case_schema", "documented"]
-
 SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 

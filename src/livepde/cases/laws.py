@@ -21,8 +21,6 @@ from livepde.laws import (
     Shadows,
 )
 
-__all__ = ["law_of"]
-
 Options = TypeVar("Options")
 
 

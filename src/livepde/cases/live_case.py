@@ -30,15 +30,13 @@ from livepde.cases.data import (
 )
 from livepde.dates import since_1970
 from livepde.errors import ConfigurationError, DataError
-from livepde.identifier import Sample
 from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
+from livepde.samples import Sample
 from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
-
-__all__ = ["LiveCase"]
 
 LOG = logging.getLogger("livepde.run")
 

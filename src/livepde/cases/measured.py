@@ -23,8 +23,6 @@ from livepde.streams.csvfile import Written, how_written
 from livepde.streams.table import JSON_LINES, MISSING
 from livepde.units import conversion
 
-__all__ = ["IN_BRACKETS", "Measured", "measured", "unit_in"]
-
 IN_BRACKETS = re.compile(r"\s*[\[(]([^\[\]()]*)[\])]\s*$")  # T [degC], time (min)
 AT_THE_END = re.compile(r"(?:_|^(?=\w{3}))([A-Za-z]+)$")  # time_s, minutes
 HOUR = re.compile(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?( ?[AaPp][Mm])?")

@@ -22,8 +22,6 @@ from livepde.runs import Driven, Journal, stopped_by_signals
 from livepde.runs.journal import Event
 from livepde.streams import DataTable
 
-__all__ = ["MemberBlock", "blocks"]
-
 WAITING = 2**23  # numbers that wait to be written
 ALONE = "no other one has their settings and sample times"
 # Members may differ in how a channel is read, and in descriptions of a run.

@@ -24,16 +24,6 @@ from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams.sentinels import sentinels
 from livepde.streams.switches import switches
 
-__all__ = [
-    "PLACES",
-    "FoundChannel",
-    "channels_in",
-    "check_free",
-    "files_for",
-    "write_files",
-    "write_template",
-]
-
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
 FRACTION = re.compile(r"\d+\.\d+")  # T_0.05

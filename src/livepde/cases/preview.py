@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case import Prepared
-from livepde.diagnostics.identifiability import FLAT, identifiability
+from livepde.diagnostics.identifiability import identifiability
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, SensitivityLaw, Shadows
 from livepde.laws.filter_state import FilterState
 from livepde.laws.sensitivity_state import SensitivityWork
@@ -22,9 +22,8 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Combined, Observation, Points
 from livepde.result import Estimate
-from livepde.verdict import REFINE, Shifts, discretised
-
-__all__ = ["Advice", "Identified", "Preview", "advise", "linearised", "preview"]
+from livepde.samples import Sample
+from livepde.verdict import FLAT, REFINE, Shifts, discretised
 
 MOST_SAMPLES = 500
 

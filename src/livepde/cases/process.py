@@ -39,9 +39,6 @@ from livepde.observation.flux_plates import in_cells
 from livepde.runs.thermal_resistance import LAYERS, SURFACES
 from livepde.units import conversion
 
-__all__ = ["conditioned", "drive_notes", "held", "model_of", "process_notes", "wall_attributes"]
-
-
 HELD = 1e4  # transfer coefficient at a boundary that is held, over D and the size of a cell
 
 

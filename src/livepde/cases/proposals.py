@@ -17,8 +17,6 @@ from livepde.verdict import Cause, channel_setting
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
 
-__all__ = ["MOST", "proposed"]
-
 MOST = 12  # variants that the program chooses
 PLACE = 0.01  # of the length of the domain: how far off a sensor may be
 SAMPLES = 64  # in which a source moves the state by the usual error

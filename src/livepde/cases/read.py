@@ -20,25 +20,6 @@ from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError
 from livepde.units import LARGEST
 
-__all__ = [
-    "BLANK",
-    "apply",
-    "beside",
-    "blanks_in",
-    "did_you_mean",
-    "is_blank",
-    "key_path",
-    "parse",
-    "read_spec",
-    "read_text",
-    "read_toml",
-    "settings_in",
-    "spec_of",
-    "toml_key",
-    "toml_line",
-    "toml_value",
-]
-
 BLANK = "?"  # how a value begins that is still to be filled in
 LONGEST = 1_000_000  # bytes of a case file
 DATA = (".csv", ".txt", ".jsonl", ".parquet", ".xlsx")  # endings of what is no case

@@ -16,8 +16,6 @@ from livepde.verdict.sentences import ESTIMATED, LIKELY, estimating
 if TYPE_CHECKING:
     from livepde.cases.case import Case, Prepared
 
-__all__ = ["KEYS", "adding", "freed", "with_settings"]
-
 WIDE = 2.0  # prior standard deviation of what is freed, over the size that was found
 PLACE = 0.01  # of the length of the domain: how far off a sensor of unknown error may be
 KEYS = {kind: key for kind, (_, key) in ESTIMATED.items()}

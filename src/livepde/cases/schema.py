@@ -23,31 +23,17 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema
 
+from livepde.diagnostics.check_report import Bound, Sense
 from livepde.fem import Scalar
 from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
 from livepde.runs.live_loop import Backlog, Retention
-from livepde.runs.outcome import Bound, Sense
 from livepde.stepping import Between
 from livepde.streams.csvfile import UTF_8
 from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
 
 SENSORS = ("sensor", "withheld", "ignored")  # roles of channels that measure the state
-
-__all__ = [
-    "FLUX",
-    "SENSORS",
-    "BoundarySpec",
-    "CaseSpec",
-    "ChannelSpec",
-    "DataSpec",
-    "EvolutionSpec",
-    "GradientSpec",
-    "SensitivitySpec",
-    "TikhonovSpec",
-    "UnknownSpec",
-]
 
 
 def _quantity(value: Any) -> Any:

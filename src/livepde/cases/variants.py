@@ -17,28 +17,17 @@ from livepde.cases.read import parse, settings_in
 from livepde.cases.remedies import with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
-from livepde.identifier import Sample
 from livepde.plots.dataset import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import verdict
 from livepde.runs.summary import channel_errors, rmse
+from livepde.samples import Sample
 from livepde.streams import DataTable
 from livepde.verdict import Cause, Verdict
 
 if TYPE_CHECKING:
     import xarray as xr
-
-__all__ = [
-    "AS_STATED",
-    "Interval",
-    "Variant",
-    "VariantRun",
-    "conclusions",
-    "recommended",
-    "run_variant",
-    "variant_of",
-]
 
 EVERY = 1_000_000_000  # fields are not compared
 AS_STATED = "as stated"

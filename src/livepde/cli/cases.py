@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from livepde.cases.new_case import FoundChannel
     from livepde.models import Equation
 
-__all__ = ["equations", "init"]
-
 
 def init(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")],

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
     from livepde.streams import DataTable
 
-__all__ = ["check"]
-
 MOST_CHANNELS = 40  # rows of the table of channels
 
 

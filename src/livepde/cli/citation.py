@@ -12,8 +12,6 @@ import typer
 from livepde import __version__
 from livepde.cli.printing import terminal
 
-__all__ = ["CitationForm", "citation"]
-
 # The facts are those of CITATION.cff, as a test checks; the year is that of the release.
 BIBTEX = """\
 @misc{{livepde{year},

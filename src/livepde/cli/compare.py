@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from livepde.cases.variants import Interval, Variant, VariantRun
     from livepde.runs import Table
 
-__all__ = ["compare"]
-
 COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from livepde.runs import Outcome, RunWriter
 
-__all__ = ["demo", "reproduce", "run_experiment"]
-
 
 def demo(out: OutOption = None) -> None:
     """Watch the paper's method find q(x) and u(t, x) online.

@@ -26,8 +26,6 @@ from livepde.errors import ConfigurationError
 if TYPE_CHECKING:
     from xarray import Dataset
 
-__all__ = ["export", "fmu"]
-
 REPORT = ".html"
 
 

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from livepde.cases.member_blocks import MemberBlock
     from livepde.runs import Check, Driven, Run, RunWriter, Table
 
-__all__ = ["fleet"]
-
 SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
 ASKED, GOES_ON = "--separately", "resumed runs"

@@ -12,8 +12,6 @@ from threadpoolctl import threadpool_limits
 
 from livepde.errors import ConfigurationError, RunError
 
-__all__ = ["Backend", "in_parts"]
-
 Row = TypeVar("Row")
 Found = TypeVar("Found")
 

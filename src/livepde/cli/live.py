@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from livepde.runs import Driven, RunWriter
     from livepde.runs.live_loop import Sink
 
-__all__ = ["LiveOptions", "run_live"]
-
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
 METRICS_PORT = 9100

@@ -13,22 +13,6 @@ if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
     from livepde.runs import Run
 
-__all__ = [
-    "CaseArgument",
-    "CodeOption",
-    "EnvOption",
-    "ForceOption",
-    "JsonOption",
-    "OutOption",
-    "RunArgument",
-    "SetOption",
-    "argument",
-    "load_case",
-    "names_in",
-    "option",
-    "prepare_again",
-]
-
 
 def option(text: str, *names: str, **more: Any) -> Any:
     """Return an option whose help names its default, or needs none."""

@@ -18,21 +18,6 @@ from livepde.errors import ConfigurationError
 if TYPE_CHECKING:
     from livepde.runs import Check, Journal, Outcome, Table
 
-__all__ = [
-    "BAD_INPUT",
-    "CHECK_FAILED",
-    "INTERRUPTED",
-    "can_draw",
-    "extent",
-    "figures_of",
-    "named",
-    "present",
-    "print_table",
-    "report_outcome",
-    "show",
-    "terminal",
-]
-
 MOST_CURVES = 100_000  # samples of a run whose readings are drawn
 CHECK_FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130  # exit codes
 FIGURES_MISSING = "No figures: they require Matplotlib, pip install 'livepde[plots]'."

@@ -25,8 +25,6 @@ from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
 from livepde.library_messages import tame_libraries
 
-__all__ = ["app", "main"]
-
 app = typer.Typer(
     name="livepde",
     help="""Estimate unknown parameters of partial differential equations from live data.

@@ -10,8 +10,6 @@ from rich.markup import escape
 from livepde.cli.options import CodeOption, JsonOption, RunArgument, prepare_again
 from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, present, terminal
 
-__all__ = ["report"]
-
 
 def report(
     folder: RunArgument,

@@ -43,8 +43,6 @@ if TYPE_CHECKING:
     from livepde.identifier import Identifier
     from livepde.runs import Check, Driven, RunWriter, Table
 
-__all__ = ["concluded", "run", "run_batch", "writer_of"]
-
 
 class LogKind(StrEnum):
     """Formats of the log."""

@@ -6,8 +6,6 @@ import json
 
 from livepde.cli.printing import terminal
 
-__all__ = ["schema"]
-
 
 def schema() -> None:
     """Print the JSON schema of case files: editors use it to complete and explain keys.

@@ -16,8 +16,6 @@ from livepde.cli.printing import terminal
 if TYPE_CHECKING:
     from livepde.runs.web import Server
 
-__all__ = ["watch"]
-
 PORT = 8050
 
 

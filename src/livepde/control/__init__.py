@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from livepde.control.estimators import Estimator, Known, Learned, Trust
-from livepde.control.goal import Controller, Decision, Goal, Plan
+from livepde.control.estimators import Estimator, Learned, Trust
+from livepde.control.goal import Controller, Decision, Goal, Known, Plan
 from livepde.control.kalman import Kalman
 from livepde.control.linear import Discrete, Output
 from livepde.control.loop import Action, Loop

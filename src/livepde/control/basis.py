@@ -11,8 +11,6 @@ from scipy.sparse.linalg import eigs, eigsh, splu
 from livepde.control.linear import Linear
 from livepde.linalg import Array, IntArray
 
-__all__ = ["basis"]
-
 # Shift of static responses relative to the fastest rate, for processes without a steady state.
 SHIFT = 1e-9
 # Relative size below which a direction of the snapshots is dropped.

@@ -17,8 +17,6 @@ from livepde.errors import ConfigurationError, RunError
 from livepde.identifier import Identifier
 from livepde.result import Estimate
 
-__all__ = ["Estimator", "Known", "Learned", "Trust"]
-
 
 @dataclass(frozen=True)
 class Trust:

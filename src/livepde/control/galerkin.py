@@ -15,9 +15,7 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.result import unknown_of
-
-__all__ = ["GalerkinReduction", "likely"]
+from livepde.readout import unknown_of
 
 # Probability of the interval of an unknown number whose ends define the responses in the basis.
 LIKELY = 0.95

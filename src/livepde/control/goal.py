@@ -14,8 +14,6 @@ from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
-__all__ = ["Controller", "Decision", "Goal", "Known", "Plan", "Source", "check"]
-
 FREE = (-np.inf, np.inf)
 Source: TypeAlias = Literal["estimate", "fallback"]
 

@@ -16,8 +16,6 @@ from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderE
 from livepde.linalg import Array
 from livepde.samples import labelled, number, readings
 
-__all__ = ["Kalman"]
-
 # Standard deviation of the isotropic process noise, relative to that of the channels.
 FLOOR = 1e-6
 # Relative difference of two sampling intervals that is attributed to rounding.

@@ -14,8 +14,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 
-__all__ = ["Discrete", "Linear", "Linearisation", "Output"]
-
 # Relative difference that is attributed to rounding.
 SAME = 1e-9
 # Arbitrary time at which a model is evaluated to detect an explicit dependence on time.

@@ -20,8 +20,6 @@ from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.samples import labelled, number, numbers
 
-__all__ = ["Action", "Loop"]
-
 Future: TypeAlias = Mapping[str, ArrayLike]
 """Name -> a number that holds, or one for each coming period."""
 

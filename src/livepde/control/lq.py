@@ -13,8 +13,6 @@ from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
-__all__ = ["LQ"]
-
 # Weight of states that no tracked output sees, relative to the trace of the weight matrix.
 TINY = 1e-10
 

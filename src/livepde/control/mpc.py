@@ -16,8 +16,6 @@ from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 
-__all__ = ["MPC", "packages", "quiet"]
-
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
 # Largest distance of a scenario from the estimate, as a share of the distance to the bound.
 FARTHEST = 0.9

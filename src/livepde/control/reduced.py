@@ -17,10 +17,8 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.result import unknown_of
+from livepde.readout import unknown_of
 from livepde.stepping import Advance, Alexander2, simulate
-
-__all__ = ["ReducedModel", "reduce"]
 
 # Substeps of the full model per sample in `error`, so that its own time error is small.
 FINER = 8

@@ -20,23 +20,6 @@ from livepde.linalg import Array
 from livepde.plots import PALETTE, labelled, time_scale
 from livepde.runs import jumps
 
-__all__ = [
-    "CONFIG",
-    "GRID",
-    "MARKS",
-    "TimeAxis",
-    "at_time",
-    "band",
-    "empty",
-    "line",
-    "over_time",
-    "show",
-    "text",
-    "unit_label",
-    "unit_of",
-    "when_axis",
-]
-
 FAR = 1e11  # seconds from the origin beyond which times are numbers
 DECADES = 100.0  # from which ratio on a scale is logarithmic
 INK, GRID = "#1f2933", "#e4e7eb"

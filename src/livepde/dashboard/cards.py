@@ -23,19 +23,6 @@ from livepde.runs import severities
 from livepde.runs.summary import STATES, channel_errors, determination, digits
 from livepde.verdict import Severity
 
-__all__ = [
-    "Level",
-    "cards",
-    "chip",
-    "facts",
-    "gravest",
-    "pretty",
-    "sign",
-    "summary",
-    "tables",
-    "verdict",
-]
-
 Level = Literal["good", "info", "warn", "bad"]
 
 MOST_SHOWN = 6  # sentences of the verdict that are seen at once

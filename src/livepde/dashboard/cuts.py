@@ -17,8 +17,6 @@ from scipy.spatial import Delaunay
 
 from livepde.linalg import Array
 
-__all__ = ["Map", "Surface", "boundary", "plane_map", "slices"]
-
 MOST_LINES = 120  # of a map in each direction
 OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
 # A hexahedron as six tetrahedra around its diagonal from corner 0 to corner 6.

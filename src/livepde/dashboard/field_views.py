@@ -25,8 +25,6 @@ from livepde.dashboard.canvas import (
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
 
-__all__ = ["drawn_by", "field_map", "field_profile", "field_solid"]
-
 FINE = 0.2  # share of a mesh's lines on each side that may lie far out
 OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
 

@@ -24,8 +24,6 @@ from livepde.runs.journal import Event
 if TYPE_CHECKING:
     from livepde.dashboard.canvas import TimeAxis
 
-__all__ = ["page_of", "write_report"]
-
 TEMPLATE, STYLE = "report.html", "assets/page.css"
 MOST_EVENTS = 500
 MOST_READINGS = 100_000  # samples of a run whose readings are drawn

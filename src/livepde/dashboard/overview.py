@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     import xarray as xr
 
-__all__ = ["overview_page", "overview_table"]
-
 PACE = 5000  # milliseconds between two looks
 MOST_RUNS = 500  # rows
 MOST_UNKNOWNS = 4  # columns

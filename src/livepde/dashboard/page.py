@@ -18,8 +18,6 @@ from livepde.dashboard.view import View
 if TYPE_CHECKING:
     from flask import Response
 
-__all__ = ["application", "harden", "page"]
-
 FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two looks
 STOPS = 400  # of the slider
 OPEN = ("waiting", "running", "silent")  # a run in which something may happen soon

@@ -45,8 +45,6 @@ from livepde.plots.dataset import (
 from livepde.records import field_names, interval_95, scalars, used_errors
 from livepde.runs.summary import shown
 
-__all__ = ["SECTIONS", "Panel", "panels"]
-
 SECTIONS = {
     "measured": "Measured and modelled",
     "estimates": "Estimates",

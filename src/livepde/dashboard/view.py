@@ -22,8 +22,6 @@ from livepde.runs.database import in_use, written
 from livepde.runs.directory import JOURNAL
 from livepde.runs.journal import Event
 
-__all__ = ["READINGS", "RunView", "Spread", "View", "with_readings"]
-
 T = TypeVar("T")
 
 # Errors of sensors -> name of their readings in the dataset of a view, which no unknown has.

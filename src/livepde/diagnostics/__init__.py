@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from livepde.diagnostics.check_report import Check, CheckReport
-from livepde.diagnostics.constants import Part, Spaces, constants
+from livepde.diagnostics.constants import Spaces, constants
 from livepde.diagnostics.error_bounds import Errors, TwinTracker, bounds, conditions
 from livepde.diagnostics.excitation import Excitation, ExcitationState, Spectrum
 from livepde.diagnostics.form_checks import check_model
@@ -17,6 +17,7 @@ from livepde.diagnostics.law_checks import check_law
 from livepde.diagnostics.links import Interpolation, Link, interpolation, link
 from livepde.diagnostics.observation_checks import check_observation
 from livepde.diagnostics.space_checks import check_space
+from livepde.diagnostics.state_parts import Part
 from livepde.diagnostics.stopping import (
     OnlineStopping,
     StoppingState,

@@ -10,8 +10,6 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 
-__all__ = ["Bound", "Check", "CheckReport", "Sense", "Table"]
-
 Sense: TypeAlias = Literal["<=", ">=", "in"]
 Bound: TypeAlias = float | tuple[float, float]
 

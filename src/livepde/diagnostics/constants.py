@@ -20,8 +20,6 @@ from livepde.model import Model, h1_form
 from livepde.observation import Observed, Split
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Part", "Spaces", "constants"]
-
 Pair: TypeAlias = tuple[sp.csr_array, sp.csr_array]
 
 # Largest number of unknowns for a dense basis, needed if R is not a selection.

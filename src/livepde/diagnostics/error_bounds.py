@@ -27,8 +27,6 @@ from livepde.linalg import Array
 from livepde.result import Estimate
 from livepde.streams import Twin
 
-__all__ = ["Errors", "TwinTracker", "bounds", "conditions"]
-
 Data = Literal["exact", "noisy", "smoothed"]
 # Relative violation of an inequality between norms that is attributed to rounding.
 ROUNDING = 1e-9

@@ -16,8 +16,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Excitation", "ExcitationState", "Spectrum"]
-
 # Number of entries of a block of states, which bounds the size of temporary arrays.
 ENTRIES = 5_000_000
 # Number of parameters up to which the Gramian is stored as a matrix.

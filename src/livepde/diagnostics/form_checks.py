@@ -17,8 +17,6 @@ from livepde.linalg import Array, Pattern, analyse
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
-__all__ = ["check_model"]
-
 # Relative error of identities between sums of products.
 ROUNDING = 1e-12
 # Relative nonlinearity of an integrand; functions such as exp have larger rounding errors.

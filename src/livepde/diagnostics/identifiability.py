@@ -18,8 +18,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.verdict import FLAT
 
-__all__ = ["FLAT", "Direction", "Identifiability", "InformationGain", "identifiability"]
-
 # Largest remaining share of the prior standard deviation of a well-determined unknown.
 PINNED = 0.1
 # Correlation from which only a combination of two unknowns is determined.

@@ -21,8 +21,6 @@ from livepde.result import Estimate
 from livepde.samples import Sample, sample_of
 from livepde.stepping import Interval, Scheme, Stage, StepFailed
 
-__all__ = ["check_law"]
-
 
 def check_law(
     law: AnyLaw,

@@ -11,8 +11,6 @@ from livepde.errors import ConfigurationError
 from livepde.laws.damping_bounds import Norms
 from livepde.linalg import Array
 
-__all__ = ["Interpolation", "Link", "interpolation", "link"]
-
 # Growth of the constant from the first to the second half of a run that counts as none.
 STEADY = 1.5
 

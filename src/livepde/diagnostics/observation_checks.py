@@ -15,8 +15,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed, Split
 
-__all__ = ["check_observation"]
-
 ROUNDING = 1e-12
 # Relative step of central differences: the cube root of the rounding unit balances truncation and
 # rounding errors.

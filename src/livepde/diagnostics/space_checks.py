@@ -10,8 +10,6 @@ from livepde.errors import LinearAlgebraError, SpaceError
 from livepde.linalg import Array
 from livepde.spaces import HilbertSpace
 
-__all__ = ["check_space"]
-
 ROUNDING = 1e-12
 
 

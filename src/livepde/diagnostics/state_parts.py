@@ -16,8 +16,6 @@ from livepde.laws.damping_bounds import Norms
 from livepde.linalg import Array, IntArray
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Border", "Images", "Part", "lanczos"]
-
 Map: TypeAlias = Callable[[Array], Array]
 Images: TypeAlias = Sequence[tuple[HilbertSpace, sp.csr_array]]  # regions of X, operators there
 

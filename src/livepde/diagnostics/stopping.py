@@ -15,14 +15,6 @@ from livepde.laws.damping_bounds import Constants, Norms
 from livepde.linalg import Array
 from livepde.observation import Observed, Tikhonov
 
-__all__ = [
-    "OnlineStopping",
-    "StoppingState",
-    "noise_size",
-    "reconstruction_matrix",
-    "stopping_time",
-]
-
 # Number of sensors up to which the error norms are computed exactly, sensor by sensor.
 MOST_SENSORS = 2000
 # Number of random vectors beyond that: the relative standard error is at most sqrt(2/(4 PROBES)) =

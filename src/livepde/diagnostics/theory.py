@@ -33,8 +33,6 @@ from livepde.result import Estimate
 from livepde.samples import Sample, sample_of
 from livepde.streams import Twin
 
-__all__ = ["OnlineTracker", "TheoryReport", "theory_report"]
-
 DEFINITIONS = {
     "L_C": ("LipschitzC", "|C(q,u+v+w) - C(q,u)|_X <= L_C (|v|_V~ + |w|_V^)"),
     "C_A": ("AbdX, AbdV, AbdVV", "|A(u+v)|_{Q->X} <= C_A (1 + |v|)"),

@@ -14,8 +14,6 @@ from livepde.linalg import Array
 from livepde.records import STATUS_CODES
 from livepde.samples import Sample
 
-__all__ = ["Component"]
-
 # Difference of times that is attributed to rounding, relative to the period.
 SAME = 1e-9
 

@@ -18,8 +18,6 @@ from livepde.exchange.recipe import Recipe, recipe_of
 from livepde.exchange.slave import FOLDER
 from livepde.runs.exported import refuse_file
 
-__all__ = ["export_fmu", "is_code", "write_unit"]
-
 EXPORTERS = {2: "pythonfmu", 3: "pythonfmu3"}
 ABLE = (
     "canHandleVariableCommunicationStepSize",

@@ -17,8 +17,6 @@ from livepde.errors import ConfigurationError
 from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
 from livepde.streams import DataTable
 
-__all__ = ["Recipe", "opened", "recipe_of"]
-
 CASE, RECIPE = "case.toml", "recipe.json"
 FUNCTION = "() -> livepde.Identifier"
 

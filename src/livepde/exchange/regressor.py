@@ -10,8 +10,6 @@ from livepde.errors import ConfigurationError, SampleError
 from livepde.identifier import Identifier
 from livepde.result import Estimate
 
-__all__ = ["OnlineRegressor", "river_regressor"]
-
 
 class OnlineRegressor:
     """Online regressor with the verbs of river, learning and predicting one sample at a time.

@@ -19,8 +19,6 @@ from livepde.exchange.recipe import opened
 from livepde.exchange.unit_process import PERIOD, STATUS, OutputVariable, UnitProcess
 from livepde.units import in_si
 
-__all__ = ["FOLDER", "IdentifierSlave"]
-
 # Name of the folder within the resources of the unit.
 FOLDER = "process"
 

@@ -16,25 +16,13 @@ from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
 from livepde.model import Model
 from livepde.observation import Observed
+from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES
-from livepde.result import Estimate, Result, unknown_of, vertex_order
+from livepde.result import Estimate, Result, vertex_order
 from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value
 from livepde.units import conversion
-
-__all__ = [
-    "PERIOD",
-    "REFUSED",
-    "STATUS",
-    "WAITING",
-    "DataTimes",
-    "OutputVariable",
-    "Port",
-    "UnitProcess",
-    "of_case",
-    "of_code",
-]
 
 # Name of the parameter of a unit.
 PERIOD = "sample_period"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from skfem.helpers import dd as hess
+from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
+
 from livepde.fem.coefficients import Coefficients, numbers
 from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
@@ -33,21 +36,7 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
-from livepde.fem.notation import (
-    absolute,
-    ddot,
-    div,
-    dot,
-    grad,
-    hess,
-    maximum,
-    minimum,
-    mul,
-    positive,
-    trace,
-    transpose,
-    upwind,
-)
+from livepde.fem.notation import absolute, maximum, minimum, positive, upwind
 from livepde.fem.place import START, Inputs, Moment, Place, with_constants
 from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
 from livepde.fem.random_field import random_field

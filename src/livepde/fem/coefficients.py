@@ -15,8 +15,6 @@ from livepde.fem.priors import Normal
 from livepde.fem.space import FunctionSpace, Named
 from livepde.linalg import Array
 
-__all__ = ["Coefficients", "numbers"]
-
 
 def numbers(parameter: FunctionSpace, q: Array) -> Any:
     """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""

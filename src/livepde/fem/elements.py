@@ -12,8 +12,6 @@ from skfem.element.element_global import ElementGlobal
 
 from livepde.linalg import Array, IntArray
 
-__all__ = ["own"]
-
 
 class _LineHermite(ElementLineHermite):  # type: ignore[misc]
     """Cubic Hermite functions by their formula on the reference element.

@@ -17,8 +17,6 @@ import numpy as np
 from livepde.fem.scatter import Scatter
 from livepde.linalg import Array, IntArray
 
-__all__ = ["ElementProducts", "ElementTensor"]
-
 # Relative error of an element tensor in the common basis: rounding level.
 EXACT = 1e-13
 # Number of elements multiplied at once, which bounds the size of temporary arrays.

@@ -15,8 +15,6 @@ import numpy as np
 from livepde.errors import SpaceError
 from livepde.linalg import Array
 
-__all__ = ["CONSTANT", "Evolution", "MeanReverting", "Periodic", "RandomWalk"]
-
 
 def _positive(what: str, value: float) -> None:
     if not (np.isfinite(value) and value > 0):

@@ -33,8 +33,6 @@ from livepde.fem.priors import Normal
 from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
-__all__ = ["Block", "FieldBlock", "Local", "ScalarBlock", "base_name", "block_of"]
-
 JETS = ("value", "grad", "hess")
 # Relative residual of an L2 projection on a large mesh, solved by conjugate gradients.
 PROJECTED = 1e-13

@@ -19,22 +19,6 @@ from livepde.fem.priors import Normal, Prior
 from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
 
-__all__ = [
-    "Channel",
-    "Declaration",
-    "Field",
-    "Integrand",
-    "On",
-    "Piecewise",
-    "Predicate",
-    "Scalar",
-    "Scalars",
-    "Unknown",
-    "declared",
-    "interval",
-    "line",
-]
-
 # Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
 # with a probability of 2e-23.
 WITHIN = 10.0

@@ -38,8 +38,6 @@ from livepde.fem.scatter import Scatter, scatter
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern
 
-__all__ = ["Form", "FormMatrices", "Tensor", "ignores"]
-
 Tensor: TypeAlias = sp.csr_array | ElementTensor
 
 # Complex step. Its square is below rounding of any value, and no difference is formed that could

@@ -21,8 +21,6 @@ from livepde.fem.priors import Identity, Transform
 from livepde.fem.space import FunctionSpace
 from livepde.linalg import Array, IntArray, Pattern, sandwich
 
-__all__ = ["Composed", "Latent", "LatentPart", "compose"]
-
 
 @dataclass(frozen=True, eq=False)
 class LatentPart:

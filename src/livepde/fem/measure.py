@@ -19,8 +19,6 @@ from livepde.fem.elements import own
 from livepde.fem.place import Moment, Place
 from livepde.linalg import Array, IntArray
 
-__all__ = ["Measure"]
-
 # Number of quadrature points up to which shape functions evaluated on them are cached.
 KEPT = 300_000
 # Number of quadrature points of a piece of a larger measure, which bounds the size of temporary

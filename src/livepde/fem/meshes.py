@@ -40,18 +40,6 @@ from livepde.errors import SpaceError, optional
 from livepde.fem.fields import Predicate
 from livepde.linalg import Array
 
-__all__ = [
-    "box",
-    "cells",
-    "grid",
-    "hermite",
-    "linear",
-    "quadratic",
-    "read_mesh",
-    "rectangle",
-    "smooth",
-]
-
 LINEAR: dict[Any, Any] = {
     MeshLine: ElementLineP1,
     MeshTri: ElementTriP1,

@@ -11,24 +11,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from skfem.helpers import dd as hess
-from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
-
-__all__ = [
-    "absolute",
-    "ddot",
-    "div",
-    "dot",
-    "grad",
-    "hess",
-    "maximum",
-    "minimum",
-    "mul",
-    "positive",
-    "trace",
-    "transpose",
-    "upwind",
-]
 
 SERIES = (1 / 3, -1 / 45, 2 / 945, -1 / 4725, 2 / 93555, -1382 / 638512875)
 # Square of the Peclet number below which the truncated series is exact to rounding.

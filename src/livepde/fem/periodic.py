@@ -15,8 +15,6 @@ from livepde.errors import SpaceError
 from livepde.fem.fields import Field
 from livepde.linalg import IntArray
 
-__all__ = ["tied"]
-
 # Distance of two coefficients that count as the same place, relative to the size of the mesh.
 SLACK = 1e-6
 

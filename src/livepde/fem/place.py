@@ -10,8 +10,6 @@ from typing import Any, NoReturn
 from livepde.errors import MissingInputError
 from livepde.linalg import Array
 
-__all__ = ["START", "Moment", "Place", "with_constants"]
-
 
 class Inputs(dict[str, float]):
     """Values of the input channels at one moment, unchangeable; a missing name raises an error."""

@@ -14,17 +14,6 @@ import numpy as np
 from livepde.errors import SpaceError
 from livepde.linalg import Array
 
-__all__ = [
-    "Identity",
-    "Log",
-    "LogNormal",
-    "Logit",
-    "LogitNormal",
-    "Normal",
-    "Prior",
-    "Transform",
-]
-
 
 class Transform(ABC):
     """A smooth increasing function of one variable with its derivatives and its inverse."""

@@ -13,8 +13,6 @@ from scipy.linalg import cholesky, solve_triangular
 from livepde.errors import SpaceError
 from livepde.linalg import Array
 
-__all__ = ["random_field"]
-
 MOST = 8  # functions of a field at most
 KEPT = 0.98  # share of the mean variance that they represent, if so many are enough
 LEAST = 0.5  # share of it below which a stated deviation is not represented

@@ -12,8 +12,6 @@ import scipy.sparse as sp
 
 from livepde.linalg import Array, IntArray, Pattern
 
-__all__ = ["Scatter", "scatter", "shared"]
-
 Pairs = Sequence[tuple[IntArray, IntArray]]
 # Forms on one mesh repeat the same connectivity many times; on large meshes it would dominate the
 # memory. Weak references: entries vanish with their last user.

@@ -10,12 +10,11 @@ import scipy
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh
 from skfem.element import ElementLineHermite, ElementQuadBFS, ElementTriArgyris
+from skfem.helpers import dd as hess
+from skfem.helpers import ddot, dot, grad
 
 from livepde.errors import SpaceError
-from livepde.fem.notation import ddot, dot, grad, hess
 from livepde.linalg import Array, Pattern, analyse
-
-__all__ = ["Sobolev"]
 
 SMOOTH = (ElementLineHermite, ElementQuadBFS, ElementTriArgyris)  # of class C^1
 # Spacing of the quadrature points in log b. The trapezoidal rule has the error 2 exp(-2 pi^2 /

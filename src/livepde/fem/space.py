@@ -18,8 +18,6 @@ from livepde.fem.measure import Measure
 from livepde.fem.place import Moment
 from livepde.linalg import Array, IntArray, Mask, compact
 
-__all__ = ["FunctionSpace", "LocalSpace", "Named", "NamedUnknowns"]
-
 
 class Named(SimpleNamespace):
     """Namespace of several unknowns or components in forms and sensors: q.D, u.c."""

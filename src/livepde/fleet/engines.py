@@ -27,8 +27,6 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.stepping import Span
 
-__all__ = ["Beliefs", "BlockEngine", "Factors", "FleetEngine", "SeparateEngine", "State"]
-
 State: TypeAlias = Any
 """What evolves: the arrays or values of an engine."""
 

@@ -22,8 +22,6 @@ from livepde.result import Estimate, kept
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["FleetEstimate", "FleetResult"]
-
 MEMBER = "member"  # dimension of the dataset
 
 

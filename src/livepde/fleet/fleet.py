@@ -35,8 +35,6 @@ from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
-__all__ = ["Fleet"]
-
 FORMAT = 12  # of the checkpoint
 
 Values = ArrayLike | Mapping[str, ArrayLike]

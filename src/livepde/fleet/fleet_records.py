@@ -12,10 +12,9 @@ from livepde.fleet.engines import Beliefs, Factors
 from livepde.fleet.estimate import FleetEstimate
 from livepde.linalg import Array
 from livepde.model import Model
+from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES, Record, Snapshot
-from livepde.result import interval_ends, unknown_of, vertex_order
-
-__all__ = ["FleetRecords"]
+from livepde.result import interval_ends, vertex_order
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

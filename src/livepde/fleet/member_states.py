@@ -12,8 +12,6 @@ from livepde.fleet.engines import State
 from livepde.fleet.fleet import Fleet
 from livepde.linalg import Array, IntArray
 
-__all__ = ["JoinedStates", "MemberStates", "OwnStates", "states_of"]
-
 LOG = "state.log"  # its second axis has as many rows as a member needs
 ROOM = 8  # rows by which a log grows
 

@@ -20,8 +20,6 @@ from livepde.model import Model
 from livepde.observation import Observation
 from livepde.samples import number
 
-__all__ = ["Shard"]
-
 FORMAT = 1  # of `dump`
 BLOCK = 256  # members that step at once: more need more memory and are no faster
 

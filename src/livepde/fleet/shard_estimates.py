@@ -16,8 +16,6 @@ from livepde.linalg import Array
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["ShardEstimates"]
-
 REFUSED = "refused"
 
 

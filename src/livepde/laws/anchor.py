@@ -22,8 +22,6 @@ from livepde.model import Model, h1_form
 from livepde.spaces import HilbertSpace
 from livepde.stepping import Moments
 
-__all__ = ["Anchor"]
-
 
 class Anchor:
     """Corrects the state of members by their readings alone."""

@@ -20,17 +20,6 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Span
 from livepde.verdict import Judge, Ledger, ScoredSample
 
-__all__ = [
-    "HALF_LOG",
-    "OK",
-    "Assimilation",
-    "GateDecision",
-    "MemberReports",
-    "absorb",
-    "assimilate",
-    "no_readings",
-]
-
 OK = Status()
 MEMORY = 500.0  # samples: older ones fade from the noise level
 HALF_LOG = 0.5 * math.log(2.0 * math.pi)

@@ -30,8 +30,6 @@ from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.sentences import LIKELY, amount_of, table_of
 
-__all__ = ["Columns", "Explained", "likely_columns"]
-
 MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
 FEWEST_ROWS = 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute

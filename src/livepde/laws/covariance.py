@@ -9,8 +9,6 @@ from livepde.laws.filter_state import FilterState
 from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 
-__all__ = ["reported_factors", "robust_factors"]
-
 
 def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
     """Return a square root [U C] of the robust covariance, (members, r, n) and (members, r, k).

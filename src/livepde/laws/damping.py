@@ -16,8 +16,6 @@ import numpy as np
 
 from livepde.errors import LawError
 
-__all__ = ["ConstantDamping", "Damping", "Residual", "ResidualDamping"]
-
 
 class Residual:
     """Squared norms of the observed residual r = R u - u_alpha, and of u_alpha to compare it with.

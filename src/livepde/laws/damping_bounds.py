@@ -13,20 +13,6 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.laws.damping import Damping, Residual
 
-__all__ = [
-    "Constants",
-    "ExactBound",
-    "NoisyBound",
-    "Norms",
-    "SmoothedBound",
-    "nu_exact",
-    "nu_noisy",
-    "theta_exact",
-    "theta_noisy",
-    "theta_smoothed",
-    "unobserved_damping",
-]
-
 
 @dataclass(frozen=True)
 class Norms:

@@ -10,8 +10,6 @@ import numpy as np
 
 from livepde.fem import dot, grad
 
-__all__ = ["DiffusionOperator", "diffusion_operator"]
-
 Diffusivity: TypeAlias = float | Callable[[Any], Any]
 
 

@@ -38,8 +38,6 @@ from livepde.spaces import HilbertSpace
 from livepde.verdict import FEWEST, Finding, Severity, Verdict, too_few
 from livepde.verdict.sentences import FINDINGS, percent
 
-__all__ = ["EquationLedger", "EquationTests", "ObservedEquation"]
-
 TESTS = 8  # test functions: random, and smooth
 DEVIATIONS = 3.0  # of the sum of products, that may be chance
 LASTS = 0.15  # error that goes on, over what q and the process do, from which it is a caution

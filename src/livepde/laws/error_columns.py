@@ -26,8 +26,6 @@ from livepde.model import Model
 from livepde.stepping import ForwardStage
 from livepde.verdict.missing_terms import boundary_lifts, flux_loads, force, scaled_channel
 
-__all__ = ["FULL", "SMALL", "Course", "ErrorColumns", "hats"]
-
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute
 MOST_UNKNOWNS = 4  # that may jump or drift
 STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes

@@ -35,8 +35,6 @@ from livepde.model import Model, h1_form, mass_form
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 
-__all__ = ["ExcitationGate", "ExcitationLevel", "Probes"]
-
 PROBES = 16  # pairs of random functions: their products scatter by a quarter
 
 

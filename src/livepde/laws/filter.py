@@ -44,8 +44,6 @@ from livepde.verdict import Judge
 
 Steps: TypeAlias = int | IntArray
 
-__all__ = ["Filter", "Update", "contraction"]
-
 FEW_SUBSTEPS = 600  # of a pause, to find how uncertain it leaves the state
 FEW = 8  # members up to which LAPACK is called for each
 BLOCK = 32  # columns that LAPACK's QR takes at once

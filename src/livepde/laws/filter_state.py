@@ -15,16 +15,6 @@ from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 from livepde.verdict import Ledger
 
-__all__ = [
-    "NO_LEDGER",
-    "FilterState",
-    "along",
-    "extended",
-    "unaccompanied",
-    "unjudged",
-    "with_rows",
-]
-
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
 

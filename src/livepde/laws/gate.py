@@ -11,8 +11,6 @@ import numpy as np
 from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["Gate", "Gated", "Screened"]
-
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 LASTING = 100  # readings that misfit, after which constants have to explain them as well
 CALM = 50  # samples without a correction of the state, after which a disturbance is over

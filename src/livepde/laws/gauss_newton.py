@@ -11,8 +11,6 @@ from livepde.laws.filter import Filter
 from livepde.laws.filter_state import FilterState, along
 from livepde.linalg import Array
 
-__all__ = ["CONVERGED", "Window", "distance", "missed_most", "next_reference", "placed"]
-
 CONVERGED = 0.5  # standard deviations between reference and estimate at which the steps stop
 STRIDE = 1.0  # prior standard deviations that a step moves the reference at most: a trust region
 

@@ -24,8 +24,6 @@ from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance
 
-__all__ = ["GradientLaw", "GradientState"]
-
 
 @dataclass(frozen=True, eq=False)
 class GradientState:

@@ -35,8 +35,6 @@ from livepde.laws.sample_smoothing import smooths
 from livepde.linalg import Array, Memo, Pattern
 from livepde.stepping import Newton
 
-__all__ = ["GradientParts", "StageSequence", "constant_parts", "tuned_parts"]
-
 ROUNDING = 1e-9  # of entries of P, which are at most about one
 SAME = 1e-9  # of a step: times that are the same but for rounding
 MOST_STAGES = 8  # kept for different sets of present sensors

@@ -9,8 +9,6 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.linalg import Array, Mask
 
-__all__ = ["Guards"]
-
 
 @dataclass(frozen=True)
 class Guards:

@@ -17,8 +17,6 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import KeptFactors, MemberStage, StageOfMembers, member_stage
 
-__all__ = ["HalvedMesh", "refusal"]
-
 
 @dataclass(frozen=True, eq=False)
 class HalvedMesh:

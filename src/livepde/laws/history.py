@@ -16,19 +16,6 @@ from livepde.fem import Inputs
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import End, Interval, Span, own_noise
 
-__all__ = [
-    "added",
-    "empty_log",
-    "first_interval",
-    "intervals_since",
-    "opened",
-    "reaching",
-    "skipped",
-    "trimmed",
-    "with_readings",
-    "withdrawn",
-]
-
 SPARE = np.inf  # time of rows that are not in use
 ROWS = 64  # least room of a log
 

@@ -94,8 +94,6 @@ from livepde.linalg import Array, Memo, Pattern
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Information", "InformationMetric"]
-
 PULL = 10.0  # theta h: r forgets within a step
 HELD = 1e6  # times heavier than a sample is a prior that keeps q where it is
 LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error is a few per cent

@@ -10,8 +10,6 @@ from livepde.laws.member_arrays import product
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 
-__all__ = ["Innovations"]
-
 WINDOW = 500  # samples: older innovations fade, so that a poor start is forgotten
 SLOW = 50  # samples over which innovations are averaged to find errors that hide below the noise
 LARGEST_CORRELATION = 0.999

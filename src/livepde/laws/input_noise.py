@@ -17,15 +17,6 @@ from livepde.laws.reduction import Reduction
 from livepde.linalg import Array
 from livepde.stepping import Span, StepFailed
 
-__all__ = [
-    "PAUSE_ROWS",
-    "after_pause",
-    "initial_rows",
-    "input_rank",
-    "with_initial_rows",
-    "with_input_noise",
-]
-
 Propagate: TypeAlias = Callable[[FilterState, Span], tuple[FilterState, Any, StepFailed | None]]
 
 # Rows of the square root for each noisy channel: with 10 the standard deviation of a state near the

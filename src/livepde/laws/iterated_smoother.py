@@ -27,8 +27,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 from livepde.stepping import Interval
 
-__all__ = ["HOLDS", "apart", "expecting", "iterate_starts", "missed", "moved", "usual"]
-
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable

@@ -14,8 +14,6 @@ from livepde.laws.innovations import Innovations
 from livepde.laws.member_arrays import where
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["Jumps", "Watch"]
-
 LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
 
 

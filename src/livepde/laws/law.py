@@ -19,21 +19,6 @@ from livepde.observation import Observed
 from livepde.stepping import Advance, ImplicitEuler, Interval, Scheme, StepFailed
 from livepde.verdict import Verdict
 
-__all__ = [
-    "Belief",
-    "Deferred",
-    "Fit",
-    "FixedInterval",
-    "InitialReading",
-    "Law",
-    "Problem",
-    "Report",
-    "Status",
-    "finite",
-    "numerical",
-    "stepped",
-]
-
 LARGEST = 1e150  # of a sum of squares: the product of two of them is finite
 REMEDIES = {
     "ok": "",

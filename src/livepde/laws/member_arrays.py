@@ -12,8 +12,6 @@ import numpy as np
 
 from livepde.linalg import Array, Mask
 
-__all__ = ["changed", "join", "product", "put", "put_each", "take", "where", "zeros"]
-
 State = TypeVar("State")
 
 

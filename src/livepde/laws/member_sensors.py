@@ -14,8 +14,6 @@ from livepde.linalg import Array, RowProduct, row_product
 from livepde.observation import Observed
 from livepde.stepping import Moments
 
-__all__ = ["MemberSensors"]
-
 
 class MemberSensors:
     """Predicted readings of each member and their derivatives, linear about its point."""

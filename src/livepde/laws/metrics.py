@@ -17,8 +17,6 @@ from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 
-__all__ = ["ConstantMetric", "MetricRule", "MetricStep", "NoState", "StepBegin", "Transition"]
-
 HOLD = 1e12  # times smaller is a gain that keeps q where it is
 
 MetricStep = Callable[[float], Metric]

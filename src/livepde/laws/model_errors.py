@@ -26,8 +26,6 @@ from livepde.verdict.averaged import Causes, Family, LinearModel, Mixture, avera
 from livepde.verdict.directions import sensor_shifts
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
-__all__ = ["linear_model", "model_errors"]
-
 MANY = 150  # samples that tell apart what the full list has
 MOST_COLUMNS = 250  # of the process in the full list
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute with the full list

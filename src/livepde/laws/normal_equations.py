@@ -18,8 +18,6 @@ import scipy.sparse as sp
 
 from livepde.linalg import Array, Pattern
 
-__all__ = ["Gain", "NormalEquations", "ProjectedRows", "SelectedRows", "diagonal_bound"]
-
 
 @dataclass(frozen=True, eq=False)
 class Gain:

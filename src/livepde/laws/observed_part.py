@@ -17,14 +17,6 @@ from livepde.linalg import Array, Memo
 from livepde.observation import Reconstructed, Split
 from livepde.stepping import Interval
 
-__all__ = [
-    "GeneralizedInverse",
-    "ObservedPart",
-    "ObservedPath",
-    "RegularizedInverse",
-    "SelfChosenSmoothing",
-]
-
 LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
 
 State = TypeVar("State")

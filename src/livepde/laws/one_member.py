@@ -39,8 +39,6 @@ from livepde.laws.sensitivity_state import (
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.stepping import Interval
 
-__all__ = ["step_alone"]
-
 NEAR_ONSETS = (-8, -6, -4, -3, -2, -1, 0, 1, 2, 3)  # of a first guess of when a jump was
 TEMPER = 10.0  # factor on the noise of a sample whose Gauss-Newton steps do not converge
 

@@ -12,8 +12,6 @@ import numpy as np
 
 from livepde.linalg import Array, Mask
 
-__all__ = ["FEW", "near_most", "near_neighbours", "usual_size"]
-
 NEIGHBOURS = 3  # to each side
 FEW = 2 * NEIGHBOURS
 NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes

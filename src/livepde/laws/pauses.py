@@ -15,8 +15,6 @@ import numpy as np
 from livepde.linalg import Array, Mask
 from livepde.stepping import Span
 
-__all__ = ["InputHistory", "pauses"]
-
 PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # intervals before which none is usual
 SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range

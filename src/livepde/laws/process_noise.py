@@ -28,8 +28,6 @@ import numpy as np
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Advance
 
-__all__ = ["NoiseRows", "grades", "pieces"]
-
 SHORT = 1e-3  # steps over relaxation times below which a path is that of a random walk
 LONGEST = 0.35  # of the last part of a step over the memory of the readings: standard deviations
 # are within 1 % of those of the exact filter then (tests/test_sparse_samples.py)

@@ -14,8 +14,6 @@ from livepde.fem import Evolution, FieldBlock, base_name
 from livepde.laws.law import Problem
 from livepde.linalg import Array, Mask
 
-__all__ = ["ReducedEvolution", "Reduction"]
-
 LEFT_OUT = 1e-4  # share of the prior variance of a field that modes="auto" leaves out
 MOST_MODES = 60  # of a field with modes="auto"
 

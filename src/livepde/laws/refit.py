@@ -19,8 +19,6 @@ from livepde.laws.refit_options import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, Mask
 
-__all__ = ["Found", "plausible", "refitted"]
-
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many

@@ -22,8 +22,6 @@ from livepde.laws.refits import refitted_now
 from livepde.laws.sensitivity_state import Fork, SensitivityState, SensitivityWork
 from livepde.linalg import nonfinite_allowed
 
-__all__ = ["go_on"]
-
 LATER = 8  # a refit of n samples is used n / 8 samples after it began
 AT_A_TIME = 3  # samples since then that a step takes with the filter of the refit
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 from livepde.errors import LawError
 
-__all__ = ["Refit"]
-
 
 @dataclass(frozen=True)
 class Refit:

@@ -20,8 +20,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import StoredSamples
 from livepde.linalg import Array, Mask, nonfinite_allowed
 
-__all__ = ["refit_due", "refitted_now", "settle"]
-
 AT_ONCE = 64  # samples up to which a refit takes no thread of its own: it is as short as ten steps
 NEAR = 1.0  # standard deviations within which a refit that another one follows keeps these sums
 

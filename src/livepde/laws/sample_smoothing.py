@@ -39,8 +39,6 @@ from livepde.linalg import Array
 from livepde.observation import Observed, Split, Tikhonov
 from livepde.observation.reconstruction import Spectral, penalty_matrix
 
-__all__ = ["Balance", "NoiseDetector", "SmoothingOperator", "smooths"]
-
 ORDER = 4  # of the iterated Tikhonov method
 GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
 LARGEST = 3000  # sensors: the modes are those of a dense matrix

@@ -73,8 +73,6 @@ from livepde.stepping import (
     member_stage,
 )
 
-__all__ = ["SensitivityLaw"]
-
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
 GUESS = 2.0  # samples that the first guess of the noise counts for

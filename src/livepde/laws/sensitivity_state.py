@@ -24,22 +24,6 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.records import refusal
 from livepde.stepping import Span
 
-__all__ = [
-    "NEVER",
-    "FitState",
-    "Fork",
-    "Scale",
-    "SensitivityState",
-    "SensitivityWork",
-    "kept_for_estimates",
-    "new_window",
-    "reports_of",
-    "restarted",
-    "shortened",
-    "stored",
-    "without_past",
-]
-
 SMOOTHED = 64  # samples that are smoothed again where unknowns move, at most
 LEAST = 32  # rows that a log is shortened by: a copy for each sample would cost more
 NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any more

@@ -10,8 +10,6 @@ from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray
 from livepde.stepping import KeptFactors
 
-__all__ = ["ShadowState"]
-
 
 @dataclass(frozen=True, eq=False)
 class ShadowState:

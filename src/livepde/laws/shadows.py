@@ -48,8 +48,6 @@ from livepde.stepping import (
 )
 from livepde.verdict import Shifts
 
-__all__ = ["KINDS", "ShadowSet", "Shadows"]
-
 FIRST = 16  # steps that are all shadowed: where a run begins the error changes from step to step
 CALM = 4  # steps after a jump that are all shadowed
 JUMP = 4.0  # times the usual difference of two changes of the state: something has jumped

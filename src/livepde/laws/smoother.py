@@ -37,8 +37,6 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import KeptFactors, Span
 
-__all__ = ["smoothed"]
-
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 2  # of a step that makes samples and prior less probable
 CONVERGED = 0.1  # standard deviations that a step moves the trajectory by, at the end of it

@@ -13,8 +13,6 @@ from livepde.linalg import Array
 from livepde.verdict import Shifts
 from livepde.verdict.shifts import NOT_KNOWN, known
 
-__all__ = ["Diagnostics", "stacked"]
-
 Number = TypeVar("Number")
 Other = TypeVar("Other")
 

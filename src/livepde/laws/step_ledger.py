@@ -14,8 +14,6 @@ from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import Finding, Severity
 from livepde.verdict.sentences import FINDINGS
 
-__all__ = ["COUNTS", "StepLedger", "step_findings"]
-
 COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
 
 SOME = 0.02  # share of the samples from which failed steps are more than a mishap

@@ -13,8 +13,6 @@ from livepde.laws.law import Problem
 from livepde.linalg import Array
 from livepde.stepping import Moments, Span
 
-__all__ = ["ALLOWED", "StepTolerance"]
-
 # Of the noise of a reading: the error of one step, root mean square over the domain. A front that
 # passes a sensor shows the errors of ten to twenty steps, in a few readings: with this share they
 # shift the unknowns by less than 0.3 standard deviations (tests/test_step_choice.py).

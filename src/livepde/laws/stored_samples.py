@@ -24,8 +24,6 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, Mask
 from livepde.stepping import BandedStage, Span, StageOfMembers, advance
 
-__all__ = ["Passed", "StoredSamples"]
-
 FACTORS = 32  # factorised matrices that a pass keeps: one for each length of a stage
 TOGETHER = 6  # trajectories that are tried at once where one array holds them
 AT_ONCE = 32  # trajectories that are followed as one array

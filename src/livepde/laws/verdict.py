@@ -37,16 +37,6 @@ from livepde.verdict import (
 )
 from livepde.verdict.sentences import FINDINGS, percent
 
-__all__ = [
-    "after_fit",
-    "judge_of",
-    "judged",
-    "with_columns",
-    "with_discretisation",
-    "with_errors",
-    "with_fit",
-]
-
 COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
 

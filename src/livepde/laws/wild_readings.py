@@ -13,8 +13,6 @@ import numpy as np
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping import Interval
 
-__all__ = ["ReadingRange"]
-
 ABSURD = 10.0  # ranges outside of the past, as in the gate of `SensitivityLaw`
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 SETTLED = 20  # readings of a sensor before which its range is not known

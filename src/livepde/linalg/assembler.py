@@ -11,8 +11,6 @@ import scipy.sparse as sp
 from livepde.linalg.pattern import Pattern, sandwich
 from livepde.linalg.types import Array, IntArray, Sparse
 
-__all__ = ["Assembler"]
-
 
 class Assembler:
     """Assembler of a square block matrix, with linear maps from block data to its data.

@@ -14,8 +14,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array, IntArray
 
-__all__ = ["BandedSolver"]
-
 # Number of entries of a triangle up to which copying it costs more than the faster solve saves.
 FEW = 300
 

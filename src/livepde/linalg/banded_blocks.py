@@ -12,8 +12,6 @@ from scipy.linalg import lapack
 from livepde.linalg.banded import BandedSolver
 from livepde.linalg.types import Array, IntArray
 
-__all__ = ["BandedBlocks", "BlockFactor"]
-
 NONE = np.zeros(0, dtype=np.intp)
 
 

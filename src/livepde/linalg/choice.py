@@ -35,8 +35,6 @@ from livepde.linalg.pattern import Pattern
 from livepde.linalg.protocol import Solver
 from livepde.linalg.superlu import SuperLUSolver
 
-__all__ = ["Choice", "analyse", "choose"]
-
 # Largest half bandwidth of banded LU; the limits are those of the table above.
 WIDEST_BAND = 48
 # Half bandwidth up to which Pardiso is not faster than SuperLU for general matrices.

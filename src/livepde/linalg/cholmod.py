@@ -13,8 +13,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array
 
-__all__ = ["CholmodSolver"]
-
 
 @dataclass(frozen=True, eq=False)
 class CholmodFactor:

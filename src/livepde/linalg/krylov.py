@@ -9,8 +9,6 @@ import numpy as np
 from livepde.errors import LinearAlgebraError
 from livepde.linalg.types import Array
 
-__all__ = ["conjugate_gradients", "gmres"]
-
 Map = Callable[[Array], Array]
 
 

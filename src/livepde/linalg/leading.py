@@ -9,8 +9,6 @@ import numpy as np
 from livepde.linalg.protocol import Factor
 from livepde.linalg.types import Array
 
-__all__ = ["Leading"]
-
 
 @dataclass(frozen=True, eq=False)
 class Leading:

@@ -15,8 +15,6 @@ from livepde.linalg.pattern import Pattern
 from livepde.linalg.protocol import Factor
 from livepde.linalg.types import Array
 
-__all__ = ["MultigridSolver", "approximate_inverse"]
-
 # Residual of a solve relative to the right-hand side.
 TOLERANCE = 1e-10
 ITERATIONS = 200

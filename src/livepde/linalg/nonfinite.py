@@ -8,8 +8,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-__all__ = ["nonfinite_allowed"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -15,8 +15,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array, IntArray
 
-__all__ = ["PardisoSolver"]
-
 POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
 FACTORISE, REFACTORISE, SOLVE = 12, 22, 33  # its phases
 # The value of MKL_CBWR_AUTO: results do not depend on the alignment of arrays in memory, so that

@@ -10,8 +10,6 @@ import scipy.sparse as sp
 
 from livepde.linalg.types import Array, IntArray, Sparse
 
-__all__ = ["Pattern", "compact", "sandwich"]
-
 # Number of entries up to which a dense product is faster than a sparse one.
 DENSE = 10_000
 

@@ -7,8 +7,6 @@ from typing import Protocol
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array
 
-__all__ = ["Factor", "Solver"]
-
 
 class Factor(Protocol):
     """A factorised matrix."""

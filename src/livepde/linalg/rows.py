@@ -10,8 +10,6 @@ import scipy.sparse as sp
 
 from livepde.linalg.types import Array
 
-__all__ = ["RowProduct", "row_product"]
-
 # Entries up to which a dense product costs less than one by diagonals, and than a sparse one.
 DENSE, WIDE = 2_500, 10_000
 # Diagonals up to which they cost less than a sparse product.

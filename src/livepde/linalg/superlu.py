@@ -13,8 +13,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg.pattern import Pattern
 from livepde.linalg.types import Array
 
-__all__ = ["SuperLUSolver", "positive_definite"]
-
 SYMMETRIC: dict[str, Any] = {
     "permc_spec": "MMD_AT_PLUS_A",
     "diag_pivot_thresh": 0.0,

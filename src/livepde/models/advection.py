@@ -11,8 +11,6 @@ from livepde.fem.notation import upwind
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
 
-__all__ = ["ADVECTION_DIFFUSION", "advection_diffusion"]
-
 
 def advection_diffusion(
     mesh: Any,

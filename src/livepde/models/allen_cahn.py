@@ -10,8 +10,6 @@ from livepde.model import Model
 from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, by_name
 
-__all__ = ["ALLEN_CAHN", "allen_cahn"]
-
 
 def allen_cahn(
     mesh: Any,

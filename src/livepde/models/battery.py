@@ -11,8 +11,6 @@ from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, closed
 
-__all__ = ["BATTERY_PARTICLE", "FARADAY", "battery_particle"]
-
 FARADAY = 96485.33212  # C/mol
 
 

@@ -15,8 +15,6 @@ from livepde.model import Model
 from livepde.models.common import Number
 from livepde.models.description import Equation, Option, Quantity, Variable, closed
 
-__all__ = ["BOREHOLE", "GROUTED_BOREHOLE", "borehole", "fluid", "grouted_borehole"]
-
 
 def borehole(
     mesh: Any,

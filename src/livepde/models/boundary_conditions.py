@@ -16,8 +16,6 @@ from livepde.errors import ModelError
 from livepde.fem import Channel, On, Place, Unknown
 from livepde.model import Model
 
-__all__ = ["Amount", "Exchange", "Flux", "Multiple", "Source", "with_conditions"]
-
 
 @dataclass(frozen=True)
 class Multiple:

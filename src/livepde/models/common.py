@@ -11,8 +11,6 @@ from livepde.fem import Field, Integrand, Unknown
 from livepde.model import Model
 from livepde.models.description import Variable
 
-__all__ = ["INITIAL", "Number", "autonomous", "state"]
-
 Number: TypeAlias = Unknown | float
 """A coefficient of an equation: unknown, or a known number."""
 

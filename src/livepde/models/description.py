@@ -11,8 +11,6 @@ from livepde.errors import ModelError
 from livepde.fem import Place, Unknown
 from livepde.model import Model
 
-__all__ = ["Equation", "Fluxes", "Option", "Quantity", "Variable", "by_name", "closed"]
-
 
 @dataclass(frozen=True)
 class Variable:

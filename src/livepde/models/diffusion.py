@@ -22,8 +22,6 @@ from livepde.fem import (
 from livepde.model import Model
 from livepde.models.description import Equation, Fluxes, Option, Variable, by_name
 
-__all__ = ["CONDUCTION", "HEAT", "conduction", "heat"]
-
 AMBIENT = "ambient"
 
 

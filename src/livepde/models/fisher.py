@@ -12,8 +12,6 @@ from livepde.fem import Field, Unknown, dot, grad, linear, positive
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, by_name
 
-__all__ = ["FISHER_KPP", "POROUS_FISHER", "fisher_kpp", "porous_fisher"]
-
 
 def fisher_kpp(
     mesh: Any,

@@ -14,8 +14,6 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, closed
 
-__all__ = ["GROUNDWATER", "PUMPING_TEST", "groundwater", "pumping_test", "well"]
-
 
 def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any = None) -> Model:
     """Return Ss r s_t - (k r s_r)_r = 0 for the drawdown s around a well pumped at Q(t).

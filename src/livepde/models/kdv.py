@@ -9,8 +9,6 @@ from livepde.model import Model
 from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, closed
 
-__all__ = ["KDV", "kdv"]
-
 
 def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = None) -> Model:
     """Return the Korteweg-de Vries equation u_t + a u u_x + b u_xxx = 0 on a periodic interval.

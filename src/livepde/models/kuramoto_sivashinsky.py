@@ -9,8 +9,6 @@ from livepde.model import Model
 from livepde.models.common import INITIAL, Number, autonomous, state
 from livepde.models.description import Equation, Variable, closed
 
-__all__ = ["KURAMOTO_SIVASHINSKY", "kuramoto_sivashinsky"]
-
 
 def kuramoto_sivashinsky(
     mesh: Any,

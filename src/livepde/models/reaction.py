@@ -9,8 +9,6 @@ from livepde.fem import Field, Unknown, dot, grad, hermite
 from livepde.model import Model, Source
 from livepde.models.description import Equation, Option, Variable, by_name
 
-__all__ = ["REACTION_DIFFUSION", "reaction_diffusion"]
-
 
 def reaction_diffusion(
     mesh: Any,

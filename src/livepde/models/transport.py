@@ -11,8 +11,6 @@ from livepde.fem import Channel, Field, On, Unknown, grad, linear
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, closed
 
-__all__ = ["ADVECTION_DISPERSION", "MOBILE_IMMOBILE", "advection_dispersion", "mobile_immobile"]
-
 INLETS = ("flux", "fixed")
 
 

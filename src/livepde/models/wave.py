@@ -10,8 +10,6 @@ from livepde.fem import Field, Unknown, dot, grad, linear
 from livepde.model import Model, Source
 from livepde.models.description import Equation, Variable, by_name
 
-__all__ = ["WAVE", "wave"]
-
 
 def wave(
     mesh: Any,

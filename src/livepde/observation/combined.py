@@ -17,8 +17,6 @@ from livepde.linalg import Array, Mask
 from livepde.observation.operator import STEP, Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Calibrated", "CalibratedObserved", "Combined", "CombinedObserved"]
-
 
 @dataclass(frozen=True, eq=False)
 class Combined(Observation):

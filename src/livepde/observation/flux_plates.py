@@ -18,8 +18,6 @@ from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["FluxPlates", "FluxPlatesObserved", "in_cells"]
-
 
 def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
     """Return the matrix from q to the mean of an unknown over each cell, shape (cells, m).

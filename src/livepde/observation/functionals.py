@@ -15,8 +15,6 @@ from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Functionals", "FunctionalsObserved"]
-
 STATE, PARAMETER = "u_", "q_"  # in front of the names of unknowns in the joint space
 
 

@@ -14,8 +14,6 @@ from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Moving", "MovingObserved"]
-
 
 @dataclass(frozen=True, eq=False)
 class Moving(Observation):

@@ -30,8 +30,6 @@ from livepde.linalg import Array, Mask
 from livepde.observation.operator import STEP, Direct, Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Transformed", "TransformedObserved"]
-
 Reading = Callable[[Array], Array]
 """What each sensor shows for the value it sees: (sensors,) -> (sensors,), one by one."""
 

@@ -23,8 +23,6 @@ from livepde.observation.reconstruction import (
 from livepde.observation.split import Split, is_selection
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Observation", "Observed"]
-
 Direct = Callable[[Any, Place], Any]
 # Complex step: exact to rounding, as in `livepde.fem.forms`.
 STEP = 1e-30

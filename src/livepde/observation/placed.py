@@ -15,8 +15,6 @@ from livepde.linalg import Array, IntArray
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
 
-__all__ = ["POSITION", "PlacedObserved", "shift_names"]
-
 # Name of the unknown: one number for each sensor and coordinate.
 POSITION = "position"
 AXES = "xyz"

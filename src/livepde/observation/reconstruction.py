@@ -28,19 +28,6 @@ from livepde.linalg import Array, Mask
 from livepde.observation.split import Split
 from livepde.spaces import HilbertSpace
 
-__all__ = [
-    "Alpha",
-    "Apriori",
-    "BoundSensors",
-    "Discrepancy",
-    "Pseudoinverse",
-    "Reconstructed",
-    "Reconstruction",
-    "Reconstructor",
-    "Spectral",
-    "Tikhonov",
-]
-
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
 # Relative accuracy of alpha in the discrepancy principle.
 ROOT = 1e-10

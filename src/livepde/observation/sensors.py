@@ -17,8 +17,6 @@ from livepde.observation.operator import Direct, Observation, Observed
 from livepde.observation.placed import POSITION, PlacedObserved, shift_names
 from livepde.spaces import HilbertSpace
 
-__all__ = ["Averages", "LineIntegrals", "Matrix", "Points"]
-
 
 @dataclass(frozen=True, eq=False)
 class Points(Observation):

@@ -10,8 +10,6 @@ import scipy.sparse as sp
 
 from livepde.linalg import Array, IntArray
 
-__all__ = ["Split", "is_selection"]
-
 
 @dataclass(frozen=True, eq=False)
 class Split:

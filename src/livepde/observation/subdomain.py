@@ -18,8 +18,6 @@ from livepde.observation.operator import Observation
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Full", "Subdomain"]
-
 # Quadrature order of the points at which the predicate is evaluated. All are inside of the element,
 # so that its boundary nodes do not decide.
 INTERIOR = 3

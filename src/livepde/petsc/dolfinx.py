@@ -16,8 +16,6 @@ from livepde.linalg import Array, IntArray
 from livepde.petsc.petsc_model import petsc_module
 from livepde.petsc.vectors import gathered, standard_vector
 
-__all__ = ["DolfinxModel"]
-
 OBSERVED, HIDDEN = 1, 2  # tags of cells
 
 

@@ -24,8 +24,6 @@ from livepde.petsc.petsc_filter import PetscFilterState
 from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.vectors import zeros
 
-__all__ = ["load_state", "save_state"]
-
 OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
 OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X
 

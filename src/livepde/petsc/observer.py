@@ -38,8 +38,6 @@ from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order
 from livepde.petsc.vectors import free_mask, linear_solver, multigrid, random_vector, zeros
 from livepde.stepping import StepFailed
 
-__all__ = ["ObserverReport", "ObserverState", "PetscObserver"]
-
 PREFIX = "livepde_coupled_"
 OPTIONS = """
 ksp_type fgmres, ksp_gmres_restart 60, pc_type fieldsplit, pc_fieldsplit_type schur,

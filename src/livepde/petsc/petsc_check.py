@@ -9,8 +9,6 @@ from livepde.errors import ModelError
 from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.vectors import free_mask, random_vector, zeros
 
-__all__ = ["check_petsc_model"]
-
 STEP = 1e-6  # of the differences, relative
 CLOSE = 1e-5  # to a derivative, of a central difference with such a step
 ROUNDING = 1e-10

@@ -29,8 +29,6 @@ from livepde.petsc.petsc_model import PetscModel
 from livepde.petsc.step import ImplicitStep, advance, require_order
 from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
 
-__all__ = ["FilterReport", "PetscFilter", "PetscFilterState", "leading_modes", "number_modes"]
-
 ACCURATE = 1e-14  # relative change of the variances of modes
 
 

@@ -8,8 +8,6 @@ from typing import Any, Protocol, runtime_checkable
 from livepde.errors import ConfigurationError
 from livepde.linalg import IntArray
 
-__all__ = ["PetscModel", "petsc_module"]
-
 MISSING = (
     "livepde.petsc needs petsc4py, mpi4py and, for UFL, DOLFINx; deploy/petsc.sh sets up an "
     "environment with Debian's packages: see docs/parallel.md."

@@ -13,8 +13,6 @@ from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.vectors import free_mask, linear_solver
 from livepde.stepping import StepFailed
 
-__all__ = ["ImplicitStep", "advance"]
-
 RESTING = 1e-6  # of u: residuals of smaller changes in a step are relative to it
 TINY = 1e-300
 SAME = 1e-9  # of a step: steps that are the same but for rounding

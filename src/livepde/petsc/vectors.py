@@ -10,8 +10,6 @@ import numpy as np
 from livepde.linalg import Array, IntArray
 from livepde.petsc.petsc_model import petsc_module
 
-__all__ = ["combined", "gathered", "inner", "linear_solver", "multigrid", "random_vector"]
-
 RIESZ = "livepde_riesz_"  # prefix of PETSc's options
 
 

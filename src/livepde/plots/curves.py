@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ensemble", "history", "loops", "profiles"]
-
 MARKERS = "osD^vP*X"
 # End of a name -> meaning, style and colour of its line in a panel of `loops`.
 LOOP_LINES = {

@@ -16,24 +16,6 @@ from livepde.records import NOTE, scalars
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "MOST_LINES",
-    "SensorPlaces",
-    "groups",
-    "labelled",
-    "modes_told",
-    "note",
-    "prior_left",
-    "scored_from",
-    "sensor_names",
-    "sensor_places",
-    "sensor_units",
-    "time_label",
-    "time_scale",
-    "time_text",
-    "time_values",
-]
-
 # Largest number of lines in a panel; more sensors are drawn as one line with their range.
 MOST_LINES = 7
 # Time span from which a unit of the time axis is used, its length in seconds, its name.

@@ -32,17 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "RunPlots",
-    "corner",
-    "curves",
-    "estimates",
-    "field",
-    "measured_and_predicted",
-    "overview",
-    "residuals",
-]
-
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
 RESIDUALS = (  # variable, its dimension, title of its panel
     ("innovation", "sensor", "innovation"),

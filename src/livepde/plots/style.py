@@ -14,18 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "GREY",
-    "PALETTE",
-    "empty",
-    "figure",
-    "figure_class",
-    "finish",
-    "panel",
-    "shades_of",
-    "time_axis",
-]
-
 # Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
 # is omitted, because it is invisible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")

@@ -28,17 +28,17 @@ from typing import Any, Literal
 import numpy as np
 
 from livepde import paper, plots
-from livepde.identifier import Identifier, Sample
+from livepde.diagnostics.check_report import Check, Table
+from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, ConstantDamping, ResidualDamping
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, failures, track
 from livepde.result import Result
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
+from livepde.samples import Sample
 from livepde.streams import RelativeNoise, Twin
-
-__all__ = ["BOIGER2016", "Ensemble", "NoisyTwin"]
 
 LEVELS = (0.01, 0.05, 0.10)
 SEEDS = (0, 1, 2, 3, 4)

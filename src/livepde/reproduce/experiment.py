@@ -8,15 +8,14 @@ from typing import Protocol
 
 import numpy as np
 
+from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.result import Estimate, Result
-from livepde.runs.outcome import Check, Outcome
+from livepde.runs.outcome import Outcome
 from livepde.streams import Twin
-
-__all__ = ["Experiment", "Failing", "Track", "failures", "track"]
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Field, Normal, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
@@ -28,11 +29,9 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Subdomain
 from livepde.reproduce.experiment import Experiment, Track, failures, track
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
-
-__all__ = ["SEED", "shift"]
 
 D = 1.0
 N = 31

@@ -17,17 +17,16 @@ from typing import Any
 import numpy as np
 
 from livepde import paper, plots
+from livepde.diagnostics.check_report import Check, Table
 from livepde.fem import Field, Normal, dot, grad, hermite, interval
 from livepde.identifier import Identifier
 from livepde.laws import ResidualDamping, SensitivityLaw, Shadows
 from livepde.model import Model
 from livepde.observation import Full
 from livepde.reproduce.experiment import Experiment, Track, failures, track
-from livepde.runs.outcome import Check, Outcome, Table
+from livepde.runs.outcome import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
-
-__all__ = ["SEED_EXCITED"]
 
 D = 1.0
 N = 31

@@ -16,8 +16,6 @@ from livepde.dates import since
 from livepde.records import field_names, interval_95, scalars
 from livepde.runs.directory import plain
 
-__all__ = ["DIFFERENCES", "bounded", "cf", "free_names", "kinds_of", "oriented", "udunits"]
-
 CONVENTIONS = "CF-1.11"
 BESIDE = {  # end of a name -> what such a variable says of the one without it
     "_std": "standard deviation of {}",

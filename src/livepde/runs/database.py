@@ -13,24 +13,6 @@ from filelock import FileLock, Timeout
 
 from livepde.errors import RunError
 
-__all__ = [
-    "AGAIN",
-    "check_file",
-    "checksum",
-    "damaged",
-    "in_memory",
-    "in_use",
-    "locked",
-    "log_of",
-    "reader",
-    "released",
-    "remedy_of",
-    "sound",
-    "told",
-    "writer",
-    "written",
-]
-
 LOG_SIZE = 16 * 2**20  # bytes of the write-ahead log that are kept when it was longer
 MOMENT = 0.5  # seconds for which who only asks whether a journal is written may hold its lock
 # Exceptions that decoding the content of a damaged or hostile file may raise.

@@ -31,26 +31,16 @@ from typing import TYPE_CHECKING, Any
 
 from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.dates import with_epoch, without_epoch
+from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.outcome import Check, FigureFactory, Table, attempted
+from livepde.runs.outcome import FigureFactory, attempted
 from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
     import xarray as xr
-
-__all__ = [
-    "Run",
-    "RunWriter",
-    "free_path",
-    "markdown",
-    "open_run",
-    "plain",
-    "refuse_taken",
-    "run_names",
-]
 
 FORMAT = 2
 RUNS = "runs"  # where the command line puts them

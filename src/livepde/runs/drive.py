@@ -11,13 +11,12 @@ from pathlib import Path
 from types import FrameType
 
 from livepde.errors import DataError
-from livepde.identifier import Identifier, Sample
+from livepde.identifier import Identifier
 from livepde.result import Result, layout_of
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import Live
-
-__all__ = ["Driven", "conduct", "drive", "journal_of", "stopped_by_signals"]
+from livepde.samples import Sample
 
 
 @dataclass

@@ -30,8 +30,6 @@ from livepde.runs.conventions import (
 )
 from livepde.runs.directory import Run, write_dataset
 
-__all__ = ["AT_ONE_TIME", "FORMATS", "NEEDS", "cf", "export", "into_place", "need", "refuse_file"]
-
 
 def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
     """Write a run in the format that the ending of a file names: see `FORMATS`.

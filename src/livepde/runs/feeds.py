@@ -10,12 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from livepde.identifier import Sample
-from livepde.samples import by_name
+from livepde.samples import Sample, by_name
 from livepde.streams.intake import Intake, IntakeOutcome, Ready, Remark, gather
 from livepde.streams.sources import Row, RowSource
-
-__all__ = ["Feed", "Gathered", "Paced", "SampleFeed"]
 
 
 class Feed(Protocol):

@@ -60,8 +60,6 @@ from livepde.samples import noise_channel
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["Event", "Journal", "Taken"]
-
 LOG = logging.getLogger("livepde.run")
 FORMAT = 4
 MEMORY = Path(":memory:")

@@ -26,8 +26,6 @@ from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict
 
-__all__ = ["LOOK", "Backlog", "Live", "Retention", "Sink"]
-
 GROUP = 64  # most samples of one commit
 AGE = 0.25  # seconds after which no step begins before what was taken until then is committed
 CHECKPOINT = 256  # most samples between two checkpoints

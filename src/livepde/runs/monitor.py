@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
     from prometheus_client.core import Metric
 
-__all__ = ["Metrics", "Monitor"]
-
 
 class Metrics(Sink):
     """Estimates as Prometheus metrics; a sink of a run.

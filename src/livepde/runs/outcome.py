@@ -6,12 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from livepde.diagnostics.check_report import Bound, Check, Sense, Table
+from livepde.diagnostics.check_report import Check, Table
 
 if TYPE_CHECKING:
     import xarray as xr
-
-__all__ = ["Bound", "Check", "FigureFactory", "Outcome", "Sense", "Table", "attempted"]
 
 T = TypeVar("T")
 

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from livepde.dates import when
+from livepde.diagnostics.check_report import Table
 from livepde.laws.equation_tests import rested
 from livepde.laws.pauses import pauses
 from livepde.laws.step_ledger import step_findings
 from livepde.linalg import Array
 from livepde.plots.dataset import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars
-from livepde.runs.outcome import Table
 from livepde.runs.summary import digits, jumps, shown
 from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor
 from livepde.verdict import (
@@ -42,18 +42,6 @@ if TYPE_CHECKING:
 
     from livepde.runs.journal import Journal
     from livepde.streams import DataTable
-
-__all__ = [
-    "clock_findings",
-    "doubts",
-    "findings_of",
-    "input_findings",
-    "sampling_findings",
-    "severities",
-    "unexplained",
-    "verdict",
-    "verdict_table",
-]
 
 MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
 MOST_JUMPS = 5  # that get a sentence of their own

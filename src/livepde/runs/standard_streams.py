@@ -14,8 +14,6 @@ from livepde.library_messages import OneLine
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 
-__all__ = ["JsonLinesSink", "configure"]
-
 
 def configure(kind: str = "text", level: int = logging.INFO) -> None:
     """Configure logging to standard error: messages of livepde, and warnings of other libraries.

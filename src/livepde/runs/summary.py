@@ -10,35 +10,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from livepde.dates import when
+from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.identifiability import TRADED, InformationGain
 from livepde.frames import estimates, model_errors, relative_error
 from livepde.plots.dataset import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
-from livepde.runs.outcome import Bound, Check, Sense, Table
 from livepde.runs.thermal_resistance import resistance
 
 if TYPE_CHECKING:
     import xarray as xr
-
-__all__ = [
-    "ROLES",
-    "STATES",
-    "TOTALS",
-    "ChannelErrors",
-    "Jump",
-    "channel_errors",
-    "checks_of",
-    "determination",
-    "digits",
-    "jumps",
-    "measures",
-    "rmse",
-    "scalars",
-    "shown",
-    "tables",
-    "when",
-]
 
 MOST_ROWS = 40
 DIGITS = 15  # of a number

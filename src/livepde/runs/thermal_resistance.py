@@ -12,8 +12,6 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["LAYERS", "SURFACES", "Resistance", "resistance"]
-
 # Attributes of a dataset: layers as JSON, label of a conductivity -> thickness in m; and the sum of
 # the surface resistances in m^2 K/W, if they are stated.
 LAYERS, SURFACES = "wall_layers", "surface_resistance"

@@ -17,8 +17,6 @@ from waitress.server import TcpWSGIServer
 if TYPE_CHECKING:
     from wsgiref.types import WSGIApplication
 
-__all__ = ["listener"]
-
 Refusal: TypeAlias = Callable[[Mapping[str, Any]], str]  # of a header, as WSGI has it
 
 THREADS = 16  # answers that are computed at a time

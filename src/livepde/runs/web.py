@@ -20,8 +20,6 @@ from livepde.errors import RunError, optional
 if TYPE_CHECKING:
     from wsgiref.types import StartResponse, WSGIApplication, WSGIEnvironment
 
-__all__ = ["Address", "Server"]
-
 COOKIE = "livepde_token"
 SHORTEST_TOKEN = 16  # characters, where anyone may try
 NOT_HERE = "this page is for this machine only: use localhost"

@@ -25,8 +25,6 @@ from livepde.stepping.interval import Moments
 from livepde.stepping.member_stage import KeptFactors, MemberStage, SeparateStages, StageOfMembers
 from livepde.stepping.newton import StepFailed
 
-__all__ = ["BandedStage", "DrivenVector", "member_stage"]
-
 # Largest number of unknowns with an assembled matrix A_j each: the cost of summing them grows
 # linearly.
 MOST_UNKNOWNS = 64

@@ -8,8 +8,6 @@ from typing import Any, Literal, TypeAlias, get_args
 
 from livepde.errors import ConfigurationError
 
-__all__ = ["LINES", "Between", "Held"]
-
 Between: TypeAlias = Literal["line", "hold", "next"]
 """A straight line; the last reading until the next one; or the next reading since the last one."""
 

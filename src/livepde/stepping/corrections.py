@@ -14,8 +14,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor
 from livepde.stepping.newton import StepFailed
 
-__all__ = ["At", "Corrections", "Kept", "solved"]
-
 # Bound on the error of a stage relative to the change of the state in it, so that the accuracy does
 # not depend on how slow the process is.
 SHARE = 1e-2

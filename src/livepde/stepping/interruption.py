@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 
-__all__ = ["interruptible", "safe_point"]
-
 # A variable of the context, not of a control: a refit in its own thread is not interrupted.
 CHECK: ContextVar[Callable[[], None] | None] = ContextVar("livepde_interruption", default=None)
 

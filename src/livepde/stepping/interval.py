@@ -14,8 +14,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, IntArray, Mask
 from livepde.stepping.between import Held
 
-__all__ = ["End", "Interval", "Moments", "Span", "own_noise"]
-
 NO_INPUTS = np.zeros((1, 0))
 
 

@@ -23,8 +23,6 @@ GAIN = 1e-4
 # Relative error of the tangent that carries the estimated mean, as accurate as the state itself.
 ESTIMATE = 1e-8
 
-__all__ = ["KeptFactors", "MemberStage", "SeparateStages", "StageOfMembers"]
-
 
 @dataclass(frozen=True, eq=False)
 class KeptFactors:

@@ -11,8 +11,6 @@ from typing import Generic, Protocol, TypeVar
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor, nonfinite_allowed
 
-__all__ = ["TINY", "Near", "Newton", "Solution", "StageEquation", "StagePoint", "StepFailed"]
-
 # Lower bound of a divisor that may be zero.
 TINY = 1e-300
 # Maximum number of halvings of a Newton update that does not reduce the residual.

@@ -20,17 +20,6 @@ from livepde.stepping.between import LINES, Held
 from livepde.stepping.interruption import safe_point
 from livepde.stepping.newton import StepFailed
 
-__all__ = [
-    "LONG_SUBSTEPS",
-    "MOST_SUBSTEPS",
-    "Advance",
-    "Alexander2",
-    "ImplicitEuler",
-    "Scheme",
-    "Stage",
-    "advance",
-]
-
 # An interval of more than so many substeps of `dt_max`, such as a pause of the source, is divided
 # into fewer and longer ones: hourly readings with steps of a second are below, and any pause costs
 # seconds on a rod. The schemes are L-stable, and shadows divide longer substeps again where

@@ -15,8 +15,6 @@ from livepde.stepping.interval import Interval
 from livepde.stepping.schemes import Advance, advance
 from livepde.stepping.state import ForwardStage
 
-__all__ = ["simulate"]
-
 
 def simulate(
     model: Model,

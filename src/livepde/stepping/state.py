@@ -28,8 +28,6 @@ from livepde.model import Model
 from livepde.stepping.corrections import At, Corrections, Kept, solved
 from livepde.stepping.newton import TINY, Newton, StepFailed
 
-__all__ = ["ForwardStage"]
-
 # Relative error of a state that is solved with a reused factor.
 STATE = 1e-8
 # Relative rounding error of a sum of terms, in units of the sizes of its terms.

@@ -11,8 +11,6 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-__all__ = ["FAR", "STEPS", "ChannelTimes", "present", "usual_of"]
-
 STEPS = 16  # last steps of a channel, of which the longest but one is the usual step
 NEXT = 1.5  # usual steps up to which a time is the next one
 CALM = 1.5  # intervals between two times that went back, after which a clock is steady again

@@ -16,21 +16,6 @@ import numpy as np
 from livepde.errors import SampleError
 from livepde.linalg import Array
 
-__all__ = [
-    "CALLED_TIME",
-    "COMMA",
-    "NO_POINT",
-    "POINT",
-    "Clock",
-    "date_formats",
-    "guessed_format",
-    "has_decimal_comma",
-    "is_naive",
-    "number_of",
-    "read_times",
-    "with_second_passes",
-]
-
 Instant: TypeAlias = float | str | date | datetime
 CALLED_TIME = re.compile(r"(t|time|timestamp|date|datetime|elapsed|zeit|temps)\b|.*time", re.I)
 COMMA = "if that is a decimal comma, set decimal = ','."

@@ -37,18 +37,6 @@ from livepde.streams.table import (
     to_table,
 )
 
-__all__ = [
-    "UNDER",
-    "UTF_8",
-    "Written",
-    "are_labels",
-    "header_of",
-    "how_written",
-    "is_title",
-    "read_csv",
-    "too_wide",
-]
-
 T = TypeVar("T")
 
 UTF_8 = "utf-8-sig"  # with or without a mark at the start, as Excel writes it

@@ -12,8 +12,6 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["FEWEST", "wild_first_rows"]
-
 MOST = 3  # rows at the start that may be wild
 FOLLOWING = 20  # values that show how a channel usually changes
 FEWEST = 3  # following values without which nothing is judged

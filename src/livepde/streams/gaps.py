@@ -30,8 +30,6 @@ from livepde.samples import Sample, number, sample_of
 from livepde.stepping import Between, Held
 from livepde.streams.table import DataTable
 
-__all__ = ["RECENT", "FillGaps", "Filled", "Series", "bridged", "fill_table", "find_spikes"]
-
 # With 12 of 1000 records of smooth signals and white noise lose a value, and all spikes of more
 # than 40 standard deviations are found: tests/test_gaps.py.
 BEYOND = 12.0

@@ -30,8 +30,6 @@ from livepde.streams.table import (
 )
 from livepde.units import conversion
 
-__all__ = ["Reading"]
-
 INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
 TEMPERATURE = re.compile(r"T\b")  # not a time, though `CALLED_TIME` has no regard for capitals
 

@@ -23,8 +23,6 @@ from typing import NamedTuple
 
 from livepde.errors import DataError
 
-__all__ = ["LONGEST", "UTF_16", "GrowingFile", "Line", "Place"]
-
 LONGEST = 1_000_000  # bytes of a line; longer ones are refused unread
 CHUNK = 1 << 20  # bytes that are read at once
 CHUNKS = 16  # of one look: a signal is heard between two looks

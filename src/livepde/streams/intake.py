@@ -23,8 +23,6 @@ from livepde.streams.clock import Clock, is_naive
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
 
-__all__ = ["Habit", "Intake", "IntakeOutcome", "Past", "Policy", "Ready", "Remark", "gather"]
-
 
 @dataclass(frozen=True)
 class Habit:

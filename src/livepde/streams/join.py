@@ -15,8 +15,6 @@ from livepde.linalg import Array
 from livepde.stepping import Between
 from livepde.streams.table import DataTable
 
-__all__ = ["join_tables", "not_late"]
-
 SAME = 1e-10  # of the whole time: times that differ by less are one moment
 
 

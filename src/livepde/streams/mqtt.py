@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from livepde.errors import DataError, optional
 from livepde.result import Estimate
-from livepde.streams.sources import LONGEST, Row, RowSource, drained, json_row
+from livepde.streams.growing_file import LONGEST
+from livepde.streams.sources import Row, RowSource, drained, json_row
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client

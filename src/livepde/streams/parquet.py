@@ -18,8 +18,6 @@ from livepde.streams.table import (
     tabulated,
 )
 
-__all__ = ["read_parquet"]
-
 
 def read_parquet(
     path: str | Path,

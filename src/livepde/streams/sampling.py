@@ -8,8 +8,6 @@ import numpy as np
 
 from livepde.linalg import Array
 
-__all__ = ["FACTORS", "ClockLeap", "clock_leaps", "unit_factor"]
-
 FACTORS = {1000.0: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 60.0: "sixtieths"}
 """Factor of later times -> their likely unit, where those before are seconds."""
 NEAR = 3.0  # usual intervals between times before and after, once the unit is the same

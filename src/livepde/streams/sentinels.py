@@ -8,8 +8,6 @@ import numpy as np
 
 from livepde.linalg import Array
 
-__all__ = ["Sentinel", "sentinels"]
-
 # DS18B20: 85 at power-on, -127 where nothing answers; loggers and databases: nines, ends of types.
 KNOWN: tuple[float, ...] = (
     -127.0,

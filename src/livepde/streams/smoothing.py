@@ -25,8 +25,6 @@ from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array
 from livepde.samples import Sample, sample_of
 
-__all__ = ["Exponential", "LocalPolynomial", "Smoothed", "Smoother", "WindowAverage"]
-
 LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
 RESOLUTION = 1e-9  # offsets that differ by less than this share of the width have the same weights
 

@@ -20,8 +20,6 @@ from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, too_wide
 from livepde.streams.growing_file import LONGEST, UTF_16, GrowingFile, Line, Place
 from livepde.streams.table import JSON_LINES, no_file
 
-__all__ = ["LONGEST", "Follow", "Lines", "Row", "RowSource", "Rows", "drained", "json_row"]
-
 T = TypeVar("T")
 
 BATCH = 100  # most rows of one poll

@@ -7,8 +7,6 @@ import numpy as np
 from livepde.linalg import Array
 from livepde.streams.gaps import SHORT
 
-__all__ = ["switches"]
-
 FEWEST = 4  # known values that are judged
 LEVELS = 3  # so many different values are states of a switch
 STAYS = 0.75  # share of the values that repeat the one before

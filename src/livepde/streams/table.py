@@ -32,25 +32,6 @@ from livepde.streams.clock import (
 )
 from livepde.streams.thinned import Thinned
 
-__all__ = [
-    "JSON_LINES",
-    "Column",
-    "DataTable",
-    "JsonLines",
-    "cell_number",
-    "channel_value",
-    "check_columns",
-    "decimal_marks",
-    "hint",
-    "is_data",
-    "no_file",
-    "read_json_lines",
-    "row_time",
-    "tabulated",
-    "to_table",
-    "without_noise",
-]
-
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 STREAM = "standard input"
 MOST = 12  # names that are listed

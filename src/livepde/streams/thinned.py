@@ -10,8 +10,6 @@ import numpy as np
 from livepde.linalg import Array, Mask
 from livepde.stepping import Between
 
-__all__ = ["Thinned"]
-
 
 class Thinned:
     """Every n-th row of a stream, without the loss of a switch or of a share of a mean.

@@ -24,8 +24,6 @@ from livepde.result import Estimate
 from livepde.samples import Sample
 from livepde.stepping import Advance, Alexander2, Scheme, StepFailed, simulate
 
-__all__ = ["AbsoluteNoise", "Noise", "RelativeNoise", "Truth", "Twin"]
-
 Truth = Literal["analytic", "discrete", "fine"]
 Formula = Callable[[Any, float], Any]
 

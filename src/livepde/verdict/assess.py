@@ -48,8 +48,6 @@ from livepde.verdict.sentences import (
     significance,
 )
 
-__all__ = ["Position", "assess"]
-
 PRIOR = 1e-4  # probability of an estimate as far from its prior, drawn from it
 LARGER = 1.5  # times the stated noise that is worth a note
 SMALLER = 0.5

@@ -20,8 +20,6 @@ import scipy
 
 from livepde.linalg import Array, IntArray
 
-__all__ = ["Causes", "Family", "LinearModel", "Mixture", "averaged"]
-
 NU = 10.0  # degrees of freedom of the prior of the noise level
 TEMPER = 5.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
 NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike

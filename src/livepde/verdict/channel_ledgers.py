@@ -16,8 +16,6 @@ from livepde.verdict.model_errors import FAILED, OF_SIGNAL
 from livepde.verdict.sentences import FINDINGS, LIKELY, table_of
 from livepde.verdict.shifts import Shifts
 
-__all__ = ["InputLedger", "WithheldLedger"]
-
 HELD = 0.02  # share of the samples in which the last value of an input was held
 CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
 SIMILAR = 0.05  # relative difference of a slope to that of a unit

@@ -14,8 +14,6 @@ from livepde.model import Model
 from livepde.observation import Observed, Points
 from livepde.verdict.missing_terms import Process
 
-__all__ = ["Dictionary", "ScoreDirection", "sensor_shifts"]
-
 OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
 DRIFT = 64.0  # ... a drift in so many samples
 GAIN = 0.1  # of the change of a sensor since the start

@@ -20,24 +20,6 @@ import scipy
 from livepde.linalg import Array
 from livepde.verdict.ledger import BLOCKS, Ledger
 
-__all__ = [
-    "ALPHA",
-    "CAUSES",
-    "RECORD",
-    "CauseEvidence",
-    "Constancy",
-    "Following",
-    "causes_of",
-    "chance",
-    "constancy",
-    "disagreement",
-    "following",
-    "levels",
-    "mean_squares",
-    "quiet",
-    "unsuspicious",
-]
-
 ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
 CAUSES = 0.5 * ALPHA  # for the e-value of all directions
 RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors

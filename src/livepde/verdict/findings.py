@@ -10,25 +10,6 @@ from typing import Any, Literal, TypeAlias
 from livepde.verdict.model_errors import ModelErrors
 from livepde.verdict.sentences import FINDINGS, percent, quoted
 
-__all__ = [
-    "FEWEST",
-    "FLAT",
-    "LEVELS",
-    "MOST",
-    "NOT_JUDGED",
-    "NUMBERS",
-    "PROMISES",
-    "Cause",
-    "Finding",
-    "Level",
-    "Severity",
-    "Verdict",
-    "at_bound",
-    "channel_setting",
-    "flat",
-    "too_few",
-]
-
 Level: TypeAlias = Literal["trusted", "caution", "not judged", "do not trust"]
 Severity: TypeAlias = Literal["note", "caution", "do not trust"]
 Measure: TypeAlias = Literal["e-value", "p-value", "number"]

@@ -38,8 +38,6 @@ from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
 from livepde.verdict.missing_terms import Now, stride
 
-__all__ = ["Judge", "ScoredSample"]
-
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same

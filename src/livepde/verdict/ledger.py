@@ -15,8 +15,6 @@ import numpy as np
 
 from livepde.linalg import Array, IntArray, Mask
 
-__all__ = ["BLOCKS", "WINDOWS", "Ledger", "batch_of", "blocked", "changed", "summed"]
-
 WINDOWS = (0, 64, 512)
 """Samples after which a window begins anew; 0: the window of all samples. The faults of a window
 begin with it, so that an old, sound record does not hide a fault that is new."""

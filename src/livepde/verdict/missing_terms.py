@@ -19,17 +19,6 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.stepping import ForwardStage
 
-__all__ = [
-    "Now",
-    "Process",
-    "Term",
-    "boundary_lifts",
-    "flux_loads",
-    "force",
-    "scaled_channel",
-    "stride",
-]
-
 FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
 
 REACH = 64.0  # samples in which a source of amplitude one moves the state by three times the noise

@@ -7,8 +7,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
-__all__ = ["FAILED", "OF_SIGNAL", "Allowed", "ModelErrors", "Rank"]
-
 Rank: TypeAlias = Literal["trusted", "caution", "do not trust"]
 
 FAILED = 5.0  # misfit over noise, and ...

@@ -11,21 +11,6 @@ import math
 import re
 from typing import NamedTuple
 
-__all__ = [
-    "ESTIMATED",
-    "FINDINGS",
-    "JUMPS",
-    "LIKELY",
-    "LONGER_DATA",
-    "Sentence",
-    "amount_of",
-    "estimating",
-    "percent",
-    "quoted",
-    "significance",
-    "table_of",
-]
-
 SMALLEST = 1e-6  # p-value that is printed
 CENTI = {"m": ("cm", "mm")}  # unit -> those of a hundredth and a thousandth
 

@@ -12,8 +12,6 @@ import numpy as np
 from livepde.verdict.findings import Finding, Severity
 from livepde.verdict.sentences import FINDINGS
 
-__all__ = ["NOT_KNOWN", "REFINE", "Shifts", "discretised", "held_inputs", "known"]
-
 SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
 DECIDES = 5.0  # the same, from which the interval is little else
 GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign

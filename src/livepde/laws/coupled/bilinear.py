@@ -15,8 +15,6 @@ from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.laws.coupled.split_forms import AnyForm
 from livepde.linalg import Array, Pattern, compact
 
-__all__ = ["BilinearSolver"]
-
 
 class BilinearSolver(MonolithicSolver):
     """A, B and the Jacobian by products with small or sparse matrices: no form is evaluated.

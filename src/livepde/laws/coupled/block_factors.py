@@ -43,8 +43,6 @@ from livepde.linalg import (
     gmres,
 )
 
-__all__ = ["LARGE", "ApproximateFactor", "BlockJacobian", "BlockSolver"]
-
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector

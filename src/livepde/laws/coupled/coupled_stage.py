@@ -25,8 +25,6 @@ from livepde.laws.coupled.monolithic import MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
-__all__ = ["CoupledStage", "KeptFactor", "nearest_root"]
-
 STRIDE = 1.5  # factor between two values of theta that are tried
 SAME = 1e-9  # of a step: steps that are the same but for rounding
 ACCURACY = 1e-8  # relative, of theta: Newton goes on from there

@@ -36,8 +36,6 @@ from livepde.laws.damping import Damping, Residual
 from livepde.linalg import Array, Factor, Pattern, compact
 from livepde.stepping import TINY
 
-__all__ = ["Inside", "StageData", "StageIterate", "StageProblem", "StageSolver", "StageTerms"]
-
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
 CARRIED = 1e-2  # the same where the next stage makes up for the remaining residual

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from livepde.linalg import Array
 
-__all__ = ["Metric"]
-
 
 @dataclass(frozen=True, eq=False)
 class Metric:

@@ -12,8 +12,6 @@ from livepde.errors import LinearAlgebraError
 from livepde.laws.coupled.equation import StageData, StageIterate, StageSolver, StageTerms
 from livepde.linalg import Array, Assembler, BandedSolver, Factor, Leading, Pattern, Solver, analyse
 
-__all__ = ["MonolithicSolver"]
-
 
 class MonolithicSolver(StageSolver):
     """Factorises the matrix of u and q, with auxiliary unknowns behind."""

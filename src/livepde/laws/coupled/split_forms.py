@@ -25,8 +25,6 @@ from livepde.model import Model
 from livepde.observation import Split
 from livepde.spaces import HilbertSpace
 
-__all__ = ["AnyForm", "StageForms"]
-
 AnyForm: TypeAlias = Form | Composed
 
 
