@@ -112,7 +112,8 @@ def read_data(
 
     # The noise of a reading has its time.
     noise = {name: late[of] for name, one in columns.items() if (of := one.noise_of) in late}
-    return _merged(case, not_late(found, late | noise), columns)
+    may_lack = {*case.roles(*SENSORS), *noise}
+    return _merged(case, not_late(found, late | noise, may_lack), columns)
 
 
 def delays(case: CaseContent) -> dict[str, float]:

@@ -94,15 +94,20 @@ def join_tables(
     )
 
 
-def not_late(table: DataTable, late: Mapping[str, float]) -> list[DataTable]:
+def not_late(
+    table: DataTable, late: Mapping[str, float], sensors: Collection[str]
+) -> list[DataTable]:
     """Return a table as several, in which the times of late channels are earlier.
 
-    A channel without values stays where it is.
+    A channel without values stays where it is. A sensor whose times are early has no value at the
+    start of the table, which begins as before; an input has to be known from the start.
 
     Parameters
     ----------
     late
         Channel -> how much later than its values its times are, in the unit of the times.
+    sensors
+        Channels that may be missing.
     """
     seen = np.isfinite(table.values)
     late = {name: by for name, by in late.items() if seen[:, table.names.index(name)].any()}
@@ -113,6 +118,8 @@ def not_late(table: DataTable, late: Mapping[str, float]) -> list[DataTable]:
         values = table.values[:, table.names.index(name)]
         known = np.isfinite(values)
         t, own = table.t[known] - by, values[known, None]
+        if name in sensors and t[0] > table.t[0]:
+            t, own = np.append(table.t[0], t), np.append([[np.nan]], own, axis=0)
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found
 
