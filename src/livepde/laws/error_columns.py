@@ -129,6 +129,12 @@ class ErrorColumns:
         return not next(iter(model.state_space.fields.values())).vector
 
     @property
+    def _resists(self) -> bool:
+        """Whether a contact may resist: it stops what is conducted, not what a flow carries."""
+        stage = ForwardStage(self.model)
+        return stage.symmetric or not stage.keeps
+
+    @property
     def count(self) -> int:
         """Number of columns of the process."""
         return sum(course.size for _, course in self.answers)
@@ -208,7 +214,7 @@ class ErrorColumns:
         half = stiffness(lambda x: np.asarray((x[0] - low) / span > 0.5, dtype=float))
         yield Answer("layer", load=_minus(half)), ALWAYS
         wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
-        for k, place in enumerate(PLACES):
+        for k, place in enumerate(PLACES if self._resists else ()):
             matrix = stiffness(_band(low + place * span, wide * span))
             yield Answer("contact", "", k, _minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
