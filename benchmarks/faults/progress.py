@@ -19,7 +19,7 @@ LIFE = 8.0  # seconds after which a run is killed
 # Name -> substeps of a step, and samples of a run.
 STEPS = {"50 ms": (40, 400), "2 s": (1600, 16)}
 MOST = 40  # lives of a run
-LATE = 4.0  # seconds from SIGTERM to the exit: half a second of grace, and the report
+LATE = 2.5  # seconds from SIGTERM to the exit: a second of grace, and the report
 
 
 def frequent_kills(plan: Plan) -> Outcome:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,6 +105,9 @@ def run_live(
     health, stopping = partial(_health, wiring), threading.Event()
     sinks = _observers(case, how, stack, health)
     writer = write()
+    # The report at the end needs them, when a signal leaves few seconds.
+    for library in ("xarray", "pint"):
+        import_module(library)
     if how.page is not None:
         _show(how.page, how.token, folder, stack)
     with stopped_by_signals(stopping, lambda: True):

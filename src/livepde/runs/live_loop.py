@@ -33,7 +33,7 @@ CHECKPOINT = 256  # most samples between two checkpoints
 # makes progress: they are a second of steps apart, or more where they would cost more than 5 %.
 APART, COST = 1.0, 0.05
 # Seconds after a signal in which a step may end, and the last fit; then they are interrupted.
-GRACE, LAST_GRACE = 0.5, 2.0
+GRACE, LAST_GRACE = 0.5, 1.0
 JUDGED = 50  # samples between two looks at the verdict
 SELDOM = 128  # looks of which one computes errors of the model, beside those at doublings
 # Keys of a stored verdict: the level that was reported last, the samples at the last look, another
@@ -429,8 +429,9 @@ class Live:
         if last is not None:
             try:
                 with interruptible(self._check):
-                    last = self.identifier.settled(last)
-                    verdict = last.verdict
+                    settled = self.identifier.settled(last)
+                    verdict = settled.verdict
+                last = settled
                 self.result.settle(last)
                 self._keep_verdict(verdict)
             except Interrupted:
