@@ -7,6 +7,7 @@ import math
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 from commands import bad, call
@@ -266,14 +267,32 @@ def test_a_cause_that_no_setting_frees_says_so(tmp_path):
     prepared = cases.load(short_rod(tmp_path)).prepare()
     lag = Cause("lag", "T_10", "it is late", remedy="Check the clock.")
     there = Cause("flux", "right", "a flux is missing", size=1.0)  # the boundary has a value
-    swapped = Cause("exchange", "T_10", "they are exchanged", remedy="Exchange the columns.")
-    causes = lag, there, swapped
+    causes = lag, there
     verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=causes)])
     once = with_settings(prepared, verdict)
     remedies = [cause.remedy for cause in once.findings[0].causes]
     assert not any(cause.setting for cause in once.findings[0].causes)
-    assert remedies == [f"Check the clock. {NO_SETTING}", NO_SETTING, "Exchange the columns."]
+    assert remedies == [f"Check the clock. {NO_SETTING}", NO_SETTING]
     assert with_settings(prepared, once) == once
+
+
+def test_exchanged_columns_are_exchanged_by_settings(tmp_path):
+    """The law names channels; their columns have other names."""
+    path = short_rod(tmp_path)
+    named = path.read_text().replace("T_10 = {", "first = {", 1)
+    path.write_text(named)
+    prepared = cases.load(path).prepare()
+    given = 'channels.first.column="T_30"; channels.T_30.column="first"'
+    cause = Cause("exchange", "first", "they may be exchanged", setting=given)
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    once = with_settings(prepared, verdict)
+    (found,) = once.findings[0].causes
+    assert found.setting == 'channels.first.column="T_30"; channels.T_30.column="T_10"'
+    assert with_settings(prepared, once) == once
+    right = cases.load(path, settings=parse(found.setting.split("; "))).prepare().raw
+    first = right.names.index("first")
+    column = prepared.raw.names.index("T_30")
+    np.testing.assert_array_equal(right.values[:, first], prepared.raw.values[:, column])
 
 
 def test_an_offset_takes_the_prior_that_other_sensors_state(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -71,6 +72,8 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return process[cause.kind](prepared, cause)
     if cause.kind in KEYS:
         return _of_sensor(case, cause)
+    if cause.kind == "exchange":
+        return _exchanged(case, cause)
     return _stated(case, cause)
 
 
@@ -107,6 +110,16 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
     keys = [setting.partition("=")[0].rpartition(".")[2] for setting in settings]
     taken = [key for key in keys if key in STATED and getattr(channel, key, None) is not None]
     return () if taken else settings
+
+
+def _exchanged(case: Case, cause: Cause) -> tuple[str, ...]:
+    """Return the settings by which each of two channels reads the column of the other."""
+    names = list(tomllib.loads("\n".join(settings_in(cause.setting))).get("channels", {}))
+    columns = [case.spec.channels[name].column for name in reversed(names)]
+    if None in columns:  # a mean of columns, or the parts of one channel
+        return ()
+    pairs = zip(names, columns, strict=True)
+    return tuple(channel_setting(name, "column", toml_value(column)) for name, column in pairs)
 
 
 def _capacity(case: Case) -> float:

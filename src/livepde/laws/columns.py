@@ -12,6 +12,7 @@ and the cost falls by (g r)^2 / (2 (g g - h H^-1 h)). The most promising errors 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -480,5 +481,10 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
         "unit": ("unit", f'"{unit_of.name}"') if unit_of.name else ("factor", f"{factor:.6g}"),
     }
     setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
+    if error.kind == "exchange":
+        pairs = (error.names, error.names[::-1])
+        setting = "; ".join(
+            channel_setting(one, "column", json.dumps(other)) for one, other in pairs
+        )
     known = float("nan") if error.kind in ("unit", "exchange") else size
     return Cause(error.kind, first, text, float(min(share, 1.0)), remedy, setting, known)
