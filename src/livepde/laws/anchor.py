@@ -43,10 +43,7 @@ class Anchor:
     def corrected(self, x: FilterState, d: Array, used: Mask, at: Moments) -> FilterState:
         """Return the state of members after readings that correct u only.
 
-        Parameters
-        ----------
-        d, used
-            Innovations, and which of them correct the state, (members, sensors).
+        `d`, `used`: innovations, and which of them correct the state, (members, sensors).
         """
         problem, du, U = self.problem, x.du.copy(), x.U.copy()
         errors = x.shadows.u.copy()  # of the discretisation, which the correction removes, too

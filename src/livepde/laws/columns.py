@@ -45,23 +45,15 @@ CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelie
 
 
 class Unit(NamedTuple):
-    """A unit that a column may have.
+    """A unit that a column may have."""
 
-    Attributes
-    ----------
-    name, expected
-        The unit, and the expected one; empty if they are not known.
-    factor, constant
-        Of the conversion of its values.
-    times
-        How many times too large or too small its values are.
-    """
-
+    # The unit, and the expected one; empty if they are not known.
     name: str
     expected: str
+    # Of the conversion of its values.
     factor: float
     constant: float
-    times: float = np.nan
+    times: float = np.nan  # how many times too large or too small its values are
 
 
 UNITS: tuple[Unit, ...] = (
@@ -86,24 +78,13 @@ class Explained(NamedTuple):
 
 @dataclass(frozen=True)
 class Error:
-    """An error of a column, or of two.
+    """An error of a column, or of two."""
 
-    Attributes
-    ----------
-    kind
-        "offset", "gain", "lag", "unit" or "exchange".
-    names
-        The columns.
-    size
-        Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
-    unit
-        Number in `UNITS`.
-    """
-
-    kind: str
-    names: tuple[str, ...]
+    kind: str  # "offset", "gain", "lag", "unit" or "exchange"
+    names: tuple[str, ...]  # the columns
+    # Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
     size: float = 0.0
-    unit: int = 0
+    unit: int = 0  # number in `UNITS`
 
     @property
     def numbers(self) -> int:
@@ -113,25 +94,14 @@ class Error:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The stored samples of one member as columns that may be wrong.
+    """The stored samples of one member as columns that may be wrong."""
 
-    Attributes
-    ----------
-    work, state
-        Parts of the law without gate, and the member with the first samples of its window.
-    places
-        Column of the log of each sensor and each input.
-    inputs
-        Names of the inputs.
-    options
-        Those of a fit.
-    """
-
+    # Parts of the law without gate, and the member with the first samples of its window.
     work: SensitivityWork
     state: SensitivityState
-    places: dict[str, int]
-    inputs: tuple[str, ...]
-    options: Refit
+    places: dict[str, int]  # column of the log of each sensor and each input
+    inputs: tuple[str, ...]  # names of the inputs
+    options: Refit  # those of a fit
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:

@@ -114,14 +114,8 @@ def theta_noisy(
     + 4 C_A/c_M (1 + ||d||_V~ + ||p||_V^) ||e||_Q ||d||_X, 2 sigma/c_M ||r||_X^2, c_1 ||r||_X^2}
     ||r_alpha||_V~ / ||r||_VX~^2.
 
-    Parameters
-    ----------
-    e
-        ||e||_Q in the gain-scaled norm.
-    r
-        Of the true residual r = R (u - u*), not of r_alpha.
-    d
-        Of the data error u_alpha - R u*.
+    `e`: ||e||_Q in the gain-scaled norm. `r`: of the true residual r = R (u - u*), not of r_alpha.
+    `d`: of the data error u_alpha - R u*.
     """
     rough = d.V + p_V
     pull = 4.0 / c.c_M * (c.L_C * rough * r.X + c.C_A * (1.0 + rough) * e * d.X)
@@ -136,12 +130,7 @@ def theta_smoothed(
     mu >= max{2/c_M (L_C (||d||_V~ + ||p||_V^) + ||d~||_X), c_1 ||r_alpha||_X}
     ||r_alpha||_X ||r_alpha||_V~ / ||r_alpha||_VX~^2.
 
-    Parameters
-    ----------
-    r
-        Of r_alpha, which is known online.
-    rate_X
-        ||d~||_X of the rate of the data error.
+    `r`: of r_alpha, which is known online. `rate_X`: ||d~||_X of the rate of the data error.
     """
     pull = 2.0 / c.c_M * (c.L_C * (d_V + p_V) + rate_X)
     return _over(max(pull, c1 * r.X) * r.X, r.VX**2)

@@ -54,24 +54,13 @@ OUTSIDE = "the process outside the observed part"
 
 @dataclass(frozen=True, eq=False)
 class EquationLedger:
-    """Running sums over the equation errors of the data, in constant memory.
+    """Running sums over the equation errors of the data, in constant memory."""
 
-    Attributes
-    ----------
-    samples
-        Number of samples that were tested.
-    rests
-        Number of samples in which q was held because nothing excited it.
-    last
-        The errors a of the last two samples, shape (2, TESTS); NaN before.
-    sums
-        Weighed sums of (a_k, a_{k-2}), of its square, and of the squared terms that it is compared
-        with, shape (3,).
-    """
-
-    samples: int
-    rests: int
-    last: Array
+    samples: int  # number of samples that were tested
+    rests: int  # number of samples in which q was held because nothing excited it
+    last: Array  # the errors a of the last two samples, shape (2, TESTS); NaN before
+    # Weighed sums of (a_k, a_{k-2}), of its square, and of the squared terms that it is compared
+    # with, shape (3,).
     sums: Array
 
     @classmethod
@@ -82,12 +71,8 @@ class EquationLedger:
     def add(self, error: Array, square: float) -> EquationLedger:
         """Return the value after a sample.
 
-        Parameters
-        ----------
-        error
-            The errors a, shape (TESTS,).
-        square
-            The sum of the squared terms that they are compared with.
+        `error`: the errors a, shape (TESTS,). `square`: the sum of the squared terms that they are
+        compared with.
         """
         samples, sums = self.samples + 1, self.sums
         product = float(error @ self.last[0])
@@ -110,37 +95,21 @@ class EquationLedger:
 
 @dataclass(frozen=True, eq=False)
 class ObservedEquation:
-    """The equation of one step, on the observed part.
+    """The equation of one step, on the observed part."""
 
-    Attributes
-    ----------
-    error
-        The equation error R^T eps at its end, shape (n,).
-    rate
-        R^T M u_alpha', shape (n,).
-    w, q
-        State and parameter that A is evaluated at.
-    moment
-        Time and inputs at its end.
-    """
-
-    error: Array
-    rate: Array
+    error: Array  # the equation error R^T eps at its end, shape (n,)
+    rate: Array  # R^T M u_alpha', shape (n,)
+    # State and parameter that A is evaluated at.
     w: Array
     q: Array
-    moment: Moment
+    moment: Moment  # time and inputs at its end
 
 
 class EquationTests:
     """Test functions within omega, and the judgement of what they see.
 
-    Parameters
-    ----------
-    forms
-        Forms of a stage of all sensors.
-    prior
-        Columns V, shape (m, k), with the covariance V V^T of q that a prior states; none where the
-        law does not go by the prior.
+    `forms`: forms of a stage of all sensors. `prior`: columns V, shape (m, k), with the covariance
+    V V^T of q that a prior states; none where the law does not go by the prior.
     """
 
     def __init__(self, forms: StageForms, prior: Array) -> None:

@@ -46,22 +46,14 @@ class StatePoint(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A shape of error of the process, with columns that differ by their course in time.
+    """A shape of error of the process, with columns that differ by their course in time."""
 
-    Attributes
-    ----------
-    kind, subject
-        What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
-        "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
-    mode
-        Number of its shape in space.
-    load, lift, start
-        Its load, its boundary values, and its value at the start, (n,); None for zero.
-    """
-
+    # What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
+    # "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
     kind: str
     subject: str = ""
-    mode: int = 0
+    mode: int = 0  # number of its shape in space
+    # Its load, its boundary values, and its value at the start, (n,); None for zero.
     load: Load | Array | None = None
     lift: Load | Array | None = None
     start: Array | None = None
@@ -102,12 +94,8 @@ SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
 class ErrorColumns:
     """Errors that a model and its sensors can have.
 
-    Parameters
-    ----------
-    samples
-        The samples, which tell the length of the run.
-    numbers
-        How many shapes the families have.
+    `samples`: the samples, which tell the length of the run. `numbers`: how many shapes the
+    families have.
     """
 
     def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
@@ -230,10 +218,7 @@ class ErrorColumns:
 
         Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
 
-        Parameters
-        ----------
-        one
-            The trajectory about which they are linear.
+        `one`: the trajectory about which they are linear.
         """
         samples, model = self.samples, self.model
         stage, free = ForwardStage(model), model.X.free

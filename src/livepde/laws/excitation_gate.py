@@ -113,30 +113,20 @@ class ExcitationGate:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationLevel:
-    """Statistics of the excitation of q, to distinguish it from noise.
+    """Statistics of the excitation of q, to distinguish it from noise."""
 
-    Attributes
-    ----------
-    last, left, size
-        Values of the probes in the last sample, and their difference from those at the estimate,
-        shape (PROBES,); and the squared norm of the values.
-    correlation, energy, correlated
-        Fading means: of the correlation of successive samples, of the square, and of the product
-        with the sample before, in which noise and outliers have little part.
-    largest
-        The largest `correlated`.
-    noise
-        Fading mean of the share of the square that is noise.
-    """
-
+    # Values of the probes in the last sample, and their difference from those at the estimate,
+    # shape (PROBES,); and the squared norm of the values.
     last: Array
     left: Array
     size: float
+    # Fading means: of the correlation of successive samples, of the square, and of the product with
+    # the sample before, in which noise and outliers have little part.
     correlation: float
     energy: float
     correlated: float
-    largest: float
-    noise: float
+    largest: float  # the largest `correlated`
+    noise: float  # fading mean of the share of the square that is noise
 
     @classmethod
     def none(cls) -> ExcitationLevel:

@@ -50,18 +50,12 @@ BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
 class Update(NamedTuple):
-    """Matrices and vectors of an update, with W as in the docstring of this module.
+    """Matrices and vectors of an update, with W as in the docstring of this module."""
 
-    Attributes
-    ----------
-    W, Y
-        Shapes (members, r, r) and (members, r, sensors).
-    half, misfit
-        W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
-    """
-
+    # Shapes (members, r, r) and (members, r, sensors).
     W: Array
     Y: Array
+    # W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
     half: Array
     misfit: Array
 
@@ -82,38 +76,26 @@ class Filter:
     """Predicts and updates, linear about the point of a `FilterState`.
 
     Overflow is no error here: callers check that the results are finite.
-
-    Attributes
-    ----------
-    problem, stage, sensors, reduction
-        Model and sensors; the implicit stage of all members; the observation operator of all
-        members; the reduced coordinates of the unknowns.
-    noise
-        Standard deviation of each sensor, shape (sensors,).
-    rank, scale
-        A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
-        coefficients of the state then: the square root of the mass of each.
-    drift
-        Prior variances gained per unit of time by unknowns without an evolution of their own, one
-        for each member number, shape (numbers,), or (1,) for all.
-    fading
-        Time constant with which the cross-covariance of state and unknowns decays.
-    judge
-        Keeps the sums behind the verdict; None: there is no verdict.
-    shadows
-        Discretisation errors that are followed beside the filter; None: none is.
     """
 
+    # Model and sensors; the implicit stage of all members; the observation operator of all members;
+    # the reduced coordinates of the unknowns.
     problem: Problem
     stage: MemberStage
     sensors: MemberSensors
     reduction: Reduction
-    noise: Array
+    noise: Array  # standard deviation of each sensor, shape (sensors,)
+    # A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
+    # coefficients of the state then: the square root of the mass of each.
     rank: int
     scale: Array
+    # Prior variances gained per unit of time by unknowns without an evolution of their own, one for
+    # each member number, shape (numbers,), or (1,) for all.
     drift: Array
+    # Time constant with which the cross-covariance of state and unknowns decays.
     fading: float = np.inf
-    judge: Judge | None = None
+    judge: Judge | None = None  # keeps the sums behind the verdict; None: there is no verdict
+    # Discretisation errors that are followed beside the filter; None: none is.
     shadows: ShadowSet | None = None
 
     def drifts(self, member: IntArray) -> Array:
@@ -400,13 +382,9 @@ class Filter:
     ) -> tuple[dict[str, Array], Update]:
         """Return the fields of the state after a sample, and the matrices of the update.
 
-        Parameters
-        ----------
-        Y, d
-            Observed square root, (members, r, sensors), and innovations, (members, sensors), in
-            units of the noise; zero where no value is.
-        causes
-            `FilterState.causes` before the update.
+        `Y`, `d`: observed square root, (members, r, sensors), and innovations, (members, sensors),
+        in units of the noise; zero where no value is. `causes`: `FilterState.causes` before the
+        update.
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]

@@ -20,74 +20,47 @@ NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not j
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """State of a filter for each member, after the samples so far.
+    """State of a filter for each member, after the samples so far."""
 
-    Attributes
-    ----------
-    member
-        Numbers of the members, shape (members,).
-    u, q
-        Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
-    du, da
-        Estimated differences of u and of the reduced unknowns a from the linearisation point,
-        (members, n) and (members, k).
-    U, C
-        Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k).
-        As long as nothing moves, r = k.
-    past, dpast
-        Square root and estimate of earlier values of a, one after the other, that a smoother
-        follows; shapes (members, r, p) and (members, p), p = 0 otherwise.
-    age
-        Time for which the unknowns have moved, shape (members,).
-    innovations
-        Statistics of the innovations.
-    rate
-        How fast the readings forget the process noise of unknowns that move, by which steps are
-        divided, shape (members,).
-    parts
-        In how many parts the substeps since the sample before were divided, shape (members,).
-    screened
-        What the gate remembers of each sensor.
-    level, samples
-        Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
-        many samples that stands for, shapes (members,).
-    evidence
-        Logarithm of the likelihood of all readings so far, each sample given those before; a
-        reading that is refused counts as one at the limit of the gate, (members,).
-    kept
-        Warm-start data of the last stage for the next one.
-    causes, ledger
-        Data of the verdict: the shifts of the estimate by possible causes of misfit, as coordinates
-        on the rows of the square root, (members, r, columns), and running sums; see
-        `livepde.verdict`. The filter itself never reads them.
-    shadows
-        Estimated discretisation error.
-    driven
-        What the inputs have done so far.
-    """
-
-    member: IntArray
+    member: IntArray  # numbers of the members, shape (members,)
+    # Linearisation point: state and latent parameter, shapes (members, n) and (members, m).
     u: Array
     q: Array
+    # Estimated differences of u and of the reduced unknowns a from the linearisation point,
+    # (members, n) and (members, k).
     du: Array
     da: Array
+    # Square root of the joint covariance of u and a, shapes (members, r, n) and (members, r, k). As
+    # long as nothing moves, r = k.
     U: Array = field(metadata={"grows": 1})
     C: Array = field(metadata={"grows": 1})
+    # Square root and estimate of earlier values of a, one after the other, that a smoother follows;
+    # shapes (members, r, p) and (members, p), p = 0 otherwise.
     past: Array = field(metadata={"grows": 1})
     dpast: Array
-    age: Array
+    age: Array  # time for which the unknowns have moved, shape (members,)
+    # How fast the readings forget the process noise of unknowns that move, by which steps are
+    # divided, shape (members,).
     rate: Array
-    innovations: Innovations
+    innovations: Innovations  # statistics of the innovations
+    # In how many parts the substeps since the sample before were divided, shape (members,).
     parts: IntArray
-    screened: Screened
+    screened: Screened  # what the gate remembers of each sensor
+    # Square of the noise as a multiple of the stated one, 1 unless the filter finds it, and how
+    # many samples that stands for, shapes (members,).
     level: Array
     samples: Array
+    # Logarithm of the likelihood of all readings so far, each sample given those before; a reading
+    # that is refused counts as one at the limit of the gate, (members,).
     evidence: Array
-    kept: KeptFactors
+    kept: KeptFactors  # warm-start data of the last stage for the next one
+    # Data of the verdict: the shifts of the estimate by possible causes of misfit, as coordinates
+    # on the rows of the square root, (members, r, columns), and running sums; see
+    # `livepde.verdict`. The filter itself never reads them.
     causes: Array = field(metadata={"grows": 1, "begins_anew": True})
     ledger: Ledger = field(metadata={"begins_anew": True})
-    shadows: ShadowState
-    driven: InputHistory
+    shadows: ShadowState  # estimated discretisation error
+    driven: InputHistory  # what the inputs have done so far
 
     def __len__(self) -> int:
         return len(self.member)

@@ -20,47 +20,29 @@ ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """What the gate remembers of each sensor; arrays have the shape (members, sensors).
+    """What the gate remembers of each sensor; arrays have the shape (members, sensors)."""
 
-    Attributes
-    ----------
-    refused, changes
-        Refusals in a row, and how many of these readings differed from the one before.
-    fits
-        Readings in a row that fit, of a sensor of which too many did not.
-    taken
-        Readings that were used, at most `SETTLED`.
-    aside
-        Sensors that are set aside.
-    apart
-        Sensors that are believed, and correct the state but not the unknowns.
-    since, off
-        Time of the first refusal in a row, and the last innovation; NaN without a refusal.
-    low, high
-        Range of the readings that were used; NaN before.
-    last, run, longest
-        The last reading, how often it has been repeated, and the longest repetition of a reading
-        that was used.
-    strain
-        Readings that misfit while they corrected the state, since a disturbance began.
-    calm
-        Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
-    """
-
+    # Refusals in a row, and how many of these readings differed from the one before.
     refused: IntArray
     changes: IntArray
-    fits: IntArray
-    taken: IntArray
-    aside: Mask
-    apart: Mask
+    fits: IntArray  # readings in a row that fit, of a sensor of which too many did not
+    taken: IntArray  # readings that were used, at most `SETTLED`
+    aside: Mask  # sensors that are set aside
+    apart: Mask  # sensors that are believed, and correct the state but not the unknowns
+    # Time of the first refusal in a row, and the last innovation; NaN without a refusal.
     since: Array
     off: Array
+    # Range of the readings that were used; NaN before.
     low: Array
     high: Array
+    # The last reading, how often it has been repeated, and the longest repetition of a reading that
+    # was used.
     last: Array
     run: IntArray
     longest: IntArray
+    # Readings that misfit while they corrected the state, since a disturbance began.
     strain: IntArray
+    # Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
     calm: IntArray
 
     @classmethod
@@ -121,24 +103,12 @@ class Screened:
 
 
 class Gated(NamedTuple):
-    """Outcome of the gate for a sample, each of shape (members, sensors).
+    """Outcome of the gate for a sample, each of shape (members, sensors)."""
 
-    Attributes
-    ----------
-    kept
-        Readings that are used.
-    anchored
-        Readings that correct the state alone.
-    counted
-        Readings that count in the test for jumps.
-    state
-        What the gate remembers.
-    """
-
-    kept: Mask
-    anchored: Mask
-    counted: Mask
-    state: Screened
+    kept: Mask  # readings that are used
+    anchored: Mask  # readings that correct the state alone
+    counted: Mask  # readings that count in the test for jumps
+    state: Screened  # what the gate remembers
 
 
 @dataclass(frozen=True)
@@ -176,14 +146,9 @@ class Gate:
     ) -> Gated:
         """Return what is used of a sample at time t.
 
-        Parameters
-        ----------
-        z, d, noise
-            Readings, innovations and their noise, shapes (members, sensors).
-        far, used
-            Readings that do not fit, and those that are present.
-        pause
-            Members for which the sample follows a pause, shape (members,).
+        `z`, `d`, `noise`: readings, innovations and their noise, shapes (members, sensors). `far`,
+        `used`: readings that do not fit, and those that are present. `pause`: members for which the
+        sample follows a pause, shape (members,).
         """
         last, run, same = x.shown(z, used)
         outside, absurd = self._out_of_range(x, z, noise)

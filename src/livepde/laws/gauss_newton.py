@@ -17,24 +17,16 @@ STRIDE = 1.0  # prior standard deviations that a step moves the reference at mos
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Window:
-    """Some samples of one member: the filter before and after them.
+    """Some samples of one member: the filter before and after them."""
 
-    Attributes
-    ----------
-    start, now
-        The filter where the window begins, and after the samples.
-    reference
-        Latent parameter at the start from which the reference of `now` comes, shape (m,).
-    initial
-        True if the window begins with the initial state that the model says (`Model.initial`).
-    moment, length
-        Time and inputs at the start, and the time since.
-    """
-
+    # The filter where the window begins, and after the samples.
     start: FilterState
     now: FilterState
+    # Latent parameter at the start from which the reference of `now` comes, shape (m,).
     reference: Array
+    # True if the window begins with the initial state that the model says (`Model.initial`).
     initial: bool
+    # Time and inputs at the start, and the time since.
     moment: Moment
     length: float
 

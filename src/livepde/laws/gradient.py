@@ -27,44 +27,26 @@ from livepde.stepping import Interval, Newton, advance
 
 @dataclass(frozen=True, eq=False)
 class GradientState:
-    """Estimates u^ and q^, and the initial data of the next step.
+    """Estimates u^ and q^, and the initial data of the next step."""
 
-    Attributes
-    ----------
-    u, q
-        Coefficients, shapes (n,) and (m,).
-    u_alpha
-        Observed part of the state at the last sample, shape (n,).
-    rate
-        Last change of (u^ - u_alpha, q^) per unit of time, shape (n + m,).
-    kept
-        Factor of the coupled stage.
-    left, width
-        Residual of the last stage, shape (n + m,), for which the next one makes up, and its step.
-    present, frozen
-        Sensors of the last sample, shape (sensors,), and whether q was held.
-    observed, metric, excitation
-        States of the rules for u_alpha and for the metric of Q, and of the excitation gate.
-    tested
-        Sums of the tests of the equation.
-    readings
-        Range of the readings, outside of which they are wild.
-    """
-
+    # Coefficients, shapes (n,) and (m,).
     u: Array
     q: Array
-    u_alpha: Array
-    rate: Array
-    kept: KeptFactor
+    u_alpha: Array  # observed part of the state at the last sample, shape (n,)
+    rate: Array  # last change of (u^ - u_alpha, q^) per unit of time, shape (n + m,)
+    kept: KeptFactor  # factor of the coupled stage
+    # Residual of the last stage, shape (n + m,), for which the next one makes up, and its step.
     left: Array
     width: float
+    # Sensors of the last sample, shape (sensors,), and whether q was held.
     present: Array
     frozen: bool
+    # States of the rules for u_alpha and for the metric of Q, and of the excitation gate.
     observed: Any
     metric: Any
     excitation: ExcitationLevel
-    tested: EquationLedger
-    readings: ReadingRange
+    tested: EquationLedger  # sums of the tests of the equation
+    readings: ReadingRange  # range of the readings, outside of which they are wild
 
 
 @dataclass(frozen=True)

@@ -42,36 +42,25 @@ MOST_STAGES = 8  # kept for different sets of present sensors
 
 @dataclass(frozen=True, eq=False)
 class GradientParts:
-    """Parts computed once for a problem, and the rules around the method.
+    """Parts computed once for a problem, and the rules around the method."""
 
-    Attributes
-    ----------
-    problem, newton, damping
-        As given.
-    M_op, N_op, nu
-        As for `StageForms`.
-    observed, metric
-        Rules for u_alpha and for the metric of Q.
-    gate, probes
-        The excitation gate that holds q, and the probes that measure the excitation; None: q is
-        never held.
-    memory
-        Pattern of the information, for `StageTerms`.
-    tests
-        Tests of the equation, for the verdict; None: there is none.
-    """
-
+    # As given.
     problem: Problem
     newton: Newton
     damping: Damping
+    # As for `StageForms`.
     M_op: Any
     N_op: Any
     nu: float
+    # Rules for u_alpha and for the metric of Q.
     observed: ObservedPart[Any]
     metric: MetricRule[Any]
+    # The excitation gate that holds q, and the probes that measure the excitation; None: q is never
+    # held.
     gate: ExcitationGate | None = None
     probes: Probes | None = None
-    memory: Pattern | None = None
+    memory: Pattern | None = None  # pattern of the information, for `StageTerms`
+    # Tests of the equation, for the verdict; None: there is none.
     tests: EquationTests | None = None
     _stages: Memo[bytes, CoupledStage] = field(default_factory=lambda: Memo(MOST_STAGES))
 
@@ -121,12 +110,8 @@ class GradientParts:
 class StageSequence:
     """The coupled stages of one interval, one after the other: a `Stage` for `advance`.
 
-    Attributes
-    ----------
-    kept
-        The factor that the last stage has kept.
-    left, width
-        Residual of the last stage, shape (n + m,), and its step: the next stage makes up for it.
+    `kept`: the factor that the last stage has kept. `left`, `width`: residual of the last stage,
+    shape (n + m,), and its step: the next stage makes up for it.
     """
 
     def __init__(

@@ -20,24 +20,16 @@ from livepde.stepping import KeptFactors, MemberStage, StageOfMembers, member_st
 
 @dataclass(frozen=True, eq=False)
 class HalvedMesh:
-    """A model on the halved mesh, its sensors, and the maps between both meshes.
+    """A model on the halved mesh, its sensors, and the maps between both meshes."""
 
-    Attributes
-    ----------
-    model, observed, stage
-        The process, its observation, and its implicit stage.
-    P, unknowns
-        Prolongation of the state, shape (N, n), and of the latent parameter, shape (M, m).
-    at
-        Which coefficient of the halved mesh is that of each of the mesh, shape (n,).
-    """
-
+    # The process, its observation, and its implicit stage.
     model: Model
     observed: Observed
     stage: MemberStage
+    # Prolongation of the state, shape (N, n), and of the latent parameter, shape (M, m).
     P: sp.csr_array | Array
     unknowns: sp.csr_array
-    at: IntArray
+    at: IntArray  # which coefficient of the halved mesh is that of each of the mesh, shape (n,)
 
     @classmethod
     def of(cls, problem: Problem) -> HalvedMesh:
@@ -83,15 +75,10 @@ class HalvedMesh:
     def initial_difference(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
         """Return the initial state on the halved mesh minus that of the given mesh, shape (N,).
 
-        Parameters
-        ----------
-        given
-            The initial state as a user gave it; given coefficients do not define values at the new
-            nodes, so that the difference is zero then.
-        moment
-            Time and inputs of the start; None if not known yet, and the difference is zero then.
-        q, u
-            Latent parameter and initial state, shapes (m,) and (n,).
+        `given`: the initial state as a user gave it; given coefficients do not define values at the
+        new nodes, so that the difference is zero then. `moment`: time and inputs of the start; None
+        if not known yet, and the difference is zero then. `q`, `u`: latent parameter and initial
+        state, shapes (m,) and (n,).
         """
         coarse = self.prolong(u[None])[0]
         if moment is None:
@@ -109,14 +96,8 @@ class HalvedMesh:
 
         Shape (members, sensors).
 
-        Parameters
-        ----------
-        u, q
-            States and latent parameters of the mesh, about which sensors are linear.
-        difference
-            Shape (members, N).
-        moment
-            Time and inputs of a member.
+        `u`, `q`: states and latent parameters of the mesh, about which sensors are linear.
+        `difference`: shape (members, N). `moment`: time and inputs of a member.
         """
         if self.G is not None:
             return np.asarray((self.G @ difference.T).T)

@@ -42,10 +42,7 @@ def opened(log: Array, span: Span) -> Array:
 def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
     """Return a log with the sample at the end of a span, of those members that took it.
 
-    Parameters
-    ----------
-    parts
-        In how many parts the substeps of the span were divided, shape (members,).
+    `parts`: in how many parts the substeps of the span were divided, shape (members,).
     """
     longer = _extended(log)
     row, sensors = longer[:, -1], span.z1.shape[1]
@@ -88,11 +85,8 @@ def _extended(log: Array) -> Array:
 def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
     """Return a log without the readings of some sensors since a time.
 
-    Parameters
-    ----------
-    sensors, since
-        Sensors of each member, and the time of the first reading to leave out, shapes (members,
-        sensors).
+    `sensors`, `since`: sensors of each member, and the time of the first reading to leave out,
+    shapes (members, sensors).
     """
     gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
     readings = log[:, :, 1 : 1 + sensors.shape[1]]
@@ -140,10 +134,7 @@ def with_readings(log: Array, sensors: int) -> Mask:
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
     """Return how many samples, from the last one back, hold so many with a reading; all if fewer.
 
-    Parameters
-    ----------
-    shown
-        Whether a sample has a reading, in time order; one does at least.
+    `shown`: whether a sample has a reading, in time order; one does at least.
     """
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])

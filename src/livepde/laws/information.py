@@ -112,41 +112,23 @@ RESOLUTION = np.array([1e9, 1e5])  # largest ratio of information to prior, rows
 
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Sums over the samples so far, and the metric that was made of them last.
+    """Sums over the samples so far, and the metric that was made of them last."""
 
-    Attributes
-    ----------
-    origin
-        q0, shape (m,).
-    matrix, right
-        Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
-    total
-        trace(G_Q^{-1} J) of the same, shape (2,).
-    given
-        trace(G_Q^{-1} J) of all rows without fading.
-    force
-        A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m).
-    power
-        Means of the power of forces and of half that of their changes, each measured against smooth
-        and against rough functions, shape (2, 2).
-    seen
-        Means of the traces that they are relative to, shape (2,).
-    elapsed, samples
-        Time and number of samples.
-    spread, held, weighed
-        S, data of J, and trace(G_Q^{-1} J) in the current H.
-    """
-
-    origin: Array
+    origin: Array  # q0, shape (m,)
+    # Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
     matrix: Array
     right: Array
-    total: Array
-    given: float
-    force: Array
+    total: Array  # trace(G_Q^{-1} J) of the same, shape (2,)
+    given: float  # trace(G_Q^{-1} J) of all rows without fading
+    force: Array  # A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m)
+    # Means of the power of forces and of half that of their changes, each measured against smooth
+    # and against rough functions, shape (2, 2).
     power: Array
-    seen: Array
+    seen: Array  # means of the traces that they are relative to, shape (2,)
+    # Time and number of samples.
     elapsed: float
     samples: int
+    # S, data of J, and trace(G_Q^{-1} J) in the current H.
     spread: float
     held: Array
     weighed: float
@@ -236,17 +218,8 @@ def _pattern(model: Model, selects: bool) -> Pattern:
 class InformationMetric(MetricRule[Information]):
     """H/PULL instead of G_Q/gain, with H = S G_Q + J.
 
-    Parameters
-    ----------
-    model
-        With its prior.
-    selects
-        True if sensors select coefficients: then J is sparse.
-
-    Attributes
-    ----------
-    pattern
-        Of J.
+    `model`: with its prior. `selects`: True if sensors select coefficients: then J is sparse.
+    `pattern` is that of J.
     """
 
     def __init__(self, model: Model, selects: bool) -> None:
@@ -351,10 +324,7 @@ class InformationMetric(MetricRule[Information]):
     def _renewed(self, state: Information, change: Array) -> Information:
         """Return the state with an H that is new if the last one has aged.
 
-        Parameters
-        ----------
-        change
-            The last change of q, shape (m,).
+        `change`: the last change of q, shape (m,).
         """
         if not np.all(state.seen > 0.0):
             return state

@@ -44,12 +44,7 @@ def with_input_noise(
     The row is the difference to the state whose input is one standard deviation off, exact where
     the model is affine in it.
 
-    Parameters
-    ----------
-    propagate
-        Takes a state over a span.
-    x, end
-        The state before and after the span.
+    `propagate`: takes a state over a span. `x`, `end`: the state before and after the span.
     """
     members, k, bare = len(x), x.C.shape[2], _bare(x)
     rows = []
@@ -163,12 +158,8 @@ def initial_rows(
     of each reading is a row of its own, and the effect of the unknowns on the sensors, an offset
     say, stands in the rows of those unknowns. So the readings tell nothing more of them.
 
-    Parameters
-    ----------
-    noise
-        Standard deviation of each sensor, shape (sensors,).
-    q, u, moment
-        Latent parameter, state, time and inputs at the start.
+    `noise`: standard deviation of each sensor, shape (sensors,). `q`, `u`, `moment`: latent
+    parameter, state, time and inputs at the start.
 
     Returns
     -------

@@ -40,22 +40,14 @@ OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts 
 
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """The samples, assimilated linear about one trajectory of the unknowns.
+    """The samples, assimilated linear about one trajectory of the unknowns."""
 
-    Attributes
-    ----------
-    trajectory, smoothed
-        Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
-        which the filter was linear, and those that it then estimates from all samples.
-    x
-        The filter after the last sample.
-    misfit
-        Minus twice the logarithm of the probability of the trajectory, up to a constant.
-    """
-
+    # Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
+    # which the filter was linear, and those that it then estimates from all samples.
     trajectory: Array
     smoothed: Array
-    x: FilterState
+    x: FilterState  # the filter after the last sample
+    # Minus twice the logarithm of the probability of the trajectory, up to a constant.
     misfit: float
 
 
@@ -340,10 +332,7 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
 def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
     """Return the squared increment of a trajectory in a time h, in units of its process noise.
 
-    Parameters
-    ----------
-    gained
-        Variance of the process noise of each coordinate in that time, shape (k,).
+    `gained`: variance of the process noise of each coordinate in that time, shape (k,).
     """
     increment = after - filter_.reduction.transition(h) @ before
     return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())

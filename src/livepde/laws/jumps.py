@@ -19,40 +19,28 @@ LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """Innovations of the last samples of each member.
+    """Innovations of the last samples of each member."""
 
-    Attributes
-    ----------
-    squares, counts
-        Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
-        (members, samples).
-    seen, resting
-        Samples since the start, and samples that are not looked at yet, shape (members,).
-    usual
-        Statistics of the innovations, with which new ones are compared: none counts for more than
-        `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
-    scatters
-        Usual scatter before each of the last samples, newest first, shape (members, samples).
-    """
-
+    # Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
+    # (members, samples).
     squares: Array
     counts: Array
+    # Samples since the start, and samples that are not looked at yet, shape (members,).
     seen: IntArray
     resting: IntArray
+    # Statistics of the innovations, with which new ones are compared: none counts for more than
+    # `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
     usual: Innovations
+    # Usual scatter before each of the last samples, newest first, shape (members, samples).
     scatters: Array
 
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
 
-        Parameters
-        ----------
-        opening
-            Members that still have to find the usual size, shape (members,): there any innovation
-            counts, while those after an alarm, which learn anew, are left out.
-        refused
-            How many values in a row of each sensor a gate has refused, (members, sensors); None: it
-            refuses none. They may be wild, and do not count for the usual size before it is found.
+        `opening`: members that still have to find the usual size, shape (members,): there any
+        innovation counts, while those after an alarm, which learn anew, are left out. `refused`:
+        how many values in a row of each sensor a gate has refused, (members, sensors); None: it
+        refuses none. They may be wild, and do not count for the usual size before it is found.
         """
         seen = np.isfinite(e)
         square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)

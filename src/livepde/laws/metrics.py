@@ -30,46 +30,29 @@ class NoState:
 
 @dataclass(frozen=True, eq=False)
 class StepBegin:
-    """A step before it is taken.
+    """A step before it is taken."""
 
-    Attributes
-    ----------
-    q, w
-        Parameter at its beginning, and w = u_alpha + P u with the data at its end.
-    moment, length
-        Time and inputs at its end, and how long it is.
-    """
-
+    # Parameter at its beginning, and w = u_alpha + P u with the data at its end.
     q: Array
     w: Array
+    # Time and inputs at its end, and how long it is.
     moment: Moment
     length: float
 
 
 @dataclass(frozen=True, eq=False)
 class Transition:
-    """A step that was taken, for a rule to learn from.
+    """A step that was taken, for a rule to learn from."""
 
-    Attributes
-    ----------
-    forms
-        The forms of the stage.
-    q, w
-        Parameter as the stage has found it, and w = u_alpha + P u, at its end.
-    change
-        By how much q has changed, shape (m,).
-    error
-        Returns the equation error of the data at its end, shape (n,),
-        R^T eps = -theta R^T M_op r - R^T M r'.
-    moment, length
-        Time and inputs at its end, and how long it was.
-    """
-
-    forms: StageForms
+    forms: StageForms  # the forms of the stage
+    # Parameter as the stage has found it, and w = u_alpha + P u, at its end.
     q: Array
     w: Array
-    change: Array
+    change: Array  # by how much q has changed, shape (m,)
+    # Returns the equation error of the data at its end, shape (n,), R^T eps = -theta R^T M_op r -
+    # R^T M r'.
     error: Callable[[], Array]
+    # Time and inputs at its end, and how long it was.
     moment: Moment
     length: float
 

@@ -130,11 +130,8 @@ def model_errors(
 ) -> ModelErrors | str:
     """Return misfit and intervals that allow for errors of the model, or why there are none.
 
-    Parameters
-    ----------
-    std, shift
-        Reported standard deviations of the latent unknowns, and their shifts by the discretisation,
-        (m,).
+    `std`, `shift`: reported standard deviations of the latent unknowns, and their shifts by the
+    discretisation, (m,).
     """
     one = _best(samples)
     if one is None:
@@ -200,11 +197,8 @@ def _allowed(
 ) -> Iterator[Allowed]:
     """Iterate over the unknowns with their intervals.
 
-    Parameters
-    ----------
-    variance, std
-        Variance that the noise alone leaves of the latent unknowns, and their reported standard
-        deviations, (m,).
+    `variance`, `std`: variance that the noise alone leaves of the latent unknowns, and their
+    reported standard deviations, (m,).
     """
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
@@ -247,12 +241,8 @@ def linear_model(
 ) -> tuple[LinearModel, Causes, list[Family]]:
     """Return the readings in use as a linear model, and what may be wrong.
 
-    Parameters
-    ----------
-    one, used
-        The best fit, and the readings that it uses.
-    T
-        What is asked for, as rows on the coordinates xi, (numbers, r).
+    `one`, `used`: the best fit, and the readings that it uses. `T`: what is asked for, as rows on
+    the coordinates xi, (numbers, r).
     """
     work = len(samples.spans) * samples.filter.problem.model.X.dim
     fine = len(samples.spans) >= MANY and work * MOST_COLUMNS < MOST_WORK

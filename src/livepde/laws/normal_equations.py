@@ -21,24 +21,13 @@ from livepde.linalg import Array, Pattern
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """Contribution of one sample to the normal equations, per unit of time.
+    """Contribution of one sample to the normal equations, per unit of time."""
 
-    Attributes
-    ----------
-    matrix
-        A^T R D^{-1} R^T A of both kinds of rows, data in the pattern of J, shape (2, entries).
-    right
-        A^T R D^{-1} R^T y of the same, y = A q - eps, shape (2, m).
-    force
-        A^T R D^{-1} R^T eps of all rows, shape (m,).
-    trace
-        trace(G_Q^{-1} matrix), shape (2,).
-    """
-
+    # A^T R D^{-1} R^T A of both kinds of rows, data in the pattern of J, shape (2, entries).
     matrix: Array
-    right: Array
-    force: Array
-    trace: Array
+    right: Array  # A^T R D^{-1} R^T y of the same, y = A q - eps, shape (2, m)
+    force: Array  # A^T R D^{-1} R^T eps of all rows, shape (m,)
+    trace: Array  # trace(G_Q^{-1} matrix), shape (2,)
 
 
 class NormalEquations(ABC):
@@ -48,14 +37,9 @@ class NormalEquations(ABC):
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
         """Return the contribution of a sample.
 
-        Parameters
-        ----------
-        A
-            Data of A(w).
-        q, error
-            Parameter, shape (m,), and the equation error R^T eps that it leaves, shape (n,).
-        probes
-            V with trace(V^T J V) close to trace(G_Q^{-1} J), shape (m, k).
+        `A`: data of A(w). `q`, `error`: parameter, shape (m,), and the equation error R^T eps that
+        it leaves, shape (n,). `probes`: V with trace(V^T J V) close to trace(G_Q^{-1} J), shape (m,
+        k).
         """
 
     @abstractmethod
@@ -66,16 +50,8 @@ class NormalEquations(ABC):
 class SelectedRows(NormalEquations):
     """Sensors that select coefficients: D is diagonal and J as sparse as A^T A.
 
-    Parameters
-    ----------
-    pattern
-        Of A, shape (n, m).
-    inverse
-        D^{-1} of the rows of both kinds, zero elsewhere, shape (2, n).
-    free
-        One for each free coefficient of q, shape (m,).
-    J
-        Pattern of J.
+    `pattern`: of A, shape (n, m). `inverse`: D^{-1} of the rows of both kinds, zero elsewhere,
+    shape (2, n). `free`: one for each free coefficient of q, shape (m,). `J`: pattern of J.
     """
 
     def __init__(self, pattern: Pattern, inverse: Array, free: Array, J: Pattern) -> None:
@@ -140,16 +116,8 @@ class ProjectedRows(NormalEquations):
 
     All of them see the unobserved part.
 
-    Parameters
-    ----------
-    pattern
-        Of A, shape (n, m).
-    basis
-        V, shape (n, k).
-    mass
-        M, shape (n, n).
-    free, free_q
-        One for each free coefficient of u and q.
+    `pattern`: of A, shape (n, m). `basis`: V, shape (n, k). `mass`: M, shape (n, n). `free`,
+    `free_q`: one for each free coefficient of u and q.
     """
 
     def __init__(

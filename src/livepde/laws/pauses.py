@@ -22,26 +22,15 @@ SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range
 
 @dataclass(frozen=True, eq=False)
 class InputHistory:
-    """What the inputs have done so far, and at which pace.
+    """What the inputs have done so far, and at which pace."""
 
-    Attributes
-    ----------
-    low, high, steepest
-        Range of each input, and its largest rate of change, shapes (members, channels).
-    pace
-        Longest usual interval, shape (members,); 0 before.
-    count
-        Intervals so far, at most `SETTLED`, shape (members,).
-    pause
-        Whether the last interval was a pause, shape (members,).
-    """
-
+    # Range of each input, and its largest rate of change, shapes (members, channels).
     low: Array
     high: Array
     steepest: Array
-    pace: Array
-    count: Array
-    pause: Mask
+    pace: Array  # longest usual interval, shape (members,); 0 before
+    count: Array  # intervals so far, at most `SETTLED`, shape (members,)
+    pause: Mask  # whether the last interval was a pause, shape (members,)
 
     @classmethod
     def start(cls, channels: int, members: int = 1) -> InputHistory:

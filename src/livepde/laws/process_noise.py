@@ -59,31 +59,18 @@ def pieces(control: Advance, start: float, stop: float, parts: int) -> list[floa
 
 @dataclass(frozen=True, eq=False)
 class NoiseRows:
-    """Rows of the square root for the process noise of one step: all ramps, then all arches.
+    """Rows of the square root for the process noise of one step: all ramps, then all arches."""
 
-    Attributes
-    ----------
-    start, length
-        Of the step.
-    scale
-        Standard deviation gained by each coordinate that moves in it, shape (members, moving).
-    lengths
-        The step over the relaxation time of each of them, zero for a random walk.
-    columns
-        Their numbers among all k coordinates, shape (moving,).
-    k
-        Number of coordinates.
-    weight
-        Of the last stage in the quadrature of the time scheme (`Scheme.weight`).
-    """
-
+    # Of the step.
     start: float
     length: float
+    # Standard deviation gained by each coordinate that moves in it, shape (members, moving).
     scale: Array
+    # The step over the relaxation time of each of them, zero for a random walk.
     lengths: tuple[float, ...]
-    columns: IntArray
-    k: int
-    weight: float
+    columns: IntArray  # their numbers among all k coordinates, shape (moving,)
+    k: int  # number of coordinates
+    weight: float  # of the last stage in the quadrature of the time scheme (`Scheme.weight`)
 
     def __len__(self) -> int:
         return 2 * len(self.columns)
@@ -116,13 +103,8 @@ class NoiseRows:
         rate. It rises at once where a part of the step is too long for it, and falls to a half of
         it at most.
 
-        Parameters
-        ----------
-        before
-            The rate so far, by which the step was divided, shape (members,).
-        Y
-            What the sensors see of the rows in the state, in units of the noise, shape (members,
-            rows, sensors).
+        `before`: the rate so far, by which the step was divided, shape (members,). `Y`: what the
+        sensors see of the rows in the state, in units of the noise, shape (members, rows, sensors).
         """
         if self.weight == 1.0:  # one stage sees the mean of both alike
             return before

@@ -20,17 +20,10 @@ MOST_MODES = 60  # of a field with modes="auto"
 
 @dataclass(frozen=True, eq=False)
 class ReducedEvolution:
-    """How one unknown moves by itself, in reduced coordinates.
+    """How one unknown moves by itself, in reduced coordinates."""
 
-    Attributes
-    ----------
-    part
-        Slice of its reduced coordinates: copies times modes.
-    model, std
-        Evolution model of the latent coefficients, and their prior standard deviation.
-    """
-
-    part: slice
+    part: slice  # slice of its reduced coordinates: copies times modes
+    # Evolution model of the latent coefficients, and their prior standard deviation.
     model: Evolution
     std: float
 
@@ -62,21 +55,12 @@ class ReducedEvolution:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Reduced coordinates a ~ N(0, I) of all unknowns, q = prior + Phi a.
+    """Reduced coordinates a ~ N(0, I) of all unknowns, q = prior + Phi a."""
 
-    Attributes
-    ----------
-    problem
-        Model and sensors.
-    Phi
-        Prior standard deviations for numbers, leading modes of the prior for fields, shape (m, k).
-    evolutions
-        Evolution models of the coordinates of each unknown.
-    """
-
-    problem: Problem
+    problem: Problem  # model and sensors
+    # Prior standard deviations for numbers, leading modes of the prior for fields, shape (m, k).
     Phi: Array
-    evolutions: tuple[ReducedEvolution, ...]
+    evolutions: tuple[ReducedEvolution, ...]  # evolution models of the coordinates of each unknown
 
     @classmethod
     def of(cls, problem: Problem, modes: int | str | dict[str, int]) -> Reduction:
@@ -183,12 +167,8 @@ class Reduction:
         A drifting unknown gains the less, the closer its variance is to that of the prior: without
         data it is never less certain than at first.
 
-        Parameters
-        ----------
-        variance
-            Of the coordinates of each member, shape (members, k).
-        drift
-            Prior variances gained per unit of time by unknowns that stay, shape (members,).
+        `variance`: of the coordinates of each member, shape (members, k). `drift`: prior variances
+        gained per unit of time by unknowns that stay, shape (members,).
         """
         gained = _growth(self.evolutions, h)
         if not drift.any():
@@ -281,10 +261,7 @@ class Reduction:
     def directions(self, q: Array, C: Array) -> Array:
         """Return how the physical parameter changes along rows of a, (members, r, m).
 
-        Parameters
-        ----------
-        q, C
-            Latent parameters, (members, dim), and rows, (members, r, k).
+        `q`, `C`: latent parameters, (members, dim), and rows, (members, r, k).
         """
         latent, along = self.problem.model.latent, C @ self.Phi.T
         if latent.plain:
@@ -300,12 +277,8 @@ class Reduction:
     def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:
         """Return the latent parameter that is expected to have become q in a time h, shape (m,).
 
-        Parameters
-        ----------
-        start
-            A latent parameter at the earlier time: its part outside the modes is kept, shape (m,).
-        drift
-            As for `gained`.
+        `start`: a latent parameter at the earlier time: its part outside the modes is kept, shape
+        (m,). `drift`: as for `gained`.
         """
         if not (self.moves or drift):
             return q

@@ -45,28 +45,15 @@ LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """End of a search.
+    """End of a search."""
 
-    Attributes
-    ----------
-    best
-        The samples about the trajectory where it ended.
-    used
-        Readings in use, shape (samples, sensors).
-    converged
-        True if no step lowers the cost any more, and samples that are not explained pin all
-        unknowns: then the model is in error, not the search.
-    passes
-        Passes over the samples that it took.
-    screened
-        True if it began again at screened points, and none explains the samples.
-    """
-
-    best: Passed
-    used: Mask
+    best: Passed  # the samples about the trajectory where it ended
+    used: Mask  # readings in use, shape (samples, sensors)
+    # True if no step lowers the cost any more, and samples that are not explained pin all unknowns:
+    # then the model is in error, not the search.
     converged: bool
-    passes: float
-    screened: bool
+    passes: float  # passes over the samples that it took
+    screened: bool  # True if it began again at screened points, and none explains the samples
 
 
 def refitted(
@@ -74,13 +61,9 @@ def refitted(
 ) -> Found | None:
     """Return the end of a search from the present estimate; None if no trajectory is possible.
 
-    Parameters
-    ----------
-    last
-        True for the end of a run: the search converges. Else it ends within a standard deviation,
-        as the same samples are fitted again later.
-    screened
-        How many samples the last search had that began again at screened points in vain.
+    `last`: True for the end of a run: the search converges. Else it ends within a standard
+    deviation, as the same samples are fitted again later. `screened`: how many samples the last
+    search had that began again at screened points in vain.
     """
     search = _Search(samples, options, last)
     search.descend(samples.reached)
@@ -341,12 +324,8 @@ class _Search:
 def _shift(sizes: Array, g: Array, delta: float) -> float:
     """Return the shift of the Hessian with which the minimum of the model is within a ball.
 
-    Parameters
-    ----------
-    sizes, g
-        Eigenvalues of the Hessian, at least 1, and the descent direction in its axes, shapes (r,).
-    delta
-        Radius of the ball.
+    `sizes`, `g`: eigenvalues of the Hessian, at least 1, and the descent direction in its axes,
+    shapes (r,). `delta`: radius of the ball.
     """
     if np.linalg.norm(g / sizes) <= delta:
         return 0.0

@@ -48,31 +48,18 @@ FEWEST = 8  # modes below which their rougher half says nothing about noise
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """Running means over the samples.
+    """Running means over the samples."""
 
-    Attributes
-    ----------
-    left
-        (u_alpha, L (z - u_alpha)) for each alpha, shape (alphas,).
-    noise
-        E (u_alpha, L n) for noise of the stated level, or of level 1, shape (alphas,).
-    power
-        Square of the noise level, as a multiple of that.
-    samples, pairs
-        Number of samples, and of those that told of the level.
-    z, boundary
-        The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
-    turned
-        Sum of the cosines by which samples have turned back so far; those of exact data go on.
-    """
-
-    left: Array
-    noise: Array
-    power: float
+    left: Array  # (u_alpha, L (z - u_alpha)) for each alpha, shape (alphas,)
+    noise: Array  # E (u_alpha, L n) for noise of the stated level, or of level 1, shape (alphas,)
+    power: float  # square of the noise level, as a multiple of that
+    # Number of samples, and of those that told of the level.
     samples: int
     pairs: int
+    # The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
     z: Array
     boundary: Array
+    # Sum of the cosines by which samples have turned back so far; those of exact data go on.
     turned: float
 
     @classmethod
@@ -125,10 +112,8 @@ class NoiseDetector:
     def add(self, balance: Balance, z: Array, boundary: Array) -> tuple[Balance, bool]:
         """Return the means with the noise products of a sample, and whether the samples are noisy.
 
-        Parameters
-        ----------
-        z, boundary
-            The sample, shape (sensors,), and the boundary values at its time, shape (n,).
+        `z`, `boundary`: the sample, shape (sensors,), and the boundary values at its time, shape
+        (n,).
         """
         samples = np.stack([*balance.z, z])
         if np.isfinite(samples[:, self.split.present]).all():

@@ -13,76 +13,54 @@ from livepde.stepping import KeptFactors
 
 @dataclass(frozen=True, eq=False)
 class ShadowState:
-    """Shifts of the estimates of each member; the leading axis of every array is the members.
+    """Shifts of the estimates of each member; the leading axis of every array is the members."""
 
-    Attributes
-    ----------
-    u, a
-        Shifts of state and reduced unknowns by the discretisation, a row for each shadow, shapes
-        (members, shadows, n) and (members, shadows, k).
-    count, last, due
-        Steps so far, and at which the shadows were taken last and are taken next, (members,).
-    rate, usual, jumped
-        Change of the state per unit of time in the last step, how much that usually differs from
-        one step to the next, and the count of steps at which it last differed by much more; shapes
-        (members, n), (members,) and (members,).
-    size
-        Norm of the last error that the step shadow found, (members,); infinite before.
-    begun, u0, inputs0
-        Time, state and inputs where the shadows were taken last; the state without columns if no
-        shadow needs it. Shapes (members,), (members, n) and (members, channels).
-    length, slope
-        Of the last interval, infinite before the first, and how inputs changed in it per unit of
-        time; shapes (members,) and (members, channels).
-    bend, missed
-        Integral over the last interval of the difference of the inputs from straight lines, and the
-        sum of these integrals that no shadow has stepped with yet, shapes (members, channels).
-    held
-        Of inputs that are held: last value, last change, and sums of the squares of changes and of
-        their differences, shape (members, 4, channels).
-    halves, blocks
-        Warm-start data of the last stages of halved steps, and of a block of steps.
-    fine, fine_stage
-        The state on the halved mesh minus that of the filter, shape (members, N), and the
-        warm-start data of the last stage on the halved mesh.
-    seen
-        The difference in the predicted readings due to `fine`, shape (members, sensors).
-    gains
-        Sum of the gains of the samples since the shadows were taken last, each times the time since
-        then, shape (members, sensors, k); without sensors if no shadow needs it.
-    failed
-        How many shadow steps had no solution, shape (members,).
-    excess
-        Error of the last step that the step shadow took, over what is allowed, shape (members,).
-    coarse, coarsest
-        How many steps were left with a larger one, and the largest `excess` of them, (members,).
-    """
-
+    # Shifts of state and reduced unknowns by the discretisation, a row for each shadow, shapes
+    # (members, shadows, n) and (members, shadows, k).
     u: Array
     a: Array
+    # Steps so far, and at which the shadows were taken last and are taken next, (members,).
     count: IntArray
     last: IntArray
     due: IntArray
+    # Change of the state per unit of time in the last step, how much that usually differs from one
+    # step to the next, and the count of steps at which it last differed by much more; shapes
+    # (members, n), (members,) and (members,).
     rate: Array
     usual: Array
     jumped: IntArray
-    size: Array
+    size: Array  # norm of the last error that the step shadow found, (members,); infinite before
+    # Time, state and inputs where the shadows were taken last; the state without columns if no
+    # shadow needs it. Shapes (members,), (members, n) and (members, channels).
     begun: Array
     u0: Array
     inputs0: Array
+    # Of the last interval, infinite before the first, and how inputs changed in it per unit of
+    # time; shapes (members,) and (members, channels).
     length: Array
     slope: Array
+    # Integral over the last interval of the difference of the inputs from straight lines, and the
+    # sum of these integrals that no shadow has stepped with yet, shapes (members, channels).
     bend: Array
     missed: Array
+    # Of inputs that are held: last value, last change, and sums of the squares of changes and of
+    # their differences, shape (members, 4, channels).
     held: Array
+    # Warm-start data of the last stages of halved steps, and of a block of steps.
     halves: KeptFactors
     blocks: KeptFactors
+    # The state on the halved mesh minus that of the filter, shape (members, N), and the warm-start
+    # data of the last stage on the halved mesh.
     fine: Array
     fine_stage: KeptFactors
-    seen: Array
+    seen: Array  # the difference in the predicted readings due to `fine`, shape (members, sensors)
+    # Sum of the gains of the samples since the shadows were taken last, each times the time since
+    # then, shape (members, sensors, k); without sensors if no shadow needs it.
     gains: Array
-    failed: IntArray
+    failed: IntArray  # how many shadow steps had no solution, shape (members,)
+    # Error of the last step that the step shadow took, over what is allowed, shape (members,).
     excess: Array
+    # How many steps were left with a larger one, and the largest `excess` of them, (members,).
     coarse: IntArray
     coarsest: Array
 

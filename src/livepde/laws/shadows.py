@@ -117,79 +117,49 @@ class Shadows:
 
 
 class ShadowedSteps(NamedTuple):
-    """Steps of some members whose error a shadow estimates: all since the previous estimate.
+    """Steps of some members whose error a shadow estimates: all since the previous estimate."""
 
-    Attributes
-    ----------
-    x, end
-        The filter before and after the last of them.
-    step, span
-        The last step, and all steps as one.
-    waited, next
-        Number of steps in it, and from now to the next estimate, (members,).
-    jumps
-        Members of which the rate of the state jumped in the last step, shape (members,).
-    """
-
+    # The filter before and after the last of them.
     x: FilterState
     end: FilterState
+    # The last step, and all steps as one.
     step: Span
     span: Span
+    # Number of steps in it, and from now to the next estimate, (members,).
     waited: IntArray
     next: IntArray
-    jumps: Mask
+    jumps: Mask  # members of which the rate of the state jumped in the last step, shape (members,)
 
 
 class ErrorIncrement(NamedTuple):
-    """Discretisation error of a block of steps.
+    """Discretisation error of a block of steps."""
 
-    Attributes
-    ----------
-    failed
-        Members whose shadow could not be stepped, shape (members,); nothing is added for them.
-    parts
-        Fields of `ShadowState` to exchange.
-    u, a
-        Additional error of the state and of the reduced unknowns, shapes (members, n) and (members,
-        k); None for zero.
-    """
-
+    # Members whose shadow could not be stepped, shape (members,); nothing is added for them.
     failed: Mask
-    parts: dict[str, Any]
+    parts: dict[str, Any]  # fields of `ShadowState` to exchange
+    # Additional error of the state and of the reduced unknowns, shapes (members, n) and (members,
+    # k); None for zero.
     u: Array | None = None
     a: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class MeanProcess:
-    """The process of a filter without covariance: members with the unknowns of the filter.
+    """The process of a filter without covariance: members with the unknowns of the filter."""
 
-    Attributes
-    ----------
-    control, stage
-        Step control, and implicit stage of all members.
-    reduction
-        The reduced coordinates of the unknowns.
-    moves
-        True if an unknown moves.
-    """
-
+    # Step control, and implicit stage of all members.
     control: Advance
     stage: MemberStage
-    reduction: Reduction
-    moves: bool
+    reduction: Reduction  # the reduced coordinates of the unknowns
+    moves: bool  # True if an unknown moves
 
     def propagate(
         self, x: FilterState, u: Array, kept: KeptFactors, span: Span
     ) -> tuple[Array, KeptFactors, Mask]:
         """Return states after a span, warm-start data of the last stage, and which members failed.
 
-        Parameters
-        ----------
-        x, u
-            The filter at the start, and the states that are propagated in the place of its own.
-        kept
-            Warm-start data of the previous stage.
+        `x`, `u`: the filter at the start, and the states that are propagated in the place of its
+        own. `kept`: warm-start data of the previous stage.
         """
         if not self.moves:
             return self._through(x, u, kept, span, [span.t1])
@@ -249,10 +219,7 @@ class Shadow(ABC):
     ) -> ShadowState:
         """Return the state before the first step, of one member.
 
-        Parameters
-        ----------
-        moment, given
-            Time and inputs, None before any; and the initial state as it was given.
+        `moment`, `given`: time and inputs, None before any; and the initial state as it was given.
         """
 
     @abstractmethod
@@ -282,20 +249,11 @@ class StepShadow(Shadow):
 
     One step stands for half of those since the estimate before and half of those until the next,
     unless its error is much larger than the one estimated before.
-
-    Attributes
-    ----------
-    halves
-        The process by halved steps.
-    factor
-        2^p/(2^p - 1) for a scheme of order p.
-    tolerance
-        What is allowed of an error.
     """
 
-    halves: MeanProcess
-    factor: float
-    tolerance: StepTolerance
+    halves: MeanProcess  # the process by halved steps
+    factor: float  # 2^p/(2^p - 1) for a scheme of order p
+    tolerance: StepTolerance  # what is allowed of an error
 
     kind = "step"
 
@@ -335,17 +293,10 @@ class InputShadow(Shadow):
     The mean of a line misses that of a curve by h^2/12 times its second derivative, which the last
     three readings tell. Second differences of noise add up to nothing. A step that is written as
     two rows a moment apart is no curve.
-
-    Attributes
-    ----------
-    process
-        The process itself.
-    signs
-        Sign of the error of each channel, shape (channels,): 1 for a line, 0 for none.
     """
 
-    process: MeanProcess
-    signs: Array
+    process: MeanProcess  # the process itself
+    signs: Array  # sign of the error of each channel, shape (channels,): 1 for a line, 0 for none
 
     kind = "input"
 
@@ -457,18 +408,12 @@ class MeshShadow(Shadow):
     only its difference to the state of the filter is kept. Several steps are taken at once on both
     meshes. Up to the next block the difference in the readings is held constant; then its change is
     known, is taken as linear in between, and the effect of this change on the unknowns is added.
-
-    Attributes
-    ----------
-    coarse, fine
-        The process on the mesh, and on the halved mesh.
-    mesh
-        The halved mesh.
     """
 
+    # The process on the mesh, and on the halved mesh.
     coarse: MeanProcess
     fine: MeanProcess
-    mesh: HalvedMesh
+    mesh: HalvedMesh  # the halved mesh
 
     kind = "mesh"
 
@@ -524,29 +469,17 @@ class MeshShadow(Shadow):
 
 @dataclass(frozen=True, eq=False)
 class ShadowSet:
-    """The discretisation errors that are estimated online with a filter.
+    """The discretisation errors that are estimated online with a filter."""
 
-    Attributes
-    ----------
-    problem, reduction
-        Those of the filter.
-    rows
-        Function that returns the readings of rows of state and reduced unknowns, (members, rows,
-        sensors): `MemberSensors.rows`.
-    shadows
-        One for each row of `ShadowState.u`.
-    refused
-        Why the mesh has no shadow; empty if it has one.
-    most
-        Parts of a substep at most.
-    """
-
+    # Those of the filter.
     problem: Problem
     reduction: Reduction
+    # Function that returns the readings of rows of state and reduced unknowns, (members, rows,
+    # sensors): `MemberSensors.rows`.
     rows: Callable[[FilterState, Array, Array, Moments], Array]
-    shadows: tuple[Shadow, ...]
-    refused: str
-    most: int
+    shadows: tuple[Shadow, ...]  # one for each row of `ShadowState.u`
+    refused: str  # why the mesh has no shadow; empty if it has one
+    most: int  # parts of a substep at most
 
     @classmethod
     def of(
@@ -562,12 +495,8 @@ class ShadowSet:
     ) -> ShadowSet:
         """Return the shadows of a filter.
 
-        Parameters
-        ----------
-        noise, stage
-            Standard deviation of each sensor, shape (sensors,), and the implicit stage.
-        moves
-            Whether unknowns move.
+        `noise`, `stage`: standard deviation of each sensor, shape (sensors,), and the implicit
+        stage. `moves`: whether unknowns move.
         """
         process = MeanProcess(problem.control, stage, reduction, moves)
         refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
@@ -633,10 +562,7 @@ class ShadowSet:
     def predict(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
         """Return the state after a span with the errors that have come about in it.
 
-        Parameters
-        ----------
-        x, end
-            Before and after the span; `end` with the errors of before, propagated.
+        `x`, `end`: before and after the span; `end` with the errors of before, propagated.
         """
         s = end.shadows
         parts, jumps = _watch_rate(s, x, end, span)
@@ -719,12 +645,8 @@ class ShadowSet:
     def finer_parts(self, end: FilterState, parts: IntArray) -> IntArray:
         """Return in how many parts the substeps of a span have to be divided, (members,).
 
-        Parameters
-        ----------
-        end
-            The state after the span, with its error where that has been estimated.
-        parts
-            In how many parts its substeps are divided there.
+        `end`: the state after the span, with its error where that has been estimated. `parts`: in
+        how many parts its substeps are divided there.
         """
         s = end.shadows
         coarse = (s.last == s.count) & (s.excess > 1.0) & (parts < self.most)
@@ -777,19 +699,10 @@ class ShadowSet:
     ) -> ShadowState:
         """Return the shadows after a sample.
 
-        Parameters
-        ----------
-        x
-            The filter before it.
-        U, C
-            The square root after it.
-        left
-            `Update.left`.
-        weights
-            One over the noise of each value that was used, zero for others, (members, sensors).
-        off, t
-            By how much predictions of such values were off (`in_readings`), zero for others; and
-            the time.
+        `x`: the filter before it. `U`, `C`: the square root after it. `left`: `Update.left`.
+        `weights`: one over the noise of each value that was used, zero for others, (members,
+        sensors). `off`, `t`: by how much predictions of such values were off (`in_readings`), zero
+        for others; and the time.
         """
         s = x.shadows
         # K^T = `gain` [U C], with the rows of the new square root.
@@ -818,10 +731,7 @@ class ShadowSet:
     def diagnostics(self, x: FilterState, C: Array) -> Diagnostics[Array]:
         """Return the shifts of the unknowns, numbers of shape (members,).
 
-        Parameters
-        ----------
-        C
-            Square root of their covariance without the shifts, (members, r, k).
+        `C`: square root of their covariance without the shifts, (members, r, k).
         """
         reduction, latent = self.reduction, self.problem.model.latent
         found = []

@@ -81,13 +81,9 @@ def smoothed(
 
     States that are not asked for have no coefficients.
 
-    Parameters
-    ----------
-    before, after
-        The member before the first sample, and its filter after the last one in the run: its noise
-        level and the statistics of its innovations are those of all samples.
-    used
-        Readings of the last samples that a refit has used, (samples, sensors); None: there is none.
+    `before`, `after`: the member before the first sample, and its filter after the last one in the
+    run: its noise level and the statistics of its innovations are those of all samples. `used`:
+    readings of the last samples that a refit has used, (samples, sensors); None: there is none.
     """
     with nonfinite_allowed():  # not finite: not used
         best = _descended(*_begun(work, before, after, data, used))

@@ -60,10 +60,7 @@ class StepLedger(NamedTuple):
 def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
     """Return a finding for each way in which steps have failed.
 
-    Parameters
-    ----------
-    counts
-        Code of a status -> number of samples.
+    `counts`: code of a status -> number of samples.
     """
     samples = sum(counts.values())
     for code in FAILURES:

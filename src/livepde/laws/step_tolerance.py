@@ -26,20 +26,12 @@ class StepTolerance:
     A component of the state counts by its root mean square, times the largest reading, in units of
     its noise, of a state of size one: constant, or linear in a coordinate. So components that no
     sensor sees do not count.
-
-    Attributes
-    ----------
-    problem
-        Model and sensors.
-    rows
-        Readings of rows of state and reduced unknowns: `MemberSensors.rows`.
-    noise
-        Standard deviation of each sensor, shape (sensors,).
     """
 
-    problem: Problem
+    problem: Problem  # model and sensors
+    # Readings of rows of state and reduced unknowns: `MemberSensors.rows`.
     rows: Callable[[FilterState, Array, Array, Moments], Array]
-    noise: Array
+    noise: Array  # standard deviation of each sensor, shape (sensors,)
 
     @cached_property
     def _weights(self) -> Array:

@@ -31,24 +31,14 @@ AT_ONCE = 32  # trajectories that are followed as one array
 
 @dataclass(frozen=True, eq=False)
 class Passed:
-    """The samples about one trajectory.
+    """The samples about one trajectory."""
 
-    Attributes
-    ----------
-    xi
-        Coordinates of the trajectory, shape (r,).
-    residuals
-        Readings less predictions, in units of the noise, shape (samples, sensors); NaN: missing.
-    slopes
-        Derivatives of the predictions in xi, in units of the noise, (samples, sensors, r).
-    end
-        State, unknowns, and their derivatives in xi as rows, after the last sample.
-    """
-
-    xi: Array
+    xi: Array  # coordinates of the trajectory, shape (r,)
+    # Readings less predictions, in units of the noise, shape (samples, sensors); NaN: missing.
     residuals: Array
+    # Derivatives of the predictions in xi, in units of the noise, (samples, sensors, r).
     slopes: Array
-    end: FilterState
+    end: FilterState  # state, unknowns, and their derivatives in xi as rows, after the last sample
 
     def cost(self, used: Mask) -> float:
         """Return half the sum of squares of residuals in use and of xi."""
@@ -57,18 +47,12 @@ class Passed:
 
 @dataclass(frozen=True, eq=False)
 class StoredSamples:
-    """The samples of one member since the start of its window.
+    """The samples of one member since the start of its window."""
 
-    Attributes
-    ----------
-    work, state
-        Parts of the law, and the member as it is now.
-    spans
-        Intervals that lead to each sample; the first is without length if it is at the start.
-    """
-
+    # Parts of the law, and the member as it is now.
     work: SensitivityWork
     state: SensitivityState
+    # Intervals that lead to each sample; the first is without length if it is at the start.
     spans: Sequence[Span]
 
     @classmethod

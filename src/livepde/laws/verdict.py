@@ -52,14 +52,8 @@ def judge_of(
 ) -> Judge | None:
     """Return the judge of a filter; None if there is to be none.
 
-    Parameters
-    ----------
-    verdict
-        As for `SensitivityLaw`.
-    rank
-        Rows of the square root at most.
-    kept
-        Whether the filter forgets nothing, so that a record of unknowns that stay makes sense.
+    `verdict`: as for `SensitivityLaw`. `rank`: rows of the square root at most. `kept`: whether the
+    filter forgets nothing, so that a record of unknowns that stay makes sense.
     """
     if not verdict:
         return None
@@ -143,12 +137,7 @@ def with_discretisation(
 ) -> Callable[[], Verdict]:
     """Return a verdict that names the errors of the discretisation which are not held.
 
-    Parameters
-    ----------
-    shadows
-        Those of the filter; None: it follows no such error.
-    s
-        Their state.
+    `shadows`: those of the filter; None: it follows no such error. `s`: their state.
     """
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
     coarse = 0 if shadows is None else int(s.coarse[0])
@@ -188,10 +177,7 @@ def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callab
 
     They are looked for only where something speaks against the estimates.
 
-    Parameters
-    ----------
-    columns
-        The columns, or why they cannot be looked at.
+    `columns`: the columns, or why they cannot be looked at.
     """
 
     def found() -> Verdict:

@@ -21,22 +21,13 @@ PATIENCE = 3  # wild readings in a row, after which the process has moved
 
 @dataclass(frozen=True, eq=False)
 class ReadingRange:
-    """Range of the readings of each sensor, shapes (sensors,).
+    """Range of the readings of each sensor, shapes (sensors,)."""
 
-    Attributes
-    ----------
-    low, high
-        Range of the readings that were used; NaN before any.
-    count
-        Number of readings that were used, at most `SETTLED`.
-    wild
-        Wild readings in a row; of a sensor whose last reading was used 0.
-    """
-
+    # Range of the readings that were used; NaN before any.
     low: Array
     high: Array
-    count: IntArray
-    wild: IntArray
+    count: IntArray  # number of readings that were used, at most `SETTLED`
+    wild: IntArray  # wild readings in a row; of a sensor whose last reading was used 0
 
     @classmethod
     def start(cls, sensors: int) -> ReadingRange:

@@ -192,33 +192,21 @@ class BlockSolver(StageSolver):
 
 @dataclass(frozen=True, eq=False)
 class BlockJacobian:
-    """K at a point, as a `Factor`: GMRES, preconditioned by its approximate inverse.
-
-    Attributes
-    ----------
-    S, forward, A, H
-        Its blocks on free coefficients: `forward` is A(w) over omega and elsewhere, `A` over omega
-        only; H with its auxiliary unknowns behind.
-    rates
-        Lumped mass times the rate of each equation of the state, shape (n,).
-    least
-        Sizes of updates of u and q that are not resolved further.
-    back, curved
-        Derivatives of A(w)^T r in u and in q; None if they are held or zero.
-    border
-        (b, a): b a^T is added to S.
-    """
+    """K at a point, as a `Factor`: GMRES, preconditioned by its approximate inverse."""
 
     solver: BlockSolver
+    # Its blocks on free coefficients: `forward` is A(w) over omega and elsewhere, `A` over omega
+    # only; H with its auxiliary unknowns behind.
     S: sp.csr_array
     forward: sp.csr_array
     A: sp.csr_array
     H: sp.csr_array
-    rates: Array
-    least: tuple[float, ...]
+    rates: Array  # lumped mass times the rate of each equation of the state, shape (n,)
+    least: tuple[float, ...]  # sizes of updates of u and q that are not resolved further
+    # Derivatives of A(w)^T r in u and in q; None if they are held or zero.
     back: sp.csr_array | None
     curved: sp.csr_array | None
-    border: tuple[Array, Array] | None = None
+    border: tuple[Array, Array] | None = None  # (b, a): b a^T is added to S
 
     def apply(self, x: Array) -> Array:
         """Return K x, auxiliary unknowns behind (u, q)."""

@@ -36,25 +36,18 @@ class KeptFactor:
 
     The factor itself is made again from this where it is gone, after a restart say: the numbers
     that follow are the same.
-
-    Attributes
-    ----------
-    y, u_alpha, h
-        Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
-    weight, sigma, information, theta
-        Of its metric; `information` is empty and `theta` NaN without one.
-    spent
-        Updates that stages took since then, beyond one each.
     """
 
+    # Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
     y: Array
     u_alpha: Array
     h: float
+    # Of its metric; `information` is empty and `theta` NaN without one.
     weight: float
     sigma: float
     information: Array
     theta: float
-    spent: int
+    spent: int  # updates that stages took since then, beyond one each
 
     @classmethod
     def none(cls) -> KeptFactor:
@@ -118,10 +111,7 @@ def nearest_root(
 class CoupledStage:
     """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`.
 
-    Attributes
-    ----------
-    carries
-        True if each stage makes up for the remaining residual of the one before.
+    `carries`: True if each stage makes up for the remaining residual of the one before.
     """
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
@@ -146,14 +136,9 @@ class CoupledStage:
     ) -> tuple[StageIterate, KeptFactor]:
         """Return the solution of one stage, and the factor to keep; raises `StepFailed`.
 
-        Parameters
-        ----------
-        start
-            Returns where the iteration begins without a prediction, shape (n + m,).
-        predicted
-            A prediction of the solution, shape (n + m,).
-        kept
-            The factor that the stage before has kept.
+        `start`: returns where the iteration begins without a prediction, shape (n + m,).
+        `predicted`: a prediction of the solution, shape (n + m,). `kept`: the factor that the stage
+        before has kept.
         """
         solver, kept = self.solver, kept or KeptFactor.none()
         data = solver.data(problem)

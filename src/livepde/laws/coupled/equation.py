@@ -56,119 +56,66 @@ class Inside:
 
 @dataclass(frozen=True, eq=False)
 class StageProblem:
-    """One stage to be solved.
+    """One stage to be solved."""
 
-    Attributes
-    ----------
-    c
-        (c_u, c_q), shape (n + m,).
-    h, moment
-        Step, and time and inputs at its end.
-    u_alpha
-        Observed part of the state, shape (n,).
-    metric
-        Weights of the second line.
-    left
-        Remaining residual of the stage before, for which this one makes up, a dual vector, shape
-        (n + m,); None: residuals are not carried from stage to stage.
-    """
-
-    c: Array
+    c: Array  # (c_u, c_q), shape (n + m,)
+    # Step, and time and inputs at its end.
     h: float
     moment: Moment
-    u_alpha: Array
-    metric: Metric
+    u_alpha: Array  # observed part of the state, shape (n,)
+    metric: Metric  # weights of the second line
+    # Remaining residual of the stage before, for which this one makes up, a dual vector, shape (n +
+    # m,); None: residuals are not carried from stage to stage.
     left: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class StageData:
-    """A stage with the data that are computed once for it.
+    """A stage with the data that are computed once for it."""
 
-    Attributes
-    ----------
-    problem
-        The stage.
-    source, load
-        F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
-    rest
-        Left side of the second line for a q that does not change, shape (m,).
-    inside
-        A and B over omega, where the data give all of w there.
-    sizes
-        Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of
-        F and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
-    observed
-        Function that returns the squared norms of u_alpha, computed once.
-    J
-        Information in the metric, a matrix of shape (m, m); None: zero.
-    """
-
-    problem: StageProblem
+    problem: StageProblem  # the stage
+    # F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
     source: Array
     load: Array
-    rest: Array
-    inside: Inside | None
+    rest: Array  # left side of the second line for a q that does not change, shape (m,)
+    inside: Inside | None  # A and B over omega, where the data give all of w there
+    # Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of F
+    # and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
     sizes: tuple[float, float, float]
+    # Function that returns the squared norms of u_alpha, computed once.
     observed: Callable[[], Residual]
-    J: Any = None
+    J: Any = None  # information in the metric, a matrix of shape (m, m); None: zero
 
 
 @dataclass(frozen=True, eq=False)
 class StageIterate:
-    """The stage at a point y = (u, q).
+    """The stage at a point y = (u, q)."""
 
-    Attributes
-    ----------
-    y, residual
-        Shape (n + m,).
-    size, resolved
-        See `livepde.stepping.newton.StagePoint`.
-    scales
-        Dual norms of the largest terms of the two lines.
-    w, r
-        Argument of A and B over omega, and the observed residual, shape (n,).
-    A_in
-        A(w) over omega, shape (n, m).
-    theta
-        Weight of R^T M_op r.
-    norms
-        Squared norms of r.
-    Mr, mass_r
-        R^T M_op r and R^T M r over omega, shape (n,).
-    """
-
+    # Shape (n + m,).
     y: Array
     residual: Array
+    # See `livepde.stepping.newton.StagePoint`.
     size: float
     resolved: bool
-    scales: tuple[float, float]
+    scales: tuple[float, float]  # dual norms of the largest terms of the two lines
+    # Argument of A and B over omega, and the observed residual, shape (n,).
     w: Array
     r: Array
-    A_in: Any
-    theta: float
-    norms: Residual
+    A_in: Any  # A(w) over omega, shape (n, m)
+    theta: float  # weight of R^T M_op r
+    norms: Residual  # squared norms of r
+    # R^T M_op r and R^T M r over omega, shape (n,).
     Mr: Array
     mass_r: Array
 
 
 @dataclass(frozen=True, eq=False)
 class StageTerms:
-    """Terms of a stage that all solvers share: its forms, gains and norms.
+    """Terms of a stage that all solvers share: its forms, gains and norms."""
 
-    Parameters
-    ----------
-    forms
-        Forms over omega and elsewhere.
-    damping
-        Rule for theta.
-    memory
-        Pattern of `Metric.information`; None: there is none.
-    """
-
-    forms: StageForms
-    damping: Damping
-    memory: Pattern | None = None
+    forms: StageForms  # forms over omega and elsewhere
+    damping: Damping  # rule for theta
+    memory: Pattern | None = None  # pattern of `Metric.information`; None: there is none
 
     @cached_property
     def n(self) -> int:
@@ -256,14 +203,8 @@ class StageTerms:
     ) -> tuple[float, bool, tuple[float, float]]:
         """Return the relative size of a residual, whether it resolves r, and the scales of both.
 
-        Parameters
-        ----------
-        first, second
-            Residual and changing terms of the two lines.
-        X
-            ||r||_X^2.
-        accuracy
-            Of r, relative, as far as it is above the floor.
+        `first`, `second`: residual and changing terms of the two lines. `X`: ||r||_X^2. `accuracy`:
+        of r, relative, as far as it is above the floor.
         """
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
@@ -498,10 +439,7 @@ class StageSolver(ABC):
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
         """Return a stage, with the terms that do not depend on its solution.
 
-        Parameters
-        ----------
-        w
-            u_alpha with the Dirichlet values, shape (n,); default those of the moment.
+        `w`: u_alpha with the Dirichlet values, shape (n,); default those of the moment.
         """
         forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:

@@ -16,25 +16,15 @@ class Metric:
     with q_t = (q - c_q)/h, the Gram matrix G_Q, and the generator K of unknowns that move by
     themselves. With J = 0 and without load it is (noisy_q), and with sigma = 0 (est_exact_q), for
     weight = 1/gain.
-
-    Attributes
-    ----------
-    weight
-        1/gain, >= 0.
-    sigma
-        Stabilising term of (noisy_q), >= 0.
-    load
-        Terms of the right-hand side besides A(w)^T r, shape (m,); None: zero.
-    information
-        Data of J, in the pattern that the stage was made with; None: zero.
-    theta
-        Weight of R^T M_op r in the stage, where the metric sets it; None: by the damping rule.
     """
 
-    weight: float
-    sigma: float = 0.0
+    weight: float  # 1/gain, >= 0
+    sigma: float = 0.0  # stabilising term of (noisy_q), >= 0
+    # Terms of the right-hand side besides A(w)^T r, shape (m,); None: zero.
     load: Array | None = None
+    # Data of J, in the pattern that the stage was made with; None: zero.
     information: Array | None = None
+    # Weight of R^T M_op r in the stage, where the metric sets it; None: by the damping rule.
     theta: float | None = None
 
     def scale(self, h: float) -> float:

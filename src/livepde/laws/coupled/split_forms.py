@@ -30,23 +30,15 @@ AnyForm: TypeAlias = Form | Composed
 
 @dataclass(frozen=True, eq=False)
 class StageForms:
-    """Forms and matrices of a stage for one set of sensors; fixed, whatever the step.
+    """Forms and matrices of a stage for one set of sensors; fixed, whatever the step."""
 
-    Parameters
-    ----------
-    model, split
-        The process, and the split of its state into an observed and a hidden part.
-    M_op, N_op
-        Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
-    nu
-        Weight of N.
-    """
-
+    # The process, and the split of its state into an observed and a hidden part.
     model: Model
     split: Split
+    # Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
     M_op: Any
     N_op: Any
-    nu: float
+    nu: float  # weight of N
 
     @cached_property
     def _outside(self) -> IntArray | None:
