@@ -14,8 +14,8 @@ from benchmarks import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
 from livepde.laws.coupled import Metric, StageProblem, block_factors
-from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.block_factors import BlockJacobian, BlockSolver
+from livepde.laws.coupled.monolithic import BilinearSolver
 from livepde.linalg import choice
 
 EXACT = lp.stepping.Newton(tolerance=1e-11, share=0.0)

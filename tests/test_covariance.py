@@ -5,7 +5,7 @@ import pytest
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.covariance import robust_factors
+from livepde.laws.filter import robust_factors
 from livepde.laws.member_arrays import changed
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import livepde as lp
-from livepde.laws.damping_bounds import (
+from livepde.laws.damping import (
     Constants,
     ExactBound,
     NoisyBound,

@@ -25,8 +25,7 @@ import livepde as lp
 from livepde.fem import Moment
 from livepde.laws.coupled import CoupledStage, Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled import coupled_stage as stage_module
-from livepde.laws.coupled.bilinear import BilinearSolver
-from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
 from livepde.model import h1_form
 from livepde.stepping import ForwardStage, Near, StepFailed
 

@@ -11,7 +11,7 @@ from factories import driven_rod, filter_alone, observe, readings
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.excitation_gate import ExcitationLevel, Probes, pairs
+from livepde.laws.equation_tests import ExcitationLevel, Probes, pairs
 from livepde.laws.history import added, empty_log, opened
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import Scale

@@ -17,7 +17,7 @@ from livepde.errors import LawError
 from livepde.laws.coupled import StageForms
 from livepde.laws.information import InformationMetric, trace_probes
 from livepde.laws.normal_equations import diagonal_bound
-from livepde.laws.sample_smoothing import Balance, NoiseDetector
+from livepde.laws.observed_part import Balance, NoiseDetector
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import Twin
 

@@ -10,7 +10,7 @@ from skfem import ElementLineP1
 import livepde as lp
 from livepde import cases
 from livepde.cases.preview import StatedNoise
-from livepde.laws.input_noise import ROWS
+from livepde.laws.noise_rows import ROWS
 from livepde.stepping import Alexander2, ImplicitEuler
 
 H, STEPS = 0.01, 40

@@ -10,7 +10,7 @@ import pytest
 from factories import driven_rod, filter_alone, line, readings
 
 import livepde as lp
-from livepde.laws.jumps import Jumps
+from livepde.laws.policies import Jumps
 
 pytestmark = pytest.mark.slow
 

@@ -16,7 +16,7 @@ from benchmarks.honest.linear import diffusion, fine_times
 from livepde.cases import load
 from livepde.cli import app
 from livepde.fleet import Fleet
-from livepde.laws.pauses import InputHistory, pauses
+from livepde.laws.filter_state import InputHistory, pauses
 from livepde.runs import sampling_findings
 from livepde.stepping import Span
 from livepde.streams.sampling import clock_leaps, unit_factor

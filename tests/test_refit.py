@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from scipy.special import erfc, erfcx
 
 import livepde as lp
-from livepde.laws import refit_apart
+from livepde.laws import refits
 from livepde.laws.refit import refitted
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import heat
@@ -355,13 +355,13 @@ def test_a_refit_apart_survives_restarts_and_copies(at: int):
 def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatch):
     """A fit that has not ended holds no sample up before it is due."""
     ends = threading.Event()
-    fit = refit_apart.refitted_now
+    fit = refits.refitted_now
 
     def slowly(*given: Any) -> Any:
         assert ends.wait(60.0)
         return fit(*given)
 
-    monkeypatch.setattr(refit_apart, "refitted_now", slowly)
+    monkeypatch.setattr(refits, "refitted_now", slowly)
     identifier, samples = insulated(apart=True), rod_samples()
     numbers_of(identifier, samples[:143])  # that of 128 samples is due with sample 144
     ends.set()
@@ -373,7 +373,7 @@ def test_an_error_in_a_refit_apart_reaches_who_steps(monkeypatch: pytest.MonkeyP
     def broken(*given: Any) -> Any:
         raise ValueError("of a form")
 
-    monkeypatch.setattr(refit_apart, "refitted_now", broken)
+    monkeypatch.setattr(refits, "refitted_now", broken)
     with pytest.raises(ValueError, match="of a form"):
         numbers_of(insulated(apart=True), rod_samples())
 
@@ -383,7 +383,7 @@ def test_numbers_that_end_a_refit_apart_end_no_run(monkeypatch: pytest.MonkeyPat
     def singular(*given: Any) -> Any:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(refit_apart, "refitted_now", singular)
+    monkeypatch.setattr(refits, "refitted_now", singular)
     identifier = insulated(apart=True)
     for t, z in rod_samples():
         estimate = identifier.step(t, z)

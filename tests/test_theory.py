@@ -19,14 +19,14 @@ import livepde as lp
 from livepde import diagnostics as dg
 from livepde.errors import ConfigurationError
 from livepde.laws.coupled.split_forms import StageForms
-from livepde.laws.damping_bounds import (
+from livepde.laws.damping import (
     Constants,
     ExactBound,
     Norms,
     SmoothedBound,
+    diffusion_operator,
     unobserved_damping,
 )
-from livepde.laws.diffusion_operators import diffusion_operator
 from livepde.observation import Tikhonov
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise, Twin

@@ -21,9 +21,8 @@ import numpy as np
 
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
-from livepde.laws.outliers import near_most, near_neighbours
-from livepde.laws.refit import WILD, refitted
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Refit
+from livepde.laws.refit import WILD, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed

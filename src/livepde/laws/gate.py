@@ -1,21 +1,28 @@
-"""The gate: which readings are used, which sensors are excluded, and when they return."""
+"""The gate: which readings are used, which sensors are excluded, and when they return.
+
+Laws without a covariance cannot weigh an innovation: `ReadingRange` leaves out wild values, such as
+9999, far outside all that has been measured. If the readings of the sensor stay there, the process
+has moved.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import Interval
 
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 LASTING = 100  # readings that misfit, after which constants have to explain them as well
 CALM = 50  # samples without a correction of the state, after which a disturbance is over
 SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
 ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
+PATIENCE = 3  # wild readings in a row, after which the process has moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,3 +214,52 @@ class Gate:
         span = np.fmax.reduce(ranges, axis=1, initial=0.0)[:, None]
         moved = span > MOVED
         return moved & (beyond > span), moved & (beyond > ABSURD * span)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingRange:
+    """Range of the readings of each sensor, shapes (sensors,)."""
+
+    # Range of the readings that were used; NaN before any.
+    low: Array
+    high: Array
+    count: IntArray  # number of readings that were used, at most `SETTLED`
+    wild: IntArray  # wild readings in a row; of a sensor whose last reading was used 0
+
+    @classmethod
+    def start(cls, sensors: int) -> ReadingRange:
+        """Return the value before any reading."""
+        never, none = np.full(sensors, np.nan), np.zeros(sensors, dtype=np.int64)
+        return cls(low=never, high=never, count=none, wild=none)
+
+    def screened(self, interval: Interval, noise: Array | None) -> tuple[Interval, ReadingRange]:
+        """Return an interval without wild readings at both ends, and the value after it."""
+        z = interval.z1
+        wild = self._wild(z, 0.0 if noise is None else MOVED * noise)
+        before = self.wild > 0
+        lasting = wild & (self.wild >= PATIENCE)
+        wild &= ~lasting
+        used = np.where(wild, np.nan, z)
+        present = np.isfinite(used)
+        after = ReadingRange(
+            low=np.fmin(self.low, used),
+            high=np.fmax(self.high, used),
+            count=np.minimum(self.count + present, SETTLED),
+            wild=np.where(wild, self.wild + 1, np.where(present, 0, self.wild)),
+        )
+        if not (wild.any() or before.any()):
+            return interval, after
+        z0 = np.where(before, np.nan, interval.z0)
+        return replace(interval, z0=z0, z1=used), after
+
+    def _wild(self, z: Array, least: float | Array) -> Mask:
+        """Return which readings are far outside their past and that of the other sensors."""
+        known = self.count >= SETTLED
+        none: Mask = np.zeros(len(z), dtype=bool)
+        if not known.any():
+            return none
+        # A process that begins to move is seen by one sensor first: the scale is that of all.
+        scale = np.maximum(np.nanmax(self.high) - np.nanmin(self.low), least)
+        with np.errstate(invalid="ignore"):
+            far: Mask = (z > self.high + ABSURD * scale) | (z < self.low - ABSURD * scale)
+        return known & far & (scale > 0.0)

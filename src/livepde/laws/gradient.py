@@ -12,14 +12,18 @@ from livepde.errors import LawError
 from livepde.fem import Moment
 from livepde.laws.coupled import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.equation_tests import EquationLedger, EquationTests, ObservedEquation
-from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel
+from livepde.laws.equation_tests import (
+    EquationLedger,
+    EquationTests,
+    ExcitationGate,
+    ExcitationLevel,
+    ObservedEquation,
+)
+from livepde.laws.gate import ReadingRange
 from livepde.laws.gradient_parts import GradientParts, StageSequence, constant_parts, tuned_parts
-from livepde.laws.information import InformationMetric
+from livepde.laws.information import InformationMetric, StepBegin, Transition
 from livepde.laws.law import Belief, Deferred, Law, Problem, Report, Status
-from livepde.laws.metrics import StepBegin, Transition
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.wild_readings import ReadingRange
 from livepde.linalg import Array
 from livepde.model import h1_form
 from livepde.stepping import Interval, Newton, advance

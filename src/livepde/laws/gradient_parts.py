@@ -19,19 +19,24 @@ from livepde.laws.coupled import (
     StageTerms,
 )
 from livepde.laws.damping import Damping, ResidualDamping
-from livepde.laws.equation_tests import EquationLedger, EquationTests, ObservedEquation
-from livepde.laws.excitation_gate import ExcitationGate, ExcitationLevel, Probes
-from livepde.laws.information import InformationMetric
+from livepde.laws.equation_tests import (
+    EquationLedger,
+    EquationTests,
+    ExcitationGate,
+    ExcitationLevel,
+    ObservedEquation,
+    Probes,
+)
+from livepde.laws.information import ConstantMetric, InformationMetric, MetricRule, MetricStep
 from livepde.laws.law import Problem
-from livepde.laws.metrics import ConstantMetric, MetricRule, MetricStep
 from livepde.laws.observed_part import (
     GeneralizedInverse,
     ObservedPart,
     ObservedPath,
     RegularizedInverse,
     SelfChosenSmoothing,
+    smooths,
 )
-from livepde.laws.sample_smoothing import smooths
 from livepde.linalg import Array, Memo, Pattern
 from livepde.stepping import Newton
 

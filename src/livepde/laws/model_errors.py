@@ -17,8 +17,8 @@ import numpy as np
 
 from livepde.fem import Scalar
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
+from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
-from livepde.laws.refit_options import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.observation import Points

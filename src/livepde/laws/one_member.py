@@ -14,19 +14,18 @@ import numpy as np
 from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
 from livepde.laws.gate import Screened
-from livepde.laws.gauss_newton import (
-    CONVERGED,
+from livepde.laws.history import intervals_since, reaching
+from livepde.laws.iterated_smoother import (
+    AGREED,
     Window,
     distance,
     missed_most,
     next_reference,
     placed,
 )
-from livepde.laws.guards import Guards
-from livepde.laws.history import intervals_since, reaching
-from livepde.laws.jumps import Jumps
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
+from livepde.laws.policies import Guards, Jumps
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,
@@ -122,7 +121,7 @@ def _iterated(
             start=begin, now=x, reference=begin.q[0], initial=False, moment=start, length=length
         )
         far = missed_most(filter_, window) > guards.reach
-        if not (far and distance(filter_, window) > CONVERGED):
+        if not (far and distance(filter_, window) > AGREED):
             return levelled(x, temper), tempered
         found = _converged(work, window, interval, guards.iterations)
         if found is not None:
@@ -148,7 +147,7 @@ def _converged(
         if not report.status.ok:
             return None
         window = replace(window, now=x, reference=q)
-        if distance(filter_, window) <= CONVERGED:
+        if distance(filter_, window) <= AGREED:
             # Once more about the same reference, now with ledger and discretisation errors.
             x, report = _filtered(work, placed(filter_, last, q), interval)
             return x if report.status.ok else None

@@ -9,16 +9,19 @@ points. The gate acts once a search has ended, and may take back readings.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import scipy
 
-from livepde.laws.outliers import FEW, near_most, near_neighbours, usual_size
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, Mask
 
+NEIGHBOURS = 3  # to each side
+FEW = 2 * NEIGHBOURS
+NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
@@ -41,6 +44,49 @@ GATE_ROUNDS = 4
 WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
 GATE = 4.0  # the same for residuals, from those before and after them
 LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use is taken to keep
+
+
+def usual_size(values: Array) -> float:
+    """Return the standard deviation by the median of the sizes of values, at least 1."""
+    return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
+
+
+def near_neighbours(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of their neighbours.
+
+    A model error, which changes slowly, stays.
+    """
+    return _near(values, limit, _of_neighbours)
+
+
+def near_most(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of all of a sensor.
+
+    A sensor that shows a wrong constant for some time has neighbours that agree with it.
+    """
+    return _near(values, limit, np.median)
+
+
+def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
+    """Return which values lie within `limit` usual distances from the centre of their sensor."""
+    near = np.isfinite(values)
+    for k, column in enumerate(values.T):
+        (places,) = near[:, k].nonzero()
+        if len(places) > FEW:
+            away = column[places] - centre(column[places])
+            near[places, k] = np.abs(away) <= limit * usual_size(away)
+    return near
+
+
+def _of_neighbours(values: Array) -> Array:
+    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
+    count, reach = len(values), NEIGHBOURS
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
+    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
+    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
+    first = [np.median(values[which]) for which in edges.values()]
+    last = [np.median(values[count - 1 - which]) for which in edges.values()]
+    return np.concatenate([first, inner, last[::-1]])
 
 
 @dataclass(frozen=True, eq=False)

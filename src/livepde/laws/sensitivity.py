@@ -19,25 +19,20 @@ from livepde.laws.assimilation import (
     no_readings,
 )
 from livepde.laws.columns import Columns
-from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter
-from livepde.laws.filter_state import NO_LEDGER, FilterState
+from livepde.laws.filter import Filter, reported_factors
+from livepde.laws.filter_state import NO_LEDGER, FilterState, InputHistory, ShadowState
 from livepde.laws.gate import Gate, Screened
-from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
-from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
-from livepde.laws.input_noise import PAUSE_ROWS, input_rank, with_initial_rows
-from livepde.laws.jumps import Jumps
+from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
 from livepde.laws.member_arrays import changed, join, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
+from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
-from livepde.laws.pauses import InputHistory
+from livepde.laws.policies import Guards, Jumps, Refit
 from livepde.laws.reduction import Reduction
-from livepde.laws.refit_apart import go_on
-from livepde.laws.refit_options import Refit
-from livepde.laws.refits import refit_due, settle
+from livepde.laws.refits import go_on, refit_due, settle
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,
@@ -50,7 +45,6 @@ from livepde.laws.sensitivity_state import (
     shortened,
     stored,
 )
-from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
@@ -353,7 +347,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 moment=interval.end,
                 length=0.0,
             )
-            if not iterates or distance(filter_, begun) <= CONVERGED:
+            if not iterates or distance(filter_, begun) <= AGREED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
             # The noise level is that before the sample, which would count in each iteration else.

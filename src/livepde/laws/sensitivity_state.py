@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.covariance import robust_factors
-from livepde.laws.filter import Filter
+from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
-from livepde.laws.guards import Guards
 from livepde.laws.history import added, trimmed, withdrawn
-from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, take, where, zeros
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import refusal

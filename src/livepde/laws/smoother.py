@@ -29,8 +29,7 @@ import numpy as np
 from livepde.errors import LawError
 from livepde.laws.assimilation import GateDecision, absorb
 from livepde.laws.filter_state import FilterState, unaccompanied, unjudged
-from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved
+from livepde.laws.iterated_smoother import Window, expecting, missed, moved, placed
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork

@@ -1,26 +1,27 @@
-"""Which causes the verdict on a filter looks for, and by how much they have moved its estimate."""
+"""Which causes the verdict on a filter looks for, what has moved it, and how steps ended."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from livepde.laws.columns import Columns, likely_columns
-from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState
-from livepde.laws.input_noise import input_rank
-from livepde.laws.law import Fit, Problem
+from livepde.laws.filter import Filter, reported_factors
+from livepde.laws.filter_state import FilterState, ShadowState
+from livepde.laws.law import Fit, Problem, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import model_errors
+from livepde.laws.noise_rows import input_rank
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.shadow_state import ShadowState
+from livepde.laws.shadow_kinds import ALLOWED
 from livepde.laws.shadows import ShadowSet
-from livepde.laws.step_tolerance import ALLOWED
 from livepde.laws.stored_samples import StoredSamples
-from livepde.linalg import Array, nonfinite_allowed
+from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.records import STATUS_CODES
+from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (
     NOT_JUDGED,
     REFUSED,
@@ -39,6 +40,12 @@ from livepde.verdict.sentences import FINDINGS, percent
 
 COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
+COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
+
+SOME = 0.02  # share of the samples from which failed steps are more than a mishap
+MOST = 0.5  # share from which little is left of the data
+PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
+FAILURES = ("departed", "not_converged", "not_finite", "singular")  # codes with a finding each
 
 
 def judge_of(
@@ -284,3 +291,62 @@ def _distance(reduction: Reduction, x: FilterState, a: Array) -> tuple[float, in
     along = axes.T @ a
     squared = float((along[told] ** 2 / (1.0 - left[told])).sum())
     return squared, int(told.sum())
+
+
+class StepLedger(NamedTuple):
+    """Numbers of samples by the status of their step, in the order of `STATUS_CODES`.
+
+    The last number counts the intervals whose substeps were longer than `dt_max`.
+    """
+
+    counts: IntArray
+
+    @classmethod
+    def start(cls) -> StepLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros(COUNTS, dtype=np.int64))
+
+    def add(self, code: str, stretched: bool) -> StepLedger:
+        """Return the value after a sample whose step ended with a status."""
+        counts = self.counts.copy()
+        counts[PLACES[code]] += 1
+        counts[-1] += stretched
+        return StepLedger(counts)
+
+    @property
+    def irregular(self) -> bool:
+        """Whether any step was not ok, or had substeps longer than `dt_max`."""
+        counts = self.counts.tolist()
+        return bool(sum(counts) > counts[PLACES["ok"]])
+
+    def findings(self) -> Iterator[Finding]:
+        """Return a finding for each way in which steps have failed, and one on long intervals."""
+        *counts, stretched = self.counts.tolist()
+        yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        if stretched:
+            text, remedy = FINDINGS["steps, long"].filled(count=stretched, most=MOST_SUBSTEPS)
+            yield Finding("steps", "note", text, "dt_max", float(stretched), remedy=remedy)
+
+
+def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
+    """Return a finding for each way in which steps have failed.
+
+    `counts`: code of a status -> number of samples.
+    """
+    samples = sum(counts.values())
+    for code in FAILURES:
+        count = counts.get(code, 0)
+        if not count:
+            continue
+        text, _ = FINDINGS[code].filled(count=count, samples=samples)
+        severity = _severity(code, count / samples)
+        remedy = Status(code).remedy
+        yield Finding("steps", severity, text, code, float(count), remedy=remedy)
+
+
+def _severity(code: str, share: float) -> Severity:
+    """Return how grave it is that a share of the samples has ended so."""
+    # A right model departs in one of a million cases: there is no mishap of that sort.
+    if share > (SOME if code == "departed" else MOST):
+        return "do not trust"
+    return "caution" if code == "departed" or share > SOME else "note"

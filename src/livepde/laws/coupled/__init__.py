@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from livepde.laws.coupled.coupled_stage import CoupledStage, KeptFactor
 from livepde.laws.coupled.equation import (
+    Metric,
     StageData,
     StageIterate,
     StageProblem,
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.metric import Metric
 from livepde.laws.coupled.split_forms import StageForms
 
 __all__ = [

@@ -11,17 +11,16 @@ import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
-from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import (
+    Metric,
     StageData,
     StageIterate,
     StageProblem,
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.metric import Metric
-from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
