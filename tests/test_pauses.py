@@ -262,18 +262,6 @@ def test_a_run_goes_on_to_the_bit_before_and_after_a_pause(shadows: Any) -> None
 
 
 @pytest.mark.slow
-def test_a_member_of_a_fleet_has_the_pause_of_a_single_run() -> None:
-    single, fleet = identifier(), Fleet(*parts(), members=["a", "b"], u0=20.0)
-    for t, z in samples():
-        one = single.step(t, z)
-        off = {"T_2": 0.01}
-        both = {name: [value, value + off.get(name, 0.0)] for name, value in z.items()}
-        found = fleet.step(t, both)
-    np.testing.assert_allclose(found.q[0], one.q, rtol=1e-9)
-    assert found.q[0] != found.q[1]
-
-
-@pytest.mark.slow
 def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     rows = samples()
     last = identifier(refit=None, shadows=None).run(rows).last

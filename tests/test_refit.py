@@ -139,22 +139,6 @@ def test_outliers_are_left_out():
     assert len(wild) // 2 <= spoiled.fit.refused <= len(wild) + 4
 
 
-def test_bounds_hold():
-    mesh = lp.interval(0.0, 1.0, 10)
-    model = lp.Model(
-        lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-        {"k": lp.Normal(0.5, std=0.5, bounds=(0.4, 2.0))},
-        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-        f=lambda x, t: 1.0 + 0.0 * x[0],
-    )
-    law = lp.SensitivityLaw(refit=lp.laws.Refit(), shadows=None)
-    who = lp.Identifier(model, lp.Points({"a": 0.5}, noise=0.01), law, u0=0.0)
-    # A steady state of k = 0.2, f L^2/(8 k), which the bound excludes.
-    last = who.run([(0.5 * k, {"a": 0.625}) for k in range(1, 9)]).last
-    assert last.parameters["k"][0] == pytest.approx(0.4, abs=1e-6)
-    assert last.verdict.level == "not judged" or last.fit is not None
-
-
 def test_a_run_continues_to_the_bit():
     rows = stream()
     whole, half = column(PRIORS["far above"]), column(PRIORS["far above"])
@@ -180,16 +164,6 @@ def test_a_refit_on_demand_is_that_of_the_end():
     found = who.refit()
     assert found.parameters == end.parameters
     assert found.fit == end.fit
-
-
-def test_a_fit_that_does_not_converge_is_reported():
-    refit = lp.laws.Refit(start=0, passes=1)
-    last = column(PRIORS["far above"], refit=refit).run(stream()).last
-    assert not last.fit.converged
-    assert last.verdict.level == "do not trust"
-    assert any(finding.what == "fit" for finding in last.verdict.findings)
-    sound = column(PRIORS["near"]).run(stream()).last
-    assert not any(finding.what == "fit" for finding in sound.verdict.findings)
 
 
 def rod(**options: Any) -> lp.Identifier:
@@ -238,29 +212,6 @@ def test_a_member_of_a_fleet_is_fitted_as_a_single_run():
         for name in ("a", "b"):
             member, single = found.member(name).parameters["alpha"], one.parameters["alpha"]
             assert member == pytest.approx(single, rel=1e-9)
-
-
-def test_options_are_checked():
-    with pytest.raises(lp.errors.LawError, match="window must be at least 2"):
-        lp.laws.Refit(window=1)
-    with pytest.raises(lp.errors.LawError, match="passes must be at least 1"):
-        lp.laws.Refit(passes=0)
-    with pytest.raises(lp.errors.LawError, match="start must be at least 0"):
-        lp.laws.Refit(start=-1)
-
-
-def test_unknowns_that_move_are_not_fitted():
-    mesh = lp.interval(0.0, 1.0, 6)
-    model = lp.Model(
-        lp.Field(mesh, lp.linear(mesh), dirichlet={"boundary": 0.0}),
-        {"s": lp.Scalar(lp.Normal(0.0, std=1.0), evolution=lp.RandomWalk(0.3))},
-        A=lambda q, u, v, x: -q.s * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    sensors = lp.Points({"a": 0.5}, noise=0.01)
-    who = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=lp.laws.Refit()), u0=0.0)
-    last = who.run([(0.1 * k, {"a": 0.05 * math.sin(k)}) for k in range(1, 9)]).last
-    assert last.fit is None
 
 
 @pytest.mark.long

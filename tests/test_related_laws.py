@@ -113,25 +113,6 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     assert np.abs(learned * model.Q.free).max() < 1e-10
 
 
-@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
-@pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": np.inf}, {"mu": -1.0}, {"mu": np.nan}])
-def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
-    with pytest.raises(lp.errors.LawError, match="must be a number"):
-        kind(**options)
-
-
-@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
-def test_no_sensor_of_the_parameter(kind: Any) -> None:
-    model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),
-        lp.Normal(1.0),
-        A=lambda q, u, v, x: q * u * v,
-    )
-    sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})
-    with pytest.raises(lp.errors.LawError, match="sees a parameter directly: use SensitivityLaw"):
-        lp.Identifier(model, sensors, kind())
-
-
 @pytest.mark.study
 def test_reproduction() -> None:
     outcome = relatives()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import livepde as lp
 from livepde.laws.member_arrays import changed
 from livepde.models import heat
 from livepde.runs.run_verdict import doubts
-from livepde.stepping import Alexander2, ImplicitEuler
+from livepde.stepping import ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 
 NOISE, WIDTH, COUNT = 0.003, 0.1, 150
@@ -243,20 +242,6 @@ def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
     assert (estimate.q_std <= 1.5 * 0.3).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("refit", [None, lp.Refit()])
-def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, refit: Any) -> None:
-    law, rows = lp.SensitivityLaw(refit=refit), samples()[:90]
-    whole = identifier(8, law)
-    ran(whole, rows[:50])
-    whole.save(tmp_path / "state.bin")
-    again = identifier(8, law)
-    again.load(tmp_path / "state.bin")
-    one, other = ran(whole, rows[50:]), ran(again, rows[50:])
-    np.testing.assert_array_equal(one.q_std, other.q_std)
-    assert one.diagnostics.named() == other.diagnostics.named()
-
-
 @pytest.mark.long
 def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
@@ -268,14 +253,6 @@ def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     for kind in ("step", "mesh"):
         one, other = shifts(plain, kind), shifts(refitted, kind)
         assert np.abs(one - other).max() < 0.3 * np.abs(one).max()
-
-
-@pytest.mark.slow
-def test_holds_with_gaps() -> None:
-    rows = samples()
-    gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
-    estimate = ran(identifier(8), gappy)
-    assert abs(estimate.diagnostics.shifts.by("mesh")["k"]) > 0.0
 
 
 @pytest.mark.long
@@ -392,7 +369,3 @@ def test_refuses_shadows_of_nothing() -> None:
         lp.SensitivityLaw(shadows=True)  # type: ignore[arg-type]
     with pytest.raises(lp.errors.LawError, match="largest must be at least 1"):
         lp.laws.Shadows(largest=0)
-
-
-def test_orders_of_both_schemes_are_known() -> None:
-    assert (ImplicitEuler.order, Alexander2.order) == (1, 2)
