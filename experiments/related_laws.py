@@ -21,7 +21,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import StageForms
+from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.damping import Damping, Residual
 from livepde.laws.gradient import GradientLaw, GradientState
 from livepde.laws.gradient_parts import GradientParts, constant_parts

@@ -13,8 +13,9 @@ import livepde as lp
 from benchmarks import scale
 from livepde.errors import ConfigurationError, LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled import Metric, StageProblem, block_factors
+from livepde.laws.coupled import block_factors
 from livepde.laws.coupled.block_factors import BlockJacobian, BlockSolver
+from livepde.laws.coupled.equation import Metric, StageProblem
 from livepde.laws.coupled.monolithic import BilinearSolver
 from livepde.linalg import choice
 

@@ -12,7 +12,8 @@ from skfem import ElementLineP1
 import livepde as lp
 from experiments.related_laws import BaumeisterLaw, KueglerLaw, _FormsAtEstimate, _Linear
 from experiments.relatives import EXPECTED, LAWS, law, relatives
-from livepde.laws.coupled import CoupledStage, Metric, StageProblem, StageTerms
+from livepde.laws.coupled.coupled_stage import CoupledStage
+from livepde.laws.coupled.equation import Metric, StageProblem, StageTerms
 from livepde.model import mass_form
 from livepde.stepping import Newton
 from livepde.streams import Twin

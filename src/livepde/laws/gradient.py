@@ -10,7 +10,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import KeptFactor
+from livepde.laws.coupled.coupled_stage import KeptFactor
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.equation_tests import (
     EquationLedger,

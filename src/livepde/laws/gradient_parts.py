@@ -10,14 +10,9 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import (
-    CoupledStage,
-    KeptFactor,
-    StageForms,
-    StageIterate,
-    StageProblem,
-    StageTerms,
-)
+from livepde.laws.coupled.coupled_stage import CoupledStage, KeptFactor
+from livepde.laws.coupled.equation import StageIterate, StageProblem, StageTerms
+from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.damping import Damping, ResidualDamping
 from livepde.laws.equation_tests import (
     EquationLedger,

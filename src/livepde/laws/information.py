@@ -86,7 +86,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import Metric
+from livepde.laws.coupled.equation import Metric
 from livepde.laws.coupled.split_forms import StageForms
 from livepde.laws.normal_equations import (
     NormalEquations,

@@ -60,7 +60,6 @@ WEIGHTS = 1.0 / np.array([1, 1, 1, *range(3, USUAL + 1)])
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
 LATER = np.array([5, 11, 7, 9])
-KINDS = ("step", "mesh", "input")
 AT_ONCE = 3  # halvings of a step, as powers of two, before its error is estimated again
 
 

@@ -32,13 +32,11 @@ from livepde.linalg import (
 class MonolithicSolver(StageSolver):
     """Factorises the matrix of u and q, with auxiliary unknowns behind."""
 
+    keeps = False
+
     def __init__(self, terms: StageTerms) -> None:
         super().__init__(terms)
         self._constant: tuple[tuple[float, float, float], Array] | None = None
-
-    @property
-    def keeps(self) -> bool:
-        return False
 
     @property
     def patience(self) -> int:
@@ -215,6 +213,8 @@ class BilinearSolver(MonolithicSolver):
     The equation is that of `StageSolver.evaluate`.
     """
 
+    keeps = True
+
     @classmethod
     def of(cls, terms: StageTerms) -> BilinearSolver | None:
         """Return it for a stage; None where A or B is another, or the mesh is large."""
@@ -223,13 +223,9 @@ class BilinearSolver(MonolithicSolver):
         if terms.auxiliary or not (B.affine and B.constant):
             return None
         parts = [form for form in (forms.A_in, forms.A_out) if form is not None]
-        if not all(_is_bilinear(form) for form in parts):
-            return None
-        return cls(terms)
-
-    @property
-    def keeps(self) -> bool:
-        return True
+        # All derivatives are sparse matrices times coefficients.
+        bilinear = all(isinstance(one, sp.csr_array) for form in parts for one in _tensors(form))
+        return cls(terms) if bilinear else None
 
     def prepare(self) -> None:
         super().prepare()
@@ -321,12 +317,6 @@ class _Coupling:
             dense = self.pattern.compact(data)
             return dense, dense.T
         return self.pattern.matrix(data), self.pattern.transposed(data)
-
-
-def _is_bilinear(form: AnyForm) -> bool:
-    """Return whether all derivatives of a form are sparse matrices times coefficients."""
-    pairs = ("v", "q"), ("v", "u"), ("q", "u")
-    return all(isinstance(form.tensor(*pair), sp.csr_array) for pair in pairs)
 
 
 def _tensors(form: AnyForm) -> tuple[sp.csr_array, sp.csr_array, sp.csr_array]:
