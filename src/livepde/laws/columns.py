@@ -214,12 +214,11 @@ class _Fit:
     @classmethod
     def about(cls, one: Passed) -> _Fit:
         used = np.isfinite(one.residuals)
-        J, r = one.slopes[used], one.residuals[used]
-        inverse = np.linalg.inv(np.eye(len(one.xi)) + J.T @ J)
-        g = J.T @ r - one.xi
+        H, g = one.model(used)
+        inverse = np.linalg.inv(H)
         step = inverse @ g
         cost = one.cost(used) - 0.5 * float(g @ step)
-        return cls(one, J, np.asarray(inverse), step, cost)
+        return cls(one, one.slopes[used], np.asarray(inverse), step, cost)
 
     def freed(self, g: Array) -> tuple[float, float]:
         """Return by how much the cost falls if residuals may change along g, and the size."""

@@ -48,6 +48,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -217,11 +218,15 @@ def pairs(model: Model, split: Split) -> tuple[Array, Array]:
     return p, found
 
 
-def _smooth(model: Model, split: Split, rng: np.random.Generator) -> Array:
+def _smooth_gram(model: Model) -> tuple[Any, Any]:
+    """Return the matrices of u v and u v + L^2 grad u . grad v, with the size L of the domain."""
     extent = float(np.ptp(model.mesh.p, axis=1).max())
     mass = model.bilinear(mass_form)
-    # u v + extent^2 grad u . grad v: with the size of the domain both terms have one unit.
-    smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
+    return mass, mass + extent**2 * (model.bilinear(h1_form) - mass)  # both have one unit
+
+
+def _smooth(model: Model, split: Split, rng: np.random.Generator) -> Array:
+    mass, smooth = _smooth_gram(model)
     parts = split.R.T @ smooth @ split.R + split.P.T @ smooth @ split.P
     space = HilbertSpace(sp.csr_array(parts), "probes", model.state_space.fixed)
     # A white load: independent, with the variances on the diagonal of the mass matrix.
@@ -305,10 +310,7 @@ class EquationTests:
         free = self.forms.tests.free
         if self.forms.W is not None or not free.any():
             return np.zeros((model.X.dim, 0))
-        extent = float(np.ptp(model.mesh.p, axis=1).max())
-        mass = model.bilinear(mass_form)
-        # u v + extent^2 grad u . grad v: with the size of the domain both terms have one unit.
-        smooth = mass + extent**2 * (model.bilinear(h1_form) - mass)
+        mass, smooth = _smooth_gram(model)
         space = HilbertSpace(sp.csr_array(smooth), "tests", np.flatnonzero(free == 0.0))
         load = np.random.default_rng(0).standard_normal((model.X.dim, TESTS))
         p: Array = np.asarray(space.riesz(np.sqrt(mass.diagonal())[:, None] * load))

@@ -241,13 +241,16 @@ class FilterState:
         return len(self.member)
 
 
+def coordinates(C: Array, shift: Array) -> Array:
+    """Return the least xi with C^T xi = shift: the expected one if xi ~ N(0, I) and a = C^T xi."""
+    return np.asarray(np.linalg.lstsq(C.T, shift, rcond=None)[0])
+
+
 def along(x: FilterState, k: int, shift: Array) -> Array:
     """Return by how much the state of a member is expected to move with a shift of a, (n,)."""
     if not shift.any():
         return np.zeros(x.u.shape[1])
-    # With xi ~ N(0, I) and a = C^T xi, the least xi that gives the shift is the expected one.
-    weights = np.linalg.lstsq(x.C[k].T, shift, rcond=None)[0]
-    moved: Array = weights @ x.U[k]
+    moved: Array = coordinates(x.C[k], shift) @ x.U[k]
     return moved
 
 

@@ -25,10 +25,9 @@ from livepde.laws.equation_tests import (
 from livepde.laws.information import ConstantMetric, InformationMetric, MetricRule, MetricStep
 from livepde.laws.law import Problem
 from livepde.laws.observed_part import (
-    GeneralizedInverse,
+    Inverse,
     ObservedPart,
     ObservedPath,
-    RegularizedInverse,
     SelfChosenSmoothing,
     smooths,
 )
@@ -53,7 +52,7 @@ class GradientParts:
     N_op: Any
     nu: float
     # Rules for u_alpha and for the metric of Q.
-    observed: ObservedPart[Any]
+    observed: ObservedPart
     metric: MetricRule[Any]
     # The excitation gate that holds q, and the probes that measure the excitation; None: q is never
     # held.
@@ -202,8 +201,6 @@ def constant_parts(
 ) -> GradientParts:
     """Return the parts of a law with a constant gain."""
     _require_linear_readings(problem)
-    regularises = problem.observed.observation.reconstruction.regularises
-    inverse = RegularizedInverse(problem) if regularises else GeneralizedInverse(problem)
     return GradientParts(
         problem=problem,
         newton=_for_scheme(newton, problem),
@@ -211,7 +208,7 @@ def constant_parts(
         M_op=M_op,
         N_op=N_op,
         nu=nu,
-        observed=inverse,
+        observed=Inverse(problem),
         metric=ConstantMetric(gain, sigma),
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
@@ -235,12 +232,8 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
             "SensitivityLaw on this Subdomain or these sensors, or give a number for gain."
         )
     metric = InformationMetric(model, observation.nodal)
-    observed: ObservedPart[Any] = GeneralizedInverse(problem)
-    if observation.reconstruction.regularises:
-        observed = RegularizedInverse(problem)
-    elif whole and smooths(problem.observed):
-        # Of partial data the smoothed part moves with w, and errors grow: they stay as they are.
-        observed = SelfChosenSmoothing(problem)
+    # Of partial data the smoothed part moves with w, and errors grow: they stay as they are.
+    own = whole and smooths(problem.observed)
     return GradientParts(
         problem=problem,
         newton=_for_scheme(newton, problem),
@@ -248,7 +241,7 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         M_op=None,
         N_op=N_op,
         nu=nu,
-        observed=observed,
+        observed=SelfChosenSmoothing(problem) if own else Inverse(problem),
         metric=metric,
         memory=metric.pattern,
     ).prepared()

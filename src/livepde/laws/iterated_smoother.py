@@ -21,7 +21,7 @@ from scipy.linalg import eigh
 from livepde.fem import Moment
 from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState, along
+from livepde.laws.filter_state import FilterState, along, coordinates
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
@@ -83,9 +83,8 @@ def distance(filter_: Filter, window: Window) -> float:
     """Return the distance between estimate and reference, in standard deviations."""
     now = window.now
     shift = filter_.reduction.transition(window.length) @ _missed(filter_, window)
-    weights = np.linalg.lstsq(now.C[0].T, shift, rcond=None)[0]
     # In standard deviations that are inflated as the reported ones are.
-    return float(np.linalg.norm(weights)) / float(now.innovations.inflation[0])
+    return deviations(now, shift) / float(now.innovations.inflation[0])
 
 
 def placed(filter_: Filter, window: Window, q: Array) -> FilterState:
@@ -151,13 +150,18 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
         moved = math.inf if best is None else apart(work.filter, best.x, state.now)
         found = None if best is None else best.x
         if best is not None and searched is not samples:
-            if moved <= holds and usual(state.now) and _is_square(state.now):
-                found = _accompanied(best.x, state.now)
+            now = state.now
+            if moved <= holds and usual(now) and now.C.shape[1] == now.C.shape[2]:
+                # Ledger and errors of the discretisation are linear about the trajectory, on the
+                # rows of the square root, which are those of the prior: updates move them alike.
+                found = changed(best.x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
             else:
                 whole = samples.about(best.trajectory)
                 found = None if whole is None else whole.x
         if found is not None:
-            state = changed(state, now=work.filter.relinearised(_without_past(found)))
+            # Earlier values would cost columns in each later update.
+            found = changed(found, past=found.past[:, :, :0], dpast=found.dpast[:, :0])
+            state = changed(state, now=work.filter.relinearised(found))
         stays = shares[-1] < HALF and not work.filter.moves
         if stays and count >= ENOUGH and moved <= holds:
             return changed(state, due=np.array([NEVER])), moved
@@ -174,30 +178,13 @@ def iterated_smoother(samples: _Samples) -> _Pass | None:
         if one is None:
             continue
         ends.append(_descended(samples, one))
+        step = (one.smoothed - one.trajectory)[-1]
+        held = deviations(one.x, step) <= HOLDS * math.sqrt(len(step))
         # Gauss-Newton steps end in a local minimum: other beginnings are spared only if this one
         # explains the samples, and either these are many or its first linearisation held.
-        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or _holds(one)):
+        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or held):
             break
     return min(ends, key=lambda one: one.misfit, default=None)
-
-
-def _without_past(x: FilterState) -> FilterState:
-    """Return a filter without earlier values, which would cost columns in each later update."""
-    return changed(x, past=x.past[:, :, :0], dpast=x.dpast[:, :0])
-
-
-def _is_square(x: FilterState) -> bool:
-    """True if the rows of the square root are those of the prior, moved by updates alone."""
-    return bool(x.C.shape[1] == x.C.shape[2])
-
-
-def _accompanied(x: FilterState, now: FilterState) -> FilterState:
-    """Return a filter with the ledger and the errors of the discretisation of another one.
-
-    For two that are near each other: these data are linear about the trajectory, and stand on the
-    rows of the square root, which updates move alike.
-    """
-    return changed(x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
 
 
 def usual(x: FilterState) -> bool:
@@ -217,18 +204,12 @@ def _beginnings(samples: _Samples) -> Iterator[Array]:
     yield np.zeros(shape)
 
 
-def _holds(one: _Pass) -> bool:
-    """True if samples and prior together are most probable where the pass is linear."""
-    step = (one.smoothed - one.trajectory)[-1]
-    return _deviations(one.x, step) <= HOLDS * math.sqrt(len(step))
-
-
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
     """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
         # Where the step is within the uncertainty, the second-order error is far below it.
-        if _deviations(best.x, step[-1]) <= CONVERGED:
+        if deviations(best.x, step[-1]) <= CONVERGED:
             break
         step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         better = _damped(samples, best, step)
@@ -261,13 +242,12 @@ def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
 def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
     """Return how far estimates of two filters are apart, in standard deviations of the first."""
     shift = filter_.reduction.reduced(filter_.estimate(x) - filter_.estimate(other))[0]
-    return _deviations(x, shift)
+    return deviations(x, shift)
 
 
-def _deviations(x: FilterState, shift: Array) -> float:
-    # The length of the least xi with C^T xi = shift, where xi ~ N(0, I).
-    weights = np.linalg.lstsq(x.C[0].T, shift, rcond=None)[0]
-    return float(np.linalg.norm(weights))
+def deviations(x: FilterState, shift: Array) -> float:
+    """Return the length of a shift of the unknowns of one member in standard deviations."""
+    return float(np.linalg.norm(coordinates(x.C[0], shift)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -168,8 +168,7 @@ def _best(samples: StoredSamples) -> Passed | None:
         return one
     # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
     there = np.isfinite(one.residuals)
-    J, r = one.slopes[there], one.residuals[there]
-    step = np.linalg.solve(np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi)
+    step = np.linalg.solve(*one.model(there))
     better = samples.about(samples.within_bounds(one.xi + step))
     return one if better is None or better.cost(there) > one.cost(there) else better
 

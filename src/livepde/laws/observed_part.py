@@ -31,10 +31,10 @@ alpha is zero and a sample costs a few products with a sparse one.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Generic, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -54,8 +54,6 @@ LARGEST = 3000  # sensors: the modes are those of a dense matrix
 ROUNDING = 1e-14  # of second derivatives, relative to the sum of their terms
 FEWEST = 8  # modes below which their rougher half says nothing about noise
 LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
-
-State = TypeVar("State")
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,98 +239,63 @@ class SmoothingOperator:
         return u
 
 
-class ObservedPath(ABC):
+Find: TypeAlias = Callable[[Array, Array | None], Reconstructed]
+
+
+class ObservedPath:
     """u_alpha at any time of an interval, each found once."""
 
-    def __init__(self, problem: Problem, interval: Interval) -> None:
+    def __init__(self, problem: Problem, interval: Interval, find: Find) -> None:
         self.problem = problem
         self.interval = interval
+        self._find = find  # from measurements, and Dirichlet values or None if all are zero
         self._found: dict[float, Reconstructed] = {}
 
     def at(self, t: float) -> Reconstructed:
         """Return u_alpha at a time."""
         if t not in self._found:
-            self._found[t] = self.find(self.interval.z(t), self.boundary(t))
+            model, known = self.problem.model, None
+            if not model.homogeneous:
+                known = model.impose(np.zeros(model.X.dim), self.interval.at(t))
+            self._found[t] = self._find(self.interval.z(t), known)
         return self._found[t]
-
-    def boundary(self, t: float) -> Array | None:
-        """Return the Dirichlet values, shape (n,); None if all of them are zero."""
-        model = self.problem.model
-        if model.homogeneous:
-            return None
-        return model.impose(np.zeros(model.X.dim), self.interval.at(t))
-
-    @abstractmethod
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        """Return u_alpha from measurements."""
 
     def diagnostics(self) -> Diagnostics[float]:
         """Return smoothing and misfit at the end of the interval, as far as known."""
-        return Diagnostics()
-
-
-class ObservedPart(ABC, Generic[State]):
-    """Abstract rule for u_alpha; its evolving part is an explicit state."""
-
-    @abstractmethod
-    def init(self) -> State:
-        """Return the state before the first sample."""
-
-    @abstractmethod
-    def over(self, state: State, split: Split, interval: Interval) -> tuple[State, ObservedPath]:
-        """Return the state after the sample at the end of an interval, and u_alpha over it."""
-
-
-@dataclass(frozen=True, eq=False)
-class GeneralizedInverse(ObservedPart[NoState]):
-    """u_alpha = G^+ z."""
-
-    problem: Problem
-
-    def init(self) -> NoState:
-        return NoState()
-
-    def over(
-        self, state: NoState, split: Split, interval: Interval
-    ) -> tuple[NoState, ObservedPath]:
-        return state, _InversePath(self.problem, interval, split)
-
-
-class _InversePath(ObservedPath):
-    def __init__(self, problem: Problem, interval: Interval, split: Split) -> None:
-        super().__init__(problem, interval)
-        self.split = split
-
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        return Reconstructed(self.split.reconstruct(z, boundary), 0.0, 0.0, None)
-
-
-@dataclass(frozen=True, eq=False)
-class RegularizedInverse(ObservedPart[NoState]):
-    """u_alpha = G_alpha z, by the `reconstruction` of the observation."""
-
-    problem: Problem
-
-    def init(self) -> NoState:
-        return NoState()
-
-    def over(
-        self, state: NoState, split: Split, interval: Interval
-    ) -> tuple[NoState, ObservedPath]:
-        return state, _RegularizedPath(self.problem, interval)
-
-
-class _RegularizedPath(ObservedPath):
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        present = self.interval.present
-        return self.problem.observed.reconstruct(z, boundary=boundary, present=present)
-
-    def diagnostics(self) -> Diagnostics[float]:
         found = self.at(self.interval.t1)
         return Diagnostics(alpha=found.alpha, misfit=found.misfit)
 
 
-class SelfChosenSmoothing(ObservedPart[Balance]):
+def exact(split: Split, z: Array, boundary: Array | None, alpha: float = np.nan) -> Reconstructed:
+    """Return u_alpha = G^+ z."""
+    return Reconstructed(split.reconstruct(z, boundary), alpha, np.nan, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """u_alpha = G^+ z, or G_alpha z if the `reconstruction` of the observation regularises."""
+
+    problem: Problem
+
+    def init(self) -> NoState:
+        """Return the state before the first sample."""
+        return NoState()
+
+    def over(
+        self, state: NoState, split: Split, interval: Interval
+    ) -> tuple[NoState, ObservedPath]:
+        """Return the state after the sample at the end of an interval, and u_alpha over it."""
+        observed = self.problem.observed
+        if not observed.observation.reconstruction.regularises:
+            return state, ObservedPath(self.problem, interval, partial(exact, split))
+
+        def find(z: Array, boundary: Array | None) -> Reconstructed:
+            return observed.reconstruct(z, boundary=boundary, present=interval.present)
+
+        return state, ObservedPath(self.problem, interval, find)
+
+
+class SelfChosenSmoothing:
     """u_alpha smoothed as the noise of the samples requires."""
 
     def __init__(self, problem: Problem) -> None:
@@ -341,14 +304,16 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
         self._smoothers: Memo[bytes, SmoothingOperator] = Memo(LARGEST_MEMO)
 
     def init(self) -> Balance:
+        """Return the state before the first sample."""
         return Balance.none(self.problem.observed.size, self.problem.model.X.dim)
 
     def over(
         self, state: Balance, split: Split, interval: Interval
     ) -> tuple[Balance, ObservedPath]:
+        """Return the state after the sample at the end of an interval, and u_alpha over it."""
         model, key = self.problem.model, split.present.tobytes()
         detector = self._detectors.get(key, lambda: NoiseDetector(self.problem.observed, split))
-        smoother, alpha = None, 0.0
+        find: Find = partial(exact, split)
         samples = [(interval.t1, interval.z1)]
         if np.isnan(state.z).all():  # the first interval
             samples.insert(0, (interval.t0, interval.z0))
@@ -359,33 +324,21 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
                 make = partial(SmoothingOperator, self.problem.observed, split.present)
                 smoother = self._smoothers.get(key, make)
                 state = smoother.add(state, z, boundary)
-                alpha = smoother.alpha(state)
+                # The alpha of the last sample serves all of the interval.
+                find = _smoothed(smoother, smoother.alpha(state), split, model.X.dim)
             else:
                 state = state.followed(z, boundary)
-        # The alpha of the last sample serves all of the interval.
-        if smoother is None:
-            return state, _InversePath(self.problem, interval, split)
-        return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)
+        return state, ObservedPath(self.problem, interval, find)
 
 
-class _SmoothedPath(_InversePath):
-    def __init__(
-        self,
-        problem: Problem,
-        interval: Interval,
-        split: Split,
-        smoother: SmoothingOperator,
-        alpha: float,
-    ) -> None:
-        super().__init__(problem, interval, split)
-        self.smoother = smoother
-        self.alpha = alpha
+def _smoothed(smoother: SmoothingOperator, alpha: float, split: Split, n: int) -> Find:
+    def find(z: Array, boundary: Array | None) -> Reconstructed:
+        if alpha == 0.0:
+            return exact(split, z, boundary, alpha)
+        known = np.zeros(n) if boundary is None else boundary
+        return Reconstructed(smoother(alpha, z, known), alpha, np.nan, None)
 
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        if self.alpha == 0.0:
-            return super().find(z, boundary)
-        known = np.zeros(self.problem.model.X.dim) if boundary is None else boundary
-        return Reconstructed(self.smoother(self.alpha, z, known), self.alpha, 0.0, None)
+    return find
 
-    def diagnostics(self) -> Diagnostics[float]:
-        return Diagnostics(alpha=self.alpha)
+
+ObservedPart: TypeAlias = Inverse | SelfChosenSmoothing

@@ -13,7 +13,6 @@ import numpy as np
 
 from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.gate import Screened
 from livepde.laws.history import intervals_since, reaching
 from livepde.laws.iterated_smoother import (
     AGREED,
@@ -197,11 +196,6 @@ def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Int
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
 
 
-def _doubted(screened: Screened) -> int:
-    """Return how many readings in a row were rejected of a sensor that is not excluded."""
-    return int(np.where(screened.aside, 0, screened.refused).max())
-
-
 def _retaken(
     work: SensitivityWork,
     state: SensitivityState,
@@ -277,7 +271,9 @@ def _watched(
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
-        onset = max(jumps.onset(state.watch, e), _doubted(new.now.screened))
+        screened = new.now.screened
+        doubted = int(np.where(screened.aside, 0, screened.refused).max())
+        onset = max(jumps.onset(state.watch, e), doubted)
         guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         before = _most_likely(work, jumps, state.older, known, guess)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()

@@ -174,7 +174,7 @@ class _Search:
         one, gate = self.best, self.samples.work.options.gate.beyond
         if one is None:
             return self.used
-        H, _ = self._model(one)
+        H, _ = one.model(self.used)
         J, r = one.slopes, one.residuals
         shown = np.einsum("skr,skr->sk", J @ np.linalg.inv(H), J)
         # Residuals of readings in use vary less than the noise, those of others more.
@@ -220,14 +220,9 @@ class _Search:
         if self.best is None or end.cost(self.used) < self.best.cost(self.used):
             self.best, self.settled = end, settled
 
-    def _model(self, one: Passed) -> tuple[Array, Array]:
-        """Return Hessian and direction of descent of the cost."""
-        J, r = one.slopes[self.used], one.residuals[self.used]
-        return np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
-
     def _decrease(self, one: Passed) -> float:
         """Return by how much the quadratic model of the cost falls to its minimum."""
-        H, g = self._model(one)
+        H, g = one.model(self.used)
         free = self._free(one, g)
         sizes, axes = np.linalg.eigh(free.T @ H @ free)
         along = axes.T @ (free.T @ g)
@@ -251,7 +246,7 @@ class _Search:
 
     def _stepped(self, one: Passed, delta: float, budget: float) -> tuple[Passed | None, float]:
         """Return the pass after an accepted step, None if there is none, and the trust region."""
-        H, g = self._model(one)
+        H, g = one.model(self.used)
         free, cost = self._free(one, g), one.cost(self.used)
         sizes, axes = np.linalg.eigh(free.T @ H @ free)
         axes = free @ axes
@@ -313,7 +308,7 @@ class _Search:
             return True
         if self._square <= DOUBTFUL:
             return False
-        H, _ = self._model(self.best)
+        H, _ = self.best.model(self.used)
         # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
         C = self.samples.state.start.C[0]
         before, after = C.T @ C, C.T @ np.linalg.solve(H, C)
@@ -354,7 +349,7 @@ class _Search:
         """True if a point is at the best trajectory, within a posterior standard deviation."""
         if self.best is None:
             return False
-        H, _ = self._model(self.best)
+        H, _ = self.best.model(self.used)
         away = xi - self.best.xi
         return float(away @ H @ away) < 1.0
 

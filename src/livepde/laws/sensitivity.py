@@ -66,6 +66,7 @@ from livepde.stepping import (
     Span,
     member_stage,
 )
+from livepde.verdict import Verdict
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
@@ -513,24 +514,32 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
-        judge = with_fit(judged(work.filter, state.now, now), fit)
-        if self.verdict:
-            judge = with_discretisation(judge, work.filter.shadows, state.now.shadows)
-        return Deferred(lambda: self.member_belief(work, now, 0), judge)
+        judge = judged(work.filter, state.now, now)
+
+        def verdict() -> Verdict:
+            found = with_fit(judge(), fit)
+            if not self.verdict:
+                return found
+            return with_discretisation(found, work.filter.shadows, now.shadows)
+
+        return Deferred(lambda: self.member_belief(work, now, 0), verdict)
 
     def final(
         self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
     ) -> Deferred:
-        found = self.deferred(work, state)
+        belief, before = self.deferred(work, state)
         # Of a later window the fit knows nothing of the readings before.
         whole = state.fit.member(0) if not state.window[0] else None
-        found = found._replace(verdict=after_fit(found.verdict, whole))
         if not self.verdict:
-            return found
-        if columns:
-            wrong = with_columns(found.verdict, Columns.of(work, state))
-            found = found._replace(verdict=wrong)
-        return found._replace(verdict=with_errors(found.verdict, work, state))
+            return Deferred(belief, lambda: after_fit(before(), whole))
+        tried = Columns.of(work, state) if columns else None
+
+        def verdict() -> Verdict:
+            found = after_fit(before(), whole)
+            found = found if tried is None else with_columns(found, tried)
+            return with_errors(found, work, state)
+
+        return Deferred(belief, verdict)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""

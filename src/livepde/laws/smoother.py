@@ -28,7 +28,7 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.assimilation import GateDecision, absorb
-from livepde.laws.filter_state import FilterState, unaccompanied, unjudged
+from livepde.laws.filter_state import FilterState, coordinates, unaccompanied, unjudged
 from livepde.laws.iterated_smoother import Window, expecting, missed, moved, placed
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
@@ -295,7 +295,7 @@ class _FixedInterval:
             q = q + filter_.reduction.Phi @ shift
         x = placed(filter_, self.window, filter_.reduction.bounded(q))
         # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
-        weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
+        weights = coordinates(start.C[0], shift)
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
         predicted, Y = filter_.sensors.observe(x, span.end)

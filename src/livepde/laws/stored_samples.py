@@ -16,7 +16,7 @@ import numpy as np
 
 from livepde.laws.assimilation import HALF_LOG, absorb, assimilate
 from livepde.laws.filter import Filter, contraction
-from livepde.laws.filter_state import FilterState, extended
+from livepde.laws.filter_state import FilterState, coordinates, extended
 from livepde.laws.gate import Gate
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
@@ -43,6 +43,11 @@ class Passed:
     def cost(self, used: Mask) -> float:
         """Return half the sum of squares of residuals in use and of xi."""
         return 0.5 * float((self.residuals[used] ** 2).sum() + self.xi @ self.xi)
+
+    def model(self, used: Mask) -> tuple[Array, Array]:
+        """Return Hessian and direction of descent of the cost, (r, r) and (r,)."""
+        J, r = self.slopes[used], self.residuals[used]
+        return np.eye(len(self.xi)) + J.T @ J, J.T @ r - self.xi
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +124,7 @@ class StoredSamples:
         """Coordinates xi of the present estimate, shape (r,)."""
         now, start, reduction = self.state.now, self.state.start, self.filter.reduction
         shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
-        return self.coordinates(shift)
-
-    def coordinates(self, shift: Array) -> Array:
-        """Return the least xi that moves the reduced unknowns by a shift, (k,)."""
-        found: Array = np.linalg.lstsq(self.state.start.C[0].T, shift, rcond=None)[0]
-        return found
+        return coordinates(start.C[0], shift)
 
     def within_bounds(self, xi: Array) -> Array:
         """Return xi, moved the least so that the unknowns are within their bounds."""
@@ -134,7 +134,7 @@ class StoredSamples:
         inside = reduction.bounded(q)
         if inside is q:
             return xi
-        return xi + self.coordinates(reduction.reduced(inside - start.q[0]) - shift)
+        return xi + coordinates(start.C[0], reduction.reduced(inside - start.q[0]) - shift)
 
     def placed(self, points: Array, rows: bool) -> FilterState:
         """Return the start of trajectories, shape (points, r), with or without derivatives."""
@@ -286,8 +286,7 @@ class StoredSamples:
         The unknowns are integrated out. A reading that is not in use counts as one at the limit of
         the gate, which is wider where the residuals in use are larger than their noise.
         """
-        J, r, there = one.slopes[used], one.residuals[used], np.isfinite(self.readings)
-        H, g = np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
+        (H, g), there = one.model(used), np.isfinite(self.readings)
         lowest = one.cost(used) - 0.5 * float(g @ np.linalg.solve(H, g))
         found = -lowest - 0.5 * float(np.linalg.slogdet(H)[1])
         found -= float((np.log(self.noise) + HALF_LOG)[there].sum())

@@ -103,13 +103,13 @@ def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], V
     return found
 
 
-def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict with findings on the last fit of the samples.
 
     That it has not converged, or has left out more than 2 % of the readings.
     """
     if fit is None:
-        return judge
+        return verdict
     found = []
     if not fit.converged:
         text, remedy = FINDINGS["fit, not converged"].filled(samples=fit.samples)
@@ -120,48 +120,33 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
             samples=fit.samples, share=percent(share, 1), count=fit.refused
         )
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
-    return (lambda: judge().with_findings(found)) if found else judge
+    return verdict.with_findings(found) if found else verdict
 
 
-def after_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict at the end of a run, where a fit of all its samples has converged.
 
     The fit decides on all readings again: what the gate refused before it counts no longer.
     """
     if fit is None or not fit.converged:
-        return judge
-
-    def found() -> Verdict:
-        verdict = judge()
-        kept = [one for one in verdict.findings if one.what != "refused"]
-        return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
-
-    return found
+        return verdict
+    kept = [one for one in verdict.findings if one.what != "refused"]
+    return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
 
 
-def with_discretisation(
-    judge: Callable[[], Verdict], shadows: ShadowSet | None, s: ShadowState
-) -> Callable[[], Verdict]:
+def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowState) -> Verdict:
     """Return a verdict that names the errors of the discretisation which are not held.
 
     `shadows`: those of the filter; None: it follows no such error. `s`: their state.
     """
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
-    coarse = 0 if shadows is None else int(s.coarse[0])
-    if not missing and not coarse:
-        return judge
-
-    def found() -> Verdict:
-        verdict = judge()
-        if coarse and shadows is not None:
-            verdict = verdict.with_findings([_coarse(s, shadows.most)])
-        if not missing or not verdict.judged:
-            return verdict
-        text, _ = FINDINGS["untested"].filled(what=missing)
-        more = Finding("untested", "note", text, "discretisation")
-        return verdict.with_untested(missing).with_findings([more])
-
-    return found
+    if shadows is not None and s.coarse[0]:
+        verdict = verdict.with_findings([_coarse(s, shadows.most)])
+    if not missing or not verdict.judged:
+        return verdict
+    text, _ = FINDINGS["untested"].filled(what=missing)
+    more = Finding("untested", "note", text, "discretisation")
+    return verdict.with_untested(missing).with_findings([more])
 
 
 def _coarse(s: ShadowState, most: int) -> Finding:
@@ -179,46 +164,30 @@ def _coarse(s: ShadowState, most: int) -> Finding:
     return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
-def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:
+def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
     """Return a verdict that names the columns of the data which explain a misfit.
 
-    They are looked for only where something speaks against the estimates.
-
-    `columns`: the columns, or why they cannot be looked at.
+    They are looked for only where something speaks against the estimates. `columns`: the columns,
+    or why they cannot be looked at.
     """
-
-    def found() -> Verdict:
-        verdict = judge()
-        if verdict.level in ("trusted", NOT_JUDGED):
-            return verdict
-        if isinstance(columns, str):
-            return verdict.with_untested(f"errors of single columns: {columns}")
-        causes, misfit = likely_columns(columns)
-        # Slow noise is a misfit, too, of which a column may explain a part by chance.
-        known = any(finding.what == "misfit" for finding in verdict.findings)
-        return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
-
-    return found
+    if verdict.level in ("trusted", NOT_JUDGED):
+        return verdict
+    if isinstance(columns, str):
+        return verdict.with_untested(f"errors of single columns: {columns}")
+    causes, misfit = likely_columns(columns)
+    # Slow noise is a misfit, too, of which a column may explain a part by chance.
+    known = any(finding.what == "misfit" for finding in verdict.findings)
+    return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
 
 
-def with_errors(
-    judge: Callable[[], Verdict], work: SensitivityWork, state: SensitivityState
-) -> Callable[[], Verdict]:
-    """Return a verdict whose level follows from fit and effect, where these can be computed.
-
-    It holds the stored samples until then.
-    """
-
-    def found() -> Verdict:
-        verdict = judge()
-        if verdict.level == NOT_JUDGED:
-            return verdict
-        errors = _errors(work, state)
-        if isinstance(errors, str):
-            return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
-        return verdict.with_errors(errors)
-
-    return found
+def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:
+    """Return a verdict whose level follows from fit and effect, where these can be computed."""
+    if verdict.level == NOT_JUDGED:
+        return verdict
+    errors = _errors(work, state)
+    if isinstance(errors, str):
+        return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
+    return verdict.with_errors(errors)
 
 
 def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
