@@ -272,10 +272,7 @@ class _Trials:
         self.base_readings = columns.samples().readings
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors, and by how much they lower a cost, as the model about a fit has it.
-
-        An error that is the same wherever it is asked for is asked for everywhere.
-        """
+        """Iterate over errors, and by how much they lower a cost by the model about a fit."""
         for name in self.columns.places:
             yield from (
                 (cost - at.cost + gained, error) for gained, error in self._of_one(at, name)

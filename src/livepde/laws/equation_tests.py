@@ -252,11 +252,7 @@ class EquationLedger:
         return cls(samples=0, rests=0, last=np.full((2, TESTS), np.nan), sums=np.zeros(3))
 
     def add(self, error: Array, square: float) -> EquationLedger:
-        """Return the value after a sample.
-
-        `error`: the errors a, shape (TESTS,). `square`: the sum of the squared terms that they are
-        compared with.
-        """
+        """Return the value after a sample."""
         samples, sums = self.samples + 1, self.sums
         product = float(error @ self.last[0])
         if math.isfinite(product + square):  # the third sample in a row, or a later one

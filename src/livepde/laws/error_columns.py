@@ -92,11 +92,7 @@ SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
 
 
 class ErrorColumns:
-    """Errors that a model and its sensors can have.
-
-    `samples`: the samples, which tell the length of the run. `numbers`: how many shapes the
-    families have.
-    """
+    """Errors that a model and its sensors can have."""
 
     def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
         self.samples, self.numbers = samples, numbers
@@ -217,8 +213,6 @@ class ErrorColumns:
         """Return the readings of all answers, states at samples, and predicted readings.
 
         Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
-
-        `one`: the trajectory about which they are linear.
         """
         samples, model = self.samples, self.model
         stage, free = ForwardStage(model), model.X.free

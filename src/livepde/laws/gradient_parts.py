@@ -107,11 +107,7 @@ class GradientParts:
 
 
 class StageSequence:
-    """The coupled stages of one interval, one after the other: a `Stage` for `advance`.
-
-    `kept`: the factor that the last stage has kept. `left`, `width`: residual of the last stage,
-    shape (n + m,), and its step: the next stage makes up for it.
-    """
+    """The coupled stages of one interval, one after the other: a `Stage` for `advance`."""
 
     def __init__(
         self,

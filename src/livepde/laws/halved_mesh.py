@@ -33,13 +33,7 @@ class HalvedMesh:
 
     @classmethod
     def of(cls, problem: Problem) -> HalvedMesh:
-        """Return the process of a problem on the halved mesh.
-
-        Raises
-        ------
-        LivepdeError
-            Something that the model or the sensors were made of belongs to the given mesh alone.
-        """
+        """Return the process on the halved mesh; raises `LivepdeError` if there is none."""
         coarse, fine = problem.model, problem.model.refined()
         spaces = (fine.state_space, fine.X, fine.parameter_space)
         observed = problem.observed.observation.bind(*spaces)
@@ -92,13 +86,7 @@ class HalvedMesh:
     def in_readings(
         self, u: Array, q: Array, difference: Array, moment: Callable[[int], Moment]
     ) -> Array:
-        """Return the differences in the readings for those of the states there.
-
-        Shape (members, sensors).
-
-        `u`, `q`: states and latent parameters of the mesh, about which sensors are linear.
-        `difference`: shape (members, N). `moment`: time and inputs of a member.
-        """
+        """Return the readings of differences on the halved mesh, (members, sensors)."""
         if self.G is not None:
             return np.asarray((self.G @ difference.T).T)
         # Sensors without one constant matrix: their derivative at the prolonged state.

@@ -40,10 +40,7 @@ def opened(log: Array, span: Span) -> Array:
 
 
 def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
-    """Return a log with the sample at the end of a span, of those members that took it.
-
-    `parts`: in how many parts the substeps of the span were divided, shape (members,).
-    """
+    """Return a log with the sample at the end of a span, of those members that took it."""
     longer = _extended(log)
     row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
@@ -83,11 +80,7 @@ def _extended(log: Array) -> Array:
 
 
 def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
-    """Return a log without the readings of some sensors since a time.
-
-    `sensors`, `since`: sensors of each member, and the time of the first reading to leave out,
-    shapes (members, sensors).
-    """
+    """Return a log without the readings of some sensors since a time."""
     gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
     readings = log[:, :, 1 : 1 + sensors.shape[1]]
     if np.isnan(readings[gone]).all():
@@ -132,9 +125,6 @@ def with_readings(log: Array, sensors: int) -> Mask:
 
 
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
-    """Return how many samples, from the last one back, hold so many with a reading; all if fewer.
-
-    `shown`: whether a sample has a reading, in time order; one does at least.
-    """
+    """Return how many samples, from the last one back, hold so many with a reading, or all."""
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])

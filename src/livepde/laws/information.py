@@ -264,10 +264,7 @@ def trace_probes(space: HilbertSpace) -> Array:
 
 
 def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
-    """Return the square root of an operator times x, on the orthogonal complement of some modes.
-
-    By Lanczos' method.
-    """
+    """Return by Lanczos' method the root of an operator times x, orthogonal to some modes."""
     size, basis, T = float(np.linalg.norm(x)), [], np.zeros((LANCZOS, LANCZOS))
     y = x / size
     for k in range(LANCZOS):
@@ -413,10 +410,7 @@ class InformationMetric(MetricRule[Information]):
         return np.array([dual @ own, dual @ (dual / self.diagonal)])
 
     def _renewed(self, state: Information, change: Array) -> Information:
-        """Return the state with an H that is new if the last one has aged.
-
-        `change`: the last change of q, shape (m,).
-        """
+        """Return the state with an H that is new if the last one has aged."""
         if not np.all(state.seen > 0.0):
             return state
         least = float((state.total / RESOLUTION).sum())

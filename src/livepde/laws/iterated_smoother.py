@@ -377,10 +377,7 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
 
 
 def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
-    """Return the squared increment of a trajectory in a time h, in units of its process noise.
-
-    `gained`: variance of the process noise of each coordinate in that time, shape (k,).
-    """
+    """Return the squared increment of a trajectory in a time h, in units of its process noise."""
     increment = after - filter_.reduction.transition(h) @ before
     return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
 

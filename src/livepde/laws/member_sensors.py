@@ -43,10 +43,7 @@ class MemberSensors:
         return row_product(sp.csr_array(self.problem.observed.G))
 
     def observe(self, x: FilterState, at: Moments) -> tuple[Array, Array]:
-        """Return predicted readings, (members, sensors), and Y = [U C] H^T, (members, r, sensors).
-
-        Linear about the linearisation point.
-        """
+        """Return predictions, (members, sensors), and Y = [U C] H^T, (members, r, sensors)."""
         if self.fixed:
             return self._read(x.u + x.du), self.rows(x, x.U, x.C, at)
         predicted, rows = [], []
@@ -110,10 +107,7 @@ class Anchor:
         return HilbertSpace(gram, "X", model.state_space.fixed)
 
     def corrected(self, x: FilterState, d: Array, used: Mask, at: Moments) -> FilterState:
-        """Return the state of members after readings that correct u only.
-
-        `d`, `used`: innovations, and which of them correct the state, (members, sensors).
-        """
+        """Return the state of members after readings that correct u only."""
         problem, du, U = self.problem, x.du.copy(), x.U.copy()
         errors = x.shadows.u.copy()  # of the discretisation, which the correction removes, too
         _, Y = self.sensors.observe(x, at)

@@ -194,11 +194,7 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
 def _allowed(
     samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
 ) -> Iterator[Allowed]:
-    """Iterate over the unknowns with their intervals.
-
-    `variance`, `std`: variance that the noise alone leaves of the latent unknowns, and their
-    reported standard deviations, (m,).
-    """
+    """Iterate over the unknowns with their intervals."""
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
     own = set(problem.observed.observation.unknowns)

@@ -196,8 +196,6 @@ def with_input_noise(
     a quarter.
     The row is the difference to the state whose input is one standard deviation off, exact where
     the model is affine in it.
-
-    `propagate`: takes a state over a span. `x`, `end`: the state before and after the span.
     """
     members, k, bare = len(x), x.C.shape[2], _bare(x)
     rows = []

@@ -35,12 +35,7 @@ class NormalEquations(ABC):
 
     @abstractmethod
     def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
-        """Return the contribution of a sample.
-
-        `A`: data of A(w). `q`, `error`: parameter, shape (m,), and the equation error R^T eps that
-        it leaves, shape (n,). `probes`: V with trace(V^T J V) close to trace(G_Q^{-1} J), shape (m,
-        k).
-        """
+        """Return the contribution of a sample."""
 
     @abstractmethod
     def trace(self, A: Array, probes: Array) -> Array:

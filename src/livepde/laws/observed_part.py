@@ -120,11 +120,7 @@ class NoiseDetector:
         self.small = int(shown.sum()) < FEWEST
 
     def add(self, balance: Balance, z: Array, boundary: Array) -> tuple[Balance, bool]:
-        """Return the means with the noise products of a sample, and whether the samples are noisy.
-
-        `z`, `boundary`: the sample, shape (sensors,), and the boundary values at its time, shape
-        (n,).
-        """
+        """Return the means with the noise products of a sample, and whether there is noise."""
         samples = np.stack([*balance.z, z])
         if np.isfinite(samples[:, self.split.present]).all():
             known = [*balance.boundary, boundary]

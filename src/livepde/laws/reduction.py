@@ -132,13 +132,7 @@ class Reduction:
         return numbers + modes
 
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
-        """Return the coordinates of some unknowns, shape (k,); None means all.
-
-        Raises
-        ------
-        LawError
-            There is no unknown of that name; the message begins with `who`.
-        """
+        """Return the coordinates of some unknowns, shape (k,), None: all; raises `LawError`."""
         parts, space = list(self.problem.model.latent.parts), self.problem.model.parameter_space
         missing = [name for name in names or () if name not in space.parts]
         if missing:
@@ -166,9 +160,6 @@ class Reduction:
 
         A drifting unknown gains the less, the closer its variance is to that of the prior: without
         data it is never less certain than at first.
-
-        `variance`: of the coordinates of each member, shape (members, k). `drift`: prior variances
-        gained per unit of time by unknowns that stay, shape (members,).
         """
         gained = _growth(self.evolutions, h)
         if not drift.any():
@@ -259,10 +250,7 @@ class Reduction:
         )
 
     def directions(self, q: Array, C: Array) -> Array:
-        """Return how the physical parameter changes along rows of a, (members, r, m).
-
-        `q`, `C`: latent parameters, (members, dim), and rows, (members, r, k).
-        """
+        """Return how the physical parameter changes along rows of a, (members, r, m)."""
         latent, along = self.problem.model.latent, C @ self.Phi.T
         if latent.plain:
             return along
@@ -275,11 +263,7 @@ class Reduction:
         )
 
     def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:
-        """Return the latent parameter that is expected to have become q in a time h, shape (m,).
-
-        `start`: a latent parameter at the earlier time: its part outside the modes is kept, shape
-        (m,). `drift`: as for `gained`.
-        """
+        """Return the latent parameter that is expected to have become q in a time h, shape (m,)."""
         if not (self.moves or drift):
             return q
         prior = self.problem.model.latent.prior

@@ -363,11 +363,7 @@ class _Search:
 
 
 def _shift(sizes: Array, g: Array, delta: float) -> float:
-    """Return the shift of the Hessian with which the minimum of the model is within a ball.
-
-    `sizes`, `g`: eigenvalues of the Hessian, at least 1, and the descent direction in its axes,
-    shapes (r,). `delta`: radius of the ball.
-    """
+    """Return the shift of the Hessian with which the minimum of the model is within a ball."""
     if np.linalg.norm(g / sizes) <= delta:
         return 0.0
     # The length falls with the shift; the bracket holds since |g|/(shift + 1) bounds the length.

@@ -70,10 +70,7 @@ def refit_due(
 def settle(
     work: SensitivityWork, state: SensitivityState
 ) -> tuple[SensitivityState, list[Mask | None]]:
-    """Return all members after a last refit, for the end of a run, and the readings it has used.
-
-    Those of the last samples of each member, (samples, sensors); None of one that is not fitted.
-    """
+    """Return all members after a last refit, and the readings it has used or None, of each."""
     used: list[Mask | None] = [None] * len(state)
     each: dict[int, SensitivityState] = {}
     options = work.refit

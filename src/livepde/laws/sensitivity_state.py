@@ -242,9 +242,6 @@ class Scale:
         """Return the value after a sample, that before it for sensors whose reading was refused.
 
         A wild reading would let any later prediction pass for one within the range.
-
-        `before`: the value before the sample. `refused`: how many readings in a row the gate has
-        refused, (members, sensors).
         """
         if not np.count_nonzero(refused):
             return self
@@ -276,11 +273,7 @@ def stored(
     anchored: Mask | None = None,
     **parts: Any,
 ) -> SensitivityState:
-    """Return a state with the filter after a sample, which the members `taken` took.
-
-    `anchored`: members whose state was corrected alone, shape (members,). `parts`: other fields to
-    exchange.
-    """
+    """Return a state with the filter after a sample, which the members `taken` took."""
     if not work.keeps_log:
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken, now.parts)

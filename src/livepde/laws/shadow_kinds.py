@@ -147,11 +147,7 @@ class MeanProcess:
     def propagate(
         self, x: FilterState, u: Array, kept: KeptFactors, span: Span
     ) -> tuple[Array, KeptFactors, Mask]:
-        """Return states after a span, warm-start data of the last stage, and which members failed.
-
-        `x`, `u`: the filter at the start, and the states that are propagated in the place of its
-        own. `kept`: warm-start data of the previous stage.
-        """
+        """Return states after a span, their warm-start data, and which members failed."""
         if not self.moves:
             return self._through(x, u, kept, span, [span.t1])
         # The filter takes the steps of some members in parts (`noise_rows`): so does this.
@@ -208,10 +204,7 @@ class Shadow(ABC):
     def start(
         self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
     ) -> ShadowState:
-        """Return the state before the first step, of one member.
-
-        `moment`, `given`: time and inputs, None before any; and the initial state as it was given.
-        """
+        """Return the state before the first step, of one member."""
 
     @abstractmethod
     def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:

@@ -139,11 +139,7 @@ class ShadowSet:
         *,
         moves: bool,
     ) -> ShadowSet:
-        """Return the shadows of a filter.
-
-        `noise`, `stage`: standard deviation of each sensor, shape (sensors,), and the implicit
-        stage. `moves`: whether unknowns move.
-        """
+        """Return the shadows of a filter."""
         process = MeanProcess(problem.control, stage, reduction, moves)
         refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
         found: list[Shadow] = []
@@ -206,10 +202,7 @@ class ShadowSet:
         return s
 
     def predict(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
-        """Return the state after a span with the errors that have come about in it.
-
-        `x`, `end`: before and after the span; `end` with the errors of before, propagated.
-        """
+        """Return the state after a span with the errors that have come about in it."""
         s = end.shadows
         parts, jumps = _watch_rate(s, x, end, span)
         fresh = s.count == s.last  # members that begin a block
@@ -289,11 +282,7 @@ class ShadowSet:
         return np.where(spare, np.maximum(x.parts // 2, 1), x.parts)
 
     def finer_parts(self, end: FilterState, parts: IntArray) -> IntArray:
-        """Return in how many parts the substeps of a span have to be divided, (members,).
-
-        `end`: the state after the span, with its error where that has been estimated. `parts`: in
-        how many parts its substeps are divided there.
-        """
+        """Return in how many parts the substeps of a span have to be divided, (members,)."""
         s = end.shadows
         coarse = (s.last == s.count) & (s.excess > 1.0) & (parts < self.most)
         if not np.count_nonzero(coarse):
@@ -375,10 +364,7 @@ class ShadowSet:
         return u, s.a
 
     def diagnostics(self, x: FilterState, C: Array) -> Diagnostics[Array]:
-        """Return the shifts of the unknowns, numbers of shape (members,).
-
-        `C`: square root of their covariance without the shifts, (members, r, k).
-        """
+        """Return the shifts of the unknowns, numbers of shape (members,)."""
         reduction, latent = self.reduction, self.problem.model.latent
         found = []
         for k, a in enumerate(x.shadows.a):

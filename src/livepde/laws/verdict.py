@@ -57,11 +57,7 @@ def judge_of(
     *,
     kept: bool,
 ) -> Judge | None:
-    """Return the judge of a filter; None if there is to be none.
-
-    `verdict`: as for `SensitivityLaw`. `rank`: rows of the square root at most. `kept`: whether the
-    filter forgets nothing, so that a record of unknowns that stay makes sense.
-    """
+    """Return the judge of a filter; None if there is to be none."""
     if not verdict:
         return None
     still = kept and not (reduction.moves or problem.input_noise)
@@ -135,10 +131,7 @@ def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
 
 
 def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowState) -> Verdict:
-    """Return a verdict that names the errors of the discretisation which are not held.
-
-    `shadows`: those of the filter; None: it follows no such error. `s`: their state.
-    """
+    """Return a verdict that names the errors of the discretisation which are not held."""
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
     if shadows is not None and s.coarse[0]:
         verdict = verdict.with_findings([_coarse(s, shadows.most)])
@@ -165,11 +158,7 @@ def _coarse(s: ShadowState, most: int) -> Finding:
 
 
 def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
-    """Return a verdict that names the columns of the data which explain a misfit.
-
-    They are looked for only where something speaks against the estimates. `columns`: the columns,
-    or why they cannot be looked at.
-    """
+    """Return a verdict that names the columns of the data which explain a misfit."""
     if verdict.level in ("trusted", NOT_JUDGED):
         return verdict
     if isinstance(columns, str):
@@ -298,10 +287,7 @@ class StepLedger(NamedTuple):
 
 
 def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
-    """Return a finding for each way in which steps have failed.
-
-    `counts`: code of a status -> number of samples.
-    """
+    """Return a finding for each way in which steps have failed."""
     samples = sum(counts.values())
     for code in FAILURES:
         count = counts.get(code, 0)

@@ -83,10 +83,7 @@ class _CoupledEquation:
 def nearest_root(
     function: Callable[[float], float], start: float, least: float, most: float
 ) -> float | None:
-    """Return a root of a function of a positive number, the nearest one to both sides of a start.
-
-    None: there is none between the two ends.
-    """
+    """Return the root of a function of a positive number that is nearest to a start, or None."""
     # Each value is asked for once: that of a stage depends on where its iteration began.
     values = cache(function)
     start = min(max(start, least), most)
@@ -133,12 +130,7 @@ class CoupledStage:
         predicted: Array | None = None,
         kept: KeptFactor | None = None,
     ) -> tuple[StageIterate, KeptFactor]:
-        """Return the solution of one stage, and the factor to keep; raises `StepFailed`.
-
-        `start`: returns where the iteration begins without a prediction, shape (n + m,).
-        `predicted`: a prediction of the solution, shape (n + m,). `kept`: the factor that the stage
-        before has kept.
-        """
+        """Return the solution of one stage, and the factor to keep; raises `StepFailed`."""
         solver, kept = self.solver, kept or KeptFactor.none()
         data = solver.data(problem)
         near = None

@@ -225,11 +225,7 @@ class StageTerms:
         theta: float,
         accuracy: float,
     ) -> tuple[float, bool, tuple[float, float]]:
-        """Return the relative size of a residual, whether it resolves r, and the scales of both.
-
-        `first`, `second`: residual and changing terms of the two lines. `X`: ||r||_X^2. `accuracy`:
-        of r, relative, as far as it is above the floor.
-        """
+        """Return the relative size of a residual, whether it resolves r, and the scales of both."""
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
@@ -243,10 +239,7 @@ class StageTerms:
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
 
     def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
-        """Return a stage, from its F on the free coefficients and the terms of the data on omega.
-
-        The remaining residual of the stage before is subtracted here.
-        """
+        """Return a stage, from its F and the terms of the data on omega."""
         metric, left, c_q = problem.metric, problem.left, problem.c[self.n :]
         load = np.zeros_like(c_q) if metric.load is None else metric.load
         if left is not None:
@@ -336,10 +329,7 @@ class StageTerms:
         mass_r: Array,
         observed: Callable[[], Residual] | None = None,
     ) -> Residual:
-        """Return the norms of r that a damping rule may use.
-
-        ||r||_V~ is the dual norm of M_op r over the test functions that stay within omega.
-        """
+        """Return the norms of r that a damping rule may use."""
         tests = self.forms.tests
 
         def V() -> float:
@@ -356,10 +346,7 @@ class StageTerms:
         return min(self.damping.theta(norms), STIFFEST / data.problem.h)
 
     def bracket(self, data: StageData) -> tuple[float, float]:
-        """Return two ends between which the theta of a solved stage lies.
-
-        Below the first the pull is rounding. The second is the bound of the rule.
-        """
+        """Return two ends between which the theta of a solved stage lies."""
         h = data.problem.h
         return 1.0 / (STIFFEST * h), min(self.damping.most(data.observed()), STIFFEST / h)
 
@@ -446,10 +433,7 @@ class StageSolver(ABC):
         """Compute the parts that do not depend on the samples."""
 
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        """Return a stage, with the terms that do not depend on its solution.
-
-        `w`: u_alpha with the Dirichlet values, shape (n,); default those of the moment.
-        """
+        """Return a stage, with the terms that do not depend on its solution."""
         forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:
             w = forms.model.impose(problem.u_alpha, moment) if w is None else w

@@ -208,10 +208,7 @@ def _stored(matrix: sp.csr_array) -> Array:
 
 
 class BilinearSolver(MonolithicSolver):
-    """A, B and the Jacobian by products with small or sparse matrices: no form is evaluated.
-
-    The equation is that of `StageSolver.evaluate`.
-    """
+    """A, B and the Jacobian by products with small or sparse matrices: no form is evaluated."""
 
     keeps = True
 
