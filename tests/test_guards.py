@@ -307,16 +307,6 @@ def test_the_law_goes_on_when_excitation_returns():
     assert any("samples, last at t = 20" in s for s in doubts(data))
 
 
-@pytest.mark.long
-def test_a_process_faster_than_the_samples_is_not_at_rest():
-    values = np.random.default_rng(1).standard_normal(700)
-    fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
-    assert not holds(fast).any()
-    later = lambda t: 1.0 if t < 200.0 else values[round(t / 2.0)]  # noqa: E731
-    late = learned(m := reaction(later), full(m, 600, h=2.0))
-    assert not holds(late).any()
-
-
 @pytest.mark.slow
 def test_an_exact_excitation_that_dies_out_is_none():
     model = reaction(lambda t: 1.0 / (1.0 + t) ** 2)
@@ -392,22 +382,6 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     last = identifier._state.excitation
     assert last.energy < 0.01 * last.largest  # by this alone, and by
     assert last.correlation < 0.5  # this, it would be held
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("gain", [1.0, 1e4])
-@pytest.mark.parametrize("c1", [0.1, 1.0])
-def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
-    model = reaction(lambda t: 1.0 * (t < 50.0))
-    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
-    identifier = lp.Identifier(model, lp.Full(), law, u0=0.0)
-    held = [
-        not np.isnan(identifier.step(*sample).diagnostics.at_rest)
-        for sample in full(model, 400, h=0.5)
-    ]
-    first = held.index(True)
-    assert 100 < first < 300
-    assert all(held[first:])
 
 
 def test_probes_see_the_same_by_assembly_in_every_unit():

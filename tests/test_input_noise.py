@@ -9,7 +9,6 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.preview import StatedNoise
 from livepde.laws.noise_rows import ROWS
 from livepde.stepping import Alexander2, ImplicitEuler
 
@@ -79,42 +78,6 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     assert ratio[1] == pytest.approx(1.0, rel=tolerance)
     near = 1.0 if flux or isinstance(scheme, ImplicitEuler) else 1.25
     assert 1.0 - tolerance <= ratio[0] <= near + tolerance
-
-
-def truth(seed: int, noise: float, sensor: float) -> tuple[float, list[tuple[float, dict]]]:
-    """Return k from the prior, and what a rod with a noisy boundary channel shows."""
-    rng = np.random.default_rng(seed)
-    k = 1.0 + 0.3 * float(np.clip(rng.standard_normal(), -2.0, 2.0))
-    inputs = [channel(j) for j in range(STEPS + 1)]
-    one = lp.Identifier(rod(), lp.Points(SENSORS, noise=1.0), filter_alone(), u0=0.0, q0={"k": k})
-    samples = []
-    for j, value in enumerate(inputs):
-        one.step(H * j, {"left": value})
-        belief = one.latent_belief()
-        z = one.observed.predict(belief.u, belief.q, None) + sensor * rng.standard_normal(2)
-        read = {"left": value + noise * rng.standard_normal()}
-        samples.append((H * j, {**dict(zip(SENSORS, z.tolist(), strict=True)), **read}))
-    return k, samples
-
-
-@pytest.mark.study
-def test_an_interval_with_the_noise_of_the_boundary_holds():
-    inside = {True: 0, False: 0}
-    for seed in range(20):
-        k, samples = truth(seed, 0.1, 0.01)
-        for stated in inside:
-            one = lp.Identifier(
-                rod(),
-                lp.Points(SENSORS, noise=0.01),
-                StatedNoise(),
-                u0=0.0,
-                input_noise={"left": 0.1} if stated else None,
-            )
-            belief = one.run(samples).last.belief
-            std = np.sqrt((belief.q_factor[0] ** 2).sum())
-            inside[stated] += abs(belief.q[0] - k) < 1.96 * std
-    assert inside[True] >= 18
-    assert inside[False] <= 12
 
 
 # --- initial states ----------------------------------------------------------------------------

@@ -244,24 +244,6 @@ def test_the_law_and_the_report_have_the_same_pauses(seed: int) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("shadows", [None, lp.laws.Shadows()])
-def test_a_run_goes_on_to_the_bit_before_and_after_a_pause(shadows: Any) -> None:
-    rows = samples()
-    whole = identifier(shadows=shadows)
-    for cut in (59, 60, 61):
-        first, second = identifier(shadows=shadows), identifier(shadows=shadows)
-        for t, z in rows[:cut]:
-            first.step(t, z)
-        second.restore(first.dump())
-        for t, z in rows[cut:]:
-            second.step(t, z)
-        if cut == 59:
-            for t, z in rows:
-                whole.step(t, z)
-        assert second.dump() == whole.dump()
-
-
-@pytest.mark.slow
 def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     rows = samples()
     last = identifier(refit=None, shadows=None).run(rows).last

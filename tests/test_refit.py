@@ -303,16 +303,26 @@ def test_a_refit_apart_survives_restarts_and_copies(at: int):
         assert np.array_equal(np.concatenate([before, numbers_of(one, samples[at:])]), whole)
 
 
+def apart_only(monkeypatch: pytest.MonkeyPatch, before: Any) -> None:
+    """Call a function before each refit in another thread."""
+    fit, here = refits.refitted_now, threading.get_ident()
+
+    def fitted(*given: Any) -> Any:
+        if threading.get_ident() != here:
+            before()
+        return fit(*given)
+
+    monkeypatch.setattr(refits, "refitted_now", fitted)
+
+
 def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatch):
     """A fit that has not ended holds no sample up before it is due."""
     ends = threading.Event()
-    fit = refits.refitted_now
 
-    def slowly(*given: Any) -> Any:
+    def slowly() -> None:
         assert ends.wait(60.0)
-        return fit(*given)
 
-    monkeypatch.setattr(refits, "refitted_now", slowly)
+    apart_only(monkeypatch, slowly)
     identifier, samples = insulated(apart=True), rod_samples()
     numbers_of(identifier, samples[:143])  # that of 128 samples is due with sample 144
     ends.set()
@@ -321,20 +331,20 @@ def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 def test_an_error_in_a_refit_apart_reaches_who_steps(monkeypatch: pytest.MonkeyPatch):
-    def broken(*given: Any) -> Any:
+    def broken() -> None:
         raise ValueError("of a form")
 
-    monkeypatch.setattr(refits, "refitted_now", broken)
+    apart_only(monkeypatch, broken)
     with pytest.raises(ValueError, match="of a form"):
         numbers_of(insulated(apart=True), rod_samples())
 
 
 @pytest.mark.slow
 def test_numbers_that_end_a_refit_apart_end_no_run(monkeypatch: pytest.MonkeyPatch):
-    def singular(*given: Any) -> Any:
+    def singular() -> None:
         raise np.linalg.LinAlgError("singular")
 
-    monkeypatch.setattr(refits, "refitted_now", singular)
+    apart_only(monkeypatch, singular)
     identifier = insulated(apart=True)
     for t, z in rod_samples():
         estimate = identifier.step(t, z)

@@ -301,17 +301,6 @@ def test_says_where_the_mesh_is_not_followed() -> None:
     assert not ran(identifier(8), samples()[:30]).verdict.untested
 
 
-@pytest.mark.long
-def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
-    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (8, 8, 8))
-    model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})
-    sensors = lp.Points([(0.3, 0.5, 0.5)], noise=NOISE)
-    given = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
-    for t, _, inputs in samples()[:22]:
-        estimate = given.step(t, [0.0], inputs)
-    assert any("more cells" in text for text in estimate.verdict.untested)
-
-
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:
     """Neither gate nor verdict take its part, and no number of the filter moves."""
     law = lp.SensitivityLaw(refit=None)

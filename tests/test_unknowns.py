@@ -217,13 +217,6 @@ def test_a_prior_alone_is_one_number(prior: Any):
     assert FunctionSpace.of(prior, "q").prior == [0.5]
 
 
-def test_a_prior_alone_holds_for_a_region():
-    own = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), unit="m", own={"r": lp.LogNormal(0.3, 0.1)})
-    left, right = own.separated("a").values()
-    assert (left.prior, right.prior) == (lp.Normal(0.4, 0.1), lp.LogNormal(0.3, 0.1))
-    assert (left.unit, right.unit) == ("m", "m")
-
-
 @pytest.mark.slow
 def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)

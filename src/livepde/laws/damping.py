@@ -316,21 +316,21 @@ def theta_smoothed(
     return _over(max(pull, c1 * r.X) * r.X, r.VX**2)
 
 
-def nu_exact(c: Constants, e: float, p: Norms, nu_min: float = 0.0) -> float:
+def nu_exact(c: Constants, e: float, p: Norms) -> float:
     """Return the least nu for exact data, Assumption cond:nu."""
     embedding = 0.5 * c.hidden_V_VX * c.hidden_VX_X
     weight = 4.0 * (c.L_C + c.C_A * (e + embedding)) / c.c_N
-    return max(nu_min, weight * _over(p.V * p.X, p.VX**2))
+    return weight * _over(p.V * p.X, p.VX**2)
 
 
-def nu_noisy(c: Constants, e: float, p: Norms, d_V: float, nu_min: float = 0.0) -> float:
+def nu_noisy(c: Constants, e: float, p: Norms, d_V: float) -> float:
     """Return the least nu for noisy and smoothed data, Assumptions ass:mu_nu, ass:mu_nu_smooth."""
     rough = 4.0 * (c.L_C + c.C_A * e) / c.c_N * (p.V + d_V)
     rough += 2.0 * c.C_A * c.hidden_V_VX * c.hidden_VX_X / c.c_N * p.V
-    return max(nu_min, _over(rough * p.X, p.VX**2))
+    return _over(rough * p.X, p.VX**2)
 
 
-def unobserved_damping(c: Constants, e_bound: float, nu_min: float = 0.0) -> float:
+def unobserved_damping(c: Constants, e_bound: float) -> float:
     """Return a constant nu for `GradientLaw` that satisfies Assumption cond:nu for every p.
 
     The unknown quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is at most `c.hidden_ratio`, so the bound
@@ -345,7 +345,7 @@ def unobserved_damping(c: Constants, e_bound: float, nu_min: float = 0.0) -> flo
     8.0
     """
     # Norms of which the quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is the largest possible one.
-    return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0), nu_min)
+    return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0))
 
 
 def _check_bounds(name: str, **values: float) -> None:

@@ -399,10 +399,8 @@ class Filter:
         past, dpast = np.concatenate([x.past, x.C], axis=2), np.concatenate([x.dpast, now], axis=1)
         return changed(x, past=past, dpast=dpast)
 
-    def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
+    def relinearised(self, x: FilterState) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
-
-        Members in `kept`, shape (members,), keep their linearisation point; None: no member does.
 
         Bounds (`Reduction.ends`) hold for linearisation points and for reported estimates, not for
         the linear filter: an excess beyond them stays in da and du, so that no information of the
@@ -421,10 +419,6 @@ class Filter:
                 du[k] = along(x, k, da[k])
                 u[k] -= du[k]
                 estimate[k] = x.q[k] + self.reduction.Phi @ shift
-        if kept is not None and kept.any():
-            rows = kept[:, None]
-            u, q = np.where(rows, x.u, u), np.where(rows, x.q, estimate)
-            return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
     def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -146,37 +147,21 @@ class ShadowState:
     def none(cls, members: int, n: int, k: int) -> ShadowState:
         """Return the value without any shadow."""
         # No step writes into the arrays of a state, so that several fields may share one.
-        zero, nothing = np.zeros(members, dtype=np.int64), np.zeros((members, 0))
-        time, kept = np.zeros(members), KeptFactors.none(members)
-        u, a = np.zeros((members, 0, n)), np.zeros((members, 0, k))
+        zero, time = np.zeros(members, dtype=np.int64), np.zeros(members)
+        counts = ("count", "last", "due", "jumped", "failed", "coarse")
+        empty = ("u0", "inputs0", "slope", "bend", "missed", "fine", "seen")
+        same: dict[str, Any] = dict.fromkeys(counts, zero)
+        same |= dict.fromkeys(("usual", "begun", "excess", "coarsest"), time)
+        same |= dict.fromkeys(("size", "length"), time + np.inf)
+        same |= dict.fromkeys(empty, np.zeros((members, 0)))
+        same |= dict.fromkeys(("halves", "blocks", "fine_stage"), KeptFactors.none(members))
         return cls(
-            u,
-            a,
-            count=zero,
-            last=zero,
-            due=zero,
+            u=np.zeros((members, 0, n)),
+            a=np.zeros((members, 0, k)),
             rate=np.zeros((members, n)),
-            usual=time,
-            jumped=zero,
-            size=time + np.inf,
-            begun=time,
-            u0=nothing,
-            inputs0=nothing,
-            length=time + np.inf,
-            slope=nothing,
-            bend=nothing,
-            missed=nothing,
             held=np.zeros((members, 4, 0)),
-            halves=kept,
-            blocks=kept,
-            fine=nothing,
-            fine_stage=kept,
-            seen=nothing,
             gains=np.zeros((members, 0, k)),
-            failed=zero,
-            excess=time,
-            coarse=zero,
-            coarsest=time,
+            **same,
         )
 
     def without_stages(self) -> ShadowState:

@@ -55,25 +55,12 @@ class Screened:
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Screened:
         """Return the value before any sample."""
-        never, none = np.full((members, sensors), np.nan), np.zeros((members, sensors), np.int64)
-        no = none > 0
-        return cls(
-            refused=none,
-            changes=none,
-            fits=none,
-            taken=none,
-            aside=no,
-            apart=no,
-            since=never,
-            off=never,
-            low=never,
-            high=never,
-            last=never,
-            run=none,
-            longest=none,
-            strain=none,
-            calm=np.full(members, CALM),
-        )
+        none = np.zeros((members, sensors), np.int64)
+        counts = ("refused", "changes", "fits", "taken", "run", "longest", "strain")
+        same: dict[str, Any] = dict.fromkeys(counts, none)
+        same |= dict.fromkeys(("since", "off", "low", "high", "last"), none + np.nan)
+        same |= dict.fromkeys(("aside", "apart"), none > 0)
+        return cls(calm=np.full(members, CALM), **same)
 
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""

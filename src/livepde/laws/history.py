@@ -118,12 +118,6 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
     return [Interval.between(first, last) for first, last in pairwise(_rows(log, channels))]
 
 
-def with_readings(log: Array, sensors: int) -> Mask:
-    """Return whether each sample that one member took, shape (rows, ...), has a reading."""
-    taken = log[np.isfinite(log[:, 0]), 1 : 1 + sensors]
-    return np.asarray(np.isfinite(taken).any(axis=1))
-
-
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
     """Return how many samples, from the last one back, hold so many with a reading, or all."""
     places = np.flatnonzero(shown)

@@ -198,7 +198,9 @@ def _allowed(
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
     own = set(problem.observed.observation.unknowns)
-    own |= {name for name, item in latent.parts.items() if _corrects(item.unknown)}
+    for name, item in latent.parts.items():
+        if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
+            own.add(name)
     low, high = mixture.interval
     known = samples.filter.estimate(samples.state.now)[0]
     both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
@@ -224,11 +226,6 @@ def _allowed(
         numbers = [size, size - off[0], size + off[1], size - off[2], size + off[3]]
         numbers.append(float(np.sqrt((wider[part] ** 2).mean())))
         yield Allowed.of(name, unit, numbers, of_sensor=name in own)
-
-
-def _corrects(unknown: object) -> bool:
-    """Return whether an unknown corrects an input."""
-    return isinstance(unknown, Scalar) and unknown.corrects
 
 
 def linear_model(

@@ -283,17 +283,13 @@ class Reduction:
                 left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
         return left
 
-    @cached_property
-    def _unseen(self) -> Array:
-        return np.asarray(np.sqrt(self._left_out))
-
     def rest(self, age: float, drift: float) -> Array:
         """Return the standard deviation of latent coefficients in the omitted modes, (m,).
 
         These coefficients keep their prior, and have moved for a time `age`.
         """
         if age == 0.0 or not self._left_out.any():
-            return self._unseen
+            return np.asarray(np.sqrt(self._left_out))
         grown = []
         for evolution, item in zip(
             self.evolutions, self.problem.model.latent.parts.values(), strict=True

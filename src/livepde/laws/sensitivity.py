@@ -26,7 +26,7 @@ from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, join, put_each, take, where
+from livepde.laws.member_arrays import changed, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
@@ -367,13 +367,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if not work.filter.sensors.fixed:
             return "the sensors do not see a fixed linear part of the state alone"
         return stage.refusal
-
-    def begin_members(
-        self, work: SensitivityWork, state: SensitivityState, span: Span
-    ) -> SensitivityState:
-        """Return all members after a sample at the initial time."""
-        each = (self.begin(work, take(state, k), span.member(k)) for k in range(len(state)))
-        return join(*each)
 
     def step(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval

@@ -133,82 +133,49 @@ class StageIterate:
     mass_r: Array
 
 
-@dataclass(frozen=True, eq=False)
 class StageTerms:
-    """Terms of a stage that all solvers share: its forms, gains and norms."""
+    """Terms of a stage that all solvers share: its forms, gains and norms.
 
-    forms: StageForms  # forms over omega and elsewhere
-    damping: Damping  # rule for theta
-    memory: Pattern | None = None  # pattern of `Metric.information`; None: there is none
+    `memory` is the pattern of `Metric.information`; None: there is none.
+    """
 
-    @cached_property
-    def n(self) -> int:
-        """Number of coefficients of the state."""
-        return self.forms.model.X.dim
+    def __init__(self, forms: StageForms, damping: Damping, memory: Pattern | None = None) -> None:
+        model = forms.model
+        self.forms, self.damping, self.memory = forms, damping, memory
+        self.n, self.size = model.X.dim, model.X.dim + model.Q.dim
+        self.parts = slice(0, self.n), slice(self.n, self.size)  # of u and q in y
+        # One for each free coefficient of the state, (n,), and of the parameter, (m,).
+        self.free, self.free_q = model.X.free, model.Q.free
+        # G_Q, or where that is dense a sparse matrix of which it is the Schur complement, with
+        # auxiliary unknowns behind q.
+        self.gram: sp.csr_array = model.Q.augmented
+        self.auxiliary = self.gram.shape[0] - model.Q.dim
+        self.linear = model.form_A.linear_in_parameter  # in q
+        self.moves = bool(model.latent.generator.nnz)  # whether an unknown moves by itself
+        self.observes = bool(forms.split.present.any())  # whether a sensor is present
+        # M, R^T M_op R and R^T M R over omega; dense if small.
+        self.mass, self.pull = compact(model.mass), compact(forms.pull)
+        self.observed_mass = compact(forms.mass)
+        # Diagonal of the mass: the norm by it is equivalent to that of X.
+        self.lumped: Array = np.abs(model.mass.diagonal())
+        self.dual_weights = self._dual_weights()
+        weights = self.dual_weights
+        # Diagonals of M and G_Q on the free coefficients, shape (n + m,).
+        self.diagonal = np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0.0)
 
-    @cached_property
-    def size(self) -> int:
-        """Number of unknowns n + m."""
-        return self.n + self.forms.model.Q.dim
-
-    @cached_property
-    def free(self) -> Array:
-        """One for each free coefficient of the state, shape (n,)."""
-        return self.forms.model.X.free
-
-    @cached_property
-    def free_q(self) -> Array:
-        """One for each free coefficient of the parameter, shape (m,)."""
-        return self.forms.model.Q.free
-
-    @cached_property
-    def gram(self) -> sp.csr_array:
-        """G_Q, or where that is dense a sparse matrix of which it is the Schur complement."""
-        return self.forms.model.Q.augmented
-
-    @cached_property
-    def auxiliary(self) -> int:
-        """Number of unknowns behind q that such a matrix has."""
-        return self.gram.shape[0] - self.forms.model.Q.dim
-
-    @cached_property
-    def linear(self) -> bool:
-        """True if A is linear in q."""
-        return self.forms.model.form_A.linear_in_parameter
-
-    @cached_property
-    def dual_weights(self) -> Array:
-        """Weights of the squared dual norms, shape (n + m,): the inverse diagonals of M and G_Q.
+    def _dual_weights(self) -> Array:
+        """Return weights of squared dual norms, (n + m,): the inverse diagonals of M and G_Q.
 
         For functionals of the same kind, as a residual and the terms that it is the sum of, the
         ratio of these norms is that of the dual norms, and larger where a residual is rough.
         """
-        parts = []
-        for gram, free in (
-            (self.forms.model.mass, self.free),
-            (self.forms.model.Q.gram if not self.auxiliary else self.gram, self.free_q),
-        ):
+        parts, Q = [], self.forms.model.Q
+        grams = self.forms.model.mass, self.gram if self.auxiliary else Q.gram
+        for gram, free in zip(grams, (self.free, self.free_q), strict=True):
             diagonal = np.abs(gram.diagonal())[: len(free)]
             floor = diagonal.max(initial=0.0) or 1.0
             parts.append(free / np.where(diagonal > 0.0, diagonal, floor))
         return np.concatenate(parts)
-
-    @cached_property
-    def diagonal(self) -> Array:
-        """Diagonals of M and G_Q on the free coefficients, shape (n + m,)."""
-        weights = self.dual_weights
-        return np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0.0)
-
-    @cached_property
-    def parts(self) -> tuple[slice, slice]:
-        """Places of u and q in y."""
-        return slice(0, self.n), slice(self.n, self.size)
-
-    @cached_property
-    def lumped(self) -> Array:
-        """Diagonal of the mass, shape (n,): the norm by it is equivalent to that of X."""
-        diagonal: Array = np.abs(self.forms.model.mass.diagonal())
-        return diagonal
 
     def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
         """Return the dual norms of functionals on u or q."""
@@ -275,26 +242,6 @@ class StageTerms:
     def _small_gram(self) -> Any:
         return compact(self.gram)
 
-    @cached_property
-    def moves(self) -> bool:
-        """True if an unknown moves by itself."""
-        return bool(self.forms.model.latent.generator.nnz)
-
-    @cached_property
-    def mass(self) -> Any:
-        """M, dense if small, shape (n, n)."""
-        return compact(self.forms.model.mass)
-
-    @cached_property
-    def pull(self) -> Any:
-        """R^T M_op R over omega, dense if small, shape (n, n)."""
-        return compact(self.forms.pull)
-
-    @cached_property
-    def observed_mass(self) -> Any:
-        """R^T M R over omega, dense if small, shape (n, n)."""
-        return compact(self.forms.mass)
-
     def sizes(
         self, problem: StageProblem, source: Array, load: Array
     ) -> tuple[float, float, float]:
@@ -307,11 +254,6 @@ class StageTerms:
         (other,) = self.duals([load], self.parts[1])
         known = math.sqrt(float(self.lumped @ np.square(problem.u_alpha)))
         return max(own, RESTING * least), max(other, RESTING * least_q), known
-
-    @cached_property
-    def observes(self) -> bool:
-        """True if a sensor is present."""
-        return bool(self.forms.split.present.any())
 
     def observed(self, u_alpha: Array) -> Callable[[], Residual]:
         """Return a function that computes the norms of u_alpha when it is called first."""
