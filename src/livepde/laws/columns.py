@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -273,14 +273,11 @@ class _Trials:
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
         """Iterate over errors, and by how much they lower a cost by the model about a fit."""
-        for name in self.columns.places:
-            yield from (
-                (cost - at.cost + gained, error) for gained, error in self._of_one(at, name)
-            )
-        yield from ((cost - at.cost + gained, error) for gained, error in self._exchanged(at))
+        each = [*(self._of_one(at, name) for name in self.columns.places), self._exchanged(at)]
+        for gained, error in chain(*each):
+            yield cost - at.cost + gained, error
 
     def _of_one(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors of one column."""
         columns, values = self.columns, self.columns.column(name)
         if len(values) < FEWEST_ROWS // 2:
             return
@@ -302,7 +299,6 @@ class _Trials:
             yield from self._units(base, name, slopes)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
-        """Return a size that is possible."""
         columns = self.columns
         if kind == "gain":
             return float(np.clip(theta, -0.9, 9.0))
@@ -335,7 +331,6 @@ class _Trials:
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
-        """Iterate over pairs of columns that may be exchanged."""
         columns = self.columns
         for pair in combinations(columns.places, 2):
             first, second = (columns.column(name) for name in pair)
@@ -414,7 +409,6 @@ def _noise(residuals: Array) -> float:
 
 
 def _cause(columns: Columns, error: Error, share: float) -> Cause:
-    """Return an error as a cause."""
     first, size = error.names[0], error.size
     problem = columns.work.filter.problem
     units = dict(zip(problem.observed.names, problem.observed.units, strict=True))

@@ -155,7 +155,6 @@ class ErrorColumns:
                 yield Answer("initial", name, k, start=u * free), ALWAYS
 
     def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over boundary values and channels that are off, and late."""
         model, lifts = self.model, boundary_lifts(self.model)
         for name, lift in lifts.items():
             yield Answer("boundary", name, lift=lift), ALWAYS
@@ -170,7 +169,6 @@ class ErrorColumns:
             yield Answer("flux", name, load=load), ALWAYS
 
     def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over unknowns that drift or jump during the run."""
         reduction = self.samples.filter.reduction
         for label, place in reduction.stay[:MOST_UNKNOWNS]:
             load = _changed(self.model, reduction.Phi[:, place])
@@ -277,7 +275,6 @@ class ErrorColumns:
 
 
 def _band(place: float, wide: float) -> Callable[[Any], Any]:
-    """Return a hat function of the first coordinate."""
     return lambda x: np.maximum(1.0 - np.abs(x[0] - place) / wide, 0.0)
 
 

@@ -244,7 +244,6 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
 
 
 def _sees_all(problem: Problem) -> bool:
-    """Return True if all sensors together determine every free coefficient of the state."""
     hidden = abs(problem.observed.split().P) @ problem.model.X.free
     return not bool((hidden > ROUNDING).any())
 

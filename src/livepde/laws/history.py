@@ -96,7 +96,6 @@ def trimmed(log: Array, first: int) -> Array:
 
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
-    """Return the rows that the one member of a log took."""
     sensors = (log.shape[2] - 2 - len(channels)) // 2
     found = []
     for row in log[0][np.isfinite(log[0, :, 0])]:

@@ -205,7 +205,6 @@ def _beginnings(samples: _Samples) -> Iterator[Array]:
 
 
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
-    """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
         # Where the step is within the uncertainty, the second-order error is far below it.

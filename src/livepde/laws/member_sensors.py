@@ -72,7 +72,6 @@ class MemberSensors:
         return np.array(list(each))
 
     def _predicted(self, u: Array, q: Array, at: Moments, k: int) -> Array:
-        """Return the readings of one member."""
         observed, latent = self.problem.observed, self.problem.model.latent
         return observed.predict(u, latent.value(q), at.member(k))
 

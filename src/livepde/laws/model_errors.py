@@ -113,7 +113,6 @@ Roots: TypeAlias = Callable[[float], Array]
 
 
 def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
-    """Iterate over random errors: each kind, and several at once."""
     groups: list[tuple[tuple[str, ...], tuple[float, ...]]]
     groups = [((name,), FAMILY_SIZES) for name in known]
     groups += [(names, JOINT_SIZES) for names in JOINT if set(names) <= set(known)]
@@ -194,7 +193,6 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
 def _allowed(
     samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
 ) -> Iterator[Allowed]:
-    """Iterate over the unknowns with their intervals."""
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
     own = set(problem.observed.observation.unknowns)

@@ -222,7 +222,6 @@ def _bare(x: FilterState) -> FilterState:
 
 
 def _moved(span: Span, name: str, change: float) -> Span:
-    """Return a span with another value of one channel at both ends."""
     shift = np.zeros(len(span.channels))
     shift[span.channels.index(name)] = change
     last = span.inputs1 + shift

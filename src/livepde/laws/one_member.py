@@ -192,7 +192,6 @@ def _rescued(
 
 
 def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
-    """Return the intervals that one member has taken since a row of the log."""
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
 
 

@@ -318,7 +318,6 @@ class _Search:
 
     @property
     def _square(self) -> float:
-        """Misfit of the best trajectory."""
         if self.best is None:
             return math.inf
         return _misfit(self.best.residuals, self.samples.readings, self.used)

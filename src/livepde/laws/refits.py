@@ -104,7 +104,6 @@ def _after(
     *,
     last: bool,
 ) -> SensitivityState:
-    """Return one member that continues from the end of a search."""
     count, spent = state.assimilated, state.fit.work
     x = None if found is None else _filter(samples, found, last=last)
     if found is None or x is None:
@@ -168,7 +167,6 @@ def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
 def _under_way(
     work: SensitivityWork, options: Refit, state: SensitivityState
 ) -> Future[SensitivityState]:
-    """Return the refit of one member, which is begun where it is not yet."""
     fork = state.fork
     with LOCK:
         if fork.filter in UNDER_WAY:

@@ -555,6 +555,5 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
-    """Return one member at the start with another filter."""
     start = work.kept_start(x)
     return changed(state, start=start, now=x, older=x, newer=x)

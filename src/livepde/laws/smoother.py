@@ -135,7 +135,6 @@ def _fitted(decisions: list[GateDecision], used: Mask, data: FixedInterval) -> l
 
 
 def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _SmootherPass:
-    """Return the pass about a most probable trajectory."""
     if best is None:
         raise LawError(
             "smoothed: the samples cannot be followed about any trajectory of the unknowns; take a "

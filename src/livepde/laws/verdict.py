@@ -143,7 +143,6 @@ def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowSt
 
 
 def _coarse(s: ShadowState, most: int) -> Finding:
-    """Return the finding of steps that would have to be shorter than is allowed."""
     coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
     text, remedy = FINDINGS["step"].filled(
         count=coarse,
@@ -196,7 +195,6 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
-    """Return the data on the estimates of one member, for its verdict."""
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
     _, C = reported_factors(filter_, x)
@@ -300,7 +298,6 @@ def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
 
 
 def _severity(code: str, share: float) -> Severity:
-    """Return how grave it is that a share of the samples has ended so."""
     # A right model departs in one of a million cases: there is no mishap of that sort.
     if share > (SOME if code == "departed" else MOST):
         return "do not trust"

@@ -294,7 +294,6 @@ def masked(matrix: sp.csr_array, rows: Array, cols: Array) -> sp.csr_array:
 
 
 def _widened(matrix: sp.csr_array, more: int) -> sp.csr_array:
-    """Return a square matrix with zero rows and columns behind."""
     if not more:
         return matrix
     return sp.csr_array(sp.block_diag([matrix, sp.csr_array((more, more))]))

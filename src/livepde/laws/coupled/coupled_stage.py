@@ -176,7 +176,6 @@ class CoupledStage:
         return newton.solve(equation, y, Near(y))
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
-        """Return y with the Dirichlet values of a moment."""
         n, model = self.terms.n, self.terms.forms.model
         imposed = y.copy()
         imposed[:n] = model.impose(y[:n], moment)

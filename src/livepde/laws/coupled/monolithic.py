@@ -161,7 +161,6 @@ class MonolithicSolver(StageSolver):
 
     @cached_property
     def _pull(self) -> Array:
-        """Data of R^T M_op R."""
         found: Array = self.maps["pull"] @ _stored(self.terms.forms.pull)
         return found
 
