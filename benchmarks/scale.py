@@ -32,8 +32,7 @@ from livepde.fem import Field, Moment, box, dot, grad, linear, rectangle
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.laws.coupled.block_factors import BlockSolver
-from livepde.laws.coupled.equation import Metric, StageProblem, StageTerms
-from livepde.laws.coupled.split_forms import StageForms
+from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, StageTerms
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain

@@ -25,9 +25,8 @@ import livepde as lp
 from livepde.fem import Moment
 from livepde.laws.coupled import coupled_stage as stage_module
 from livepde.laws.coupled.coupled_stage import CoupledStage
-from livepde.laws.coupled.equation import Metric, StageProblem, StageTerms
+from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
-from livepde.laws.coupled.split_forms import StageForms
 from livepde.model import h1_form
 from livepde.stepping import Near, StepFailed
 

@@ -14,9 +14,8 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from benchmarks import scale
 from livepde.errors import LawError
-from livepde.laws.coupled.split_forms import StageForms
-from livepde.laws.information import InformationMetric, trace_probes
-from livepde.laws.normal_equations import diagonal_bound
+from livepde.laws.coupled.equation import StageForms
+from livepde.laws.information import InformationMetric, diagonal_bound, trace_probes
 from livepde.laws.observed_part import Balance, NoiseDetector
 from livepde.reproduce import seed
 from livepde.streams import Twin

@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from scipy.special import erfc, erfcx
 
 import livepde as lp
-from livepde.laws import refits
+from livepde.laws import refit as refit_module
 from livepde.laws.refit import refitted
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import heat
@@ -305,14 +305,14 @@ def test_a_refit_apart_survives_restarts_and_copies(at: int):
 
 def apart_only(monkeypatch: pytest.MonkeyPatch, before: Any) -> None:
     """Call a function before each refit in another thread."""
-    fit, here = refits.refitted_now, threading.get_ident()
+    fit, here = refit_module.refitted_now, threading.get_ident()
 
     def fitted(*given: Any) -> Any:
         if threading.get_ident() != here:
             before()
         return fit(*given)
 
-    monkeypatch.setattr(refits, "refitted_now", fitted)
+    monkeypatch.setattr(refit_module, "refitted_now", fitted)
 
 
 def test_samples_go_on_while_a_refit_is_under_way(monkeypatch: pytest.MonkeyPatch):

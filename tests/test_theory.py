@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import diagnostics as dg
 from livepde.errors import ConfigurationError
-from livepde.laws.coupled.split_forms import StageForms
+from livepde.laws.coupled.equation import StageForms
 from livepde.laws.damping import (
     Constants,
     ExactBound,

@@ -55,7 +55,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled.split_forms import StageForms
+from livepde.laws.coupled.equation import StageForms
 from livepde.linalg import Array
 from livepde.model import Model, h1_form, mass_form
 from livepde.observation import Split

@@ -32,7 +32,7 @@ from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
 from livepde.laws.policies import Guards, Jumps, Refit
 from livepde.laws.reduction import Reduction
-from livepde.laws.refits import go_on, refit_due, settle
+from livepde.laws.refit import go_on, refit_due, settle
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,

@@ -26,7 +26,6 @@ import numpy as np
 from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
 from livepde.laws.filter_state import FilterState, ShadowState, along
-from livepde.laws.halved_mesh import refusal
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.reduction import Reduction
@@ -40,6 +39,7 @@ from livepde.laws.shadow_kinds import (
     ShadowedSteps,
     StepShadow,
     StepTolerance,
+    refusal,
 )
 from livepde.laws.step_diagnostics import Diagnostics, stacked
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed

@@ -14,8 +14,14 @@ import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
 from livepde.fem import Moment
-from livepde.laws.coupled.equation import Inside, StageData, StageIterate, StageSolver, StageTerms
-from livepde.laws.coupled.split_forms import AnyForm
+from livepde.laws.coupled.equation import (
+    AnyForm,
+    Inside,
+    StageData,
+    StageIterate,
+    StageSolver,
+    StageTerms,
+)
 from livepde.linalg import (
     Array,
     Assembler,
