@@ -40,8 +40,8 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, Mask, nonfinite_allowed
 
-NEIGHBOURS = 3  # to each side
-FEW = 2 * NEIGHBOURS
+NEIGHBOURS = 3  # in time, to each side of a value
+FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
 NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
