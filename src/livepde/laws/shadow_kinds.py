@@ -91,17 +91,12 @@ class HalvedMesh:
         """Return states on the halved mesh, shape (members, N) for (members, n)."""
         return np.asarray((self.P @ u.T).T)
 
-    def initial_difference(self, given: Any, q: Array, u: Array, moment: Moment | None) -> Array:
+    def initial_difference(self, given: Any, q: Array, u: Array, moment: Moment) -> Array:
         """Return the initial state on the halved mesh minus that of the given mesh, shape (N,).
 
-        `given`: the initial state as a user gave it; given coefficients do not define values at the
-        new nodes, so that the difference is zero then. `moment`: time and inputs of the start; None
-        if not known yet, and the difference is zero then. `q`, `u`: latent parameter and initial
-        state, shapes (m,) and (n,).
+        It is zero if `given`, as a user gave it, defines no values at the new nodes.
         """
         coarse = self.prolong(u[None])[0]
-        if moment is None:
-            return np.zeros_like(coarse)
         if self.model.form_initial is not None:
             return np.asarray(self.model.initial_state(self.unknowns @ q, moment) - coarse)
         if given is None or not _pointwise(given):
