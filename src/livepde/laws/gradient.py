@@ -201,9 +201,9 @@ def constant_parts(
     *,
     M_op: Any,
     N_op: Any,
-    nu: float,
-    sigma: float,
-    gate: ExcitationGate | None,
+    nu: float = 0.0,
+    sigma: float = 0.0,
+    gate: ExcitationGate | None = None,
 ) -> GradientParts:
     """Return the parts of a law with a constant gain."""
     _require_linear_readings(problem)
