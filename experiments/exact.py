@@ -38,7 +38,7 @@ from livepde.laws import (
     ResidualDamping,
     diffusion_operator,
 )
-from livepde.laws.damping_bounds import ExactBound
+from livepde.laws.damping import ExactBound
 from livepde.linalg import Array, Mask
 from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain

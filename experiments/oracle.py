@@ -16,7 +16,7 @@ import numpy as np
 import livepde as lp
 from experiments.failed_steps import FailedSteps
 from livepde.diagnostics import Errors, Spaces, TwinTracker, bounds, conditions, constants
-from livepde.laws.damping_bounds import (
+from livepde.laws.damping import (
     Constants,
     ExactBound,
     Norms,

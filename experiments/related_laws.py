@@ -21,10 +21,9 @@ import scipy.sparse as sp
 
 from livepde.errors import LawError
 from livepde.fem import Moment
-from livepde.laws.coupled import StageForms
+from livepde.laws.coupled.equation import StageForms
 from livepde.laws.damping import Damping, Residual
-from livepde.laws.gradient import GradientLaw, GradientState
-from livepde.laws.gradient_parts import GradientParts, constant_parts
+from livepde.laws.gradient import GradientLaw, GradientParts, GradientState, constant_parts
 from livepde.laws.law import Belief, Law, Problem, Report
 from livepde.linalg import Array
 from livepde.model import h1_form

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from livepde import petsc
 from livepde.errors import LivepdeError
 from livepde.laws.damping import ConstantDamping, ResidualDamping
-from livepde.laws.excitation_gate import ExcitationGate
+from livepde.laws.equation_tests import ExcitationGate
 from livepde.petsc.vectors import gathered
 
 COMM = MPI.COMM_WORLD

@@ -21,7 +21,7 @@ from livepde.cases.member_blocks import MemberBlock
 from livepde.cases.new_case import files_for
 from livepde.errors import CaseError, ConfigurationError, DataError, RunError
 from livepde.fleet import Fleet
-from livepde.laws import shadows
+from livepde.laws import shadow_kinds
 from livepde.models import EQUATIONS
 from livepde.streams import FillGaps
 from livepde.streams.clock import Clock
@@ -253,7 +253,7 @@ def test_a_step_in_two_rows_has_no_curvature(monkeypatch: pytest.MonkeyPatch) ->
     k = int(np.searchsorted(times, before))
     rows = np.insert(times, k, before), np.insert(whole, k, 0.0)
     assert shifted(*rows, "line")["input"] < 0.02
-    monkeypatch.setattr(shadows, "SHORT", 0.0)
+    monkeypatch.setattr(shadow_kinds, "SHORT", 0.0)
     assert shifted(*rows, "line")["input"] > 1.0  # that of a curve with this slope
 
 

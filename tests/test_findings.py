@@ -314,7 +314,7 @@ RUNS = {
     "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
     "verdict: step": Pair(partial(stepped, parts=2), stepped),
     "verdict: untested": Pair(partial(stepped, mesh=False, parts=1), stepped),
-    "step_ledger: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
+    "verdict: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
 }
 
 

@@ -12,7 +12,6 @@ from skfem import ElementTriP1
 import livepde as lp
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import (
-    BandedSolver,
     Choice,
     CholmodSolver,
     MultigridSolver,
@@ -135,21 +134,6 @@ def test_a_factor_is_made_again_once_it_has_cost_a_new_one(model):
 
 
 @pytest.mark.slow
-def test_a_factor_is_kept_while_the_process_rests():
-    """What corrections leave there is rounding, whose rate tells nothing."""
-    steady = square_at_rest()
-    forward, kept = Counted(steady), Kept.none()
-    c, directions = np.zeros((steady.X.dim, 3)), np.zeros((steady.Q.dim, 2))
-    c[:, 0] = 1.0
-    for k in range(6):
-        q = bump(steady, 1.0 + 0.1 * k)
-        c, kept = forward.advance(c, q, directions, H, lp.fem.Moment(H * (k + 1)), kept)
-        assert kept.spent == 0.0
-    assert forward.made == 1
-    np.testing.assert_allclose(c[:, 0], 1.0, atol=1e-12)
-
-
-@pytest.mark.slow
 def test_errors_are_small_beside_slow_changes():
     """A state that changes by 1e-8 of itself in a step is not left where it was."""
     mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
@@ -171,31 +155,6 @@ def test_errors_are_small_beside_slow_changes():
     assert forward.made == 1
     assert change < 1e-7 * np.linalg.norm(c[:, 0])
     assert np.linalg.norm(found[:, 0] - exact[:, 0]) < 2e-2 * change
-
-
-def square_at_rest():
-    """A constant state that no unknown moves."""
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (50, 50)).to_meshtri()
-    return lp.Model(
-        lp.Field(mesh, lp.linear(mesh)),
-        lp.Field(mesh, lp.linear(mesh)),
-        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
-
-
-def test_banded_factors_are_not_kept():
-    mesh = lp.interval(0.0, 1.0, 30)
-    model = lp.Model(
-        lp.Field(mesh, lp.linear(mesh)),
-        lp.Field(mesh, lp.linear(mesh)),
-        A=lambda q, u, v, x: q * u * v,
-        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    _, forward, kept = go(model, [bump(model, s) for s in (1.0, 1.1, 1.2)])
-    assert isinstance(forward.solver, BandedSolver)
-    assert forward.made == 3
-    assert not len(kept.q)
 
 
 ENGINES = {

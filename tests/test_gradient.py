@@ -19,16 +19,16 @@ from factories import (
     reaction,
     truth,
 )
-from skfem import ElementLineHermite, ElementLineP1, ElementQuad1, MeshQuad
+from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.fem import Moment
-from livepde.laws.coupled import CoupledStage, Metric, StageForms, StageProblem, StageTerms
 from livepde.laws.coupled import coupled_stage as stage_module
-from livepde.laws.coupled.bilinear import BilinearSolver
-from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.laws.coupled.coupled_stage import CoupledStage
+from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, StageTerms
+from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
 from livepde.model import h1_form
-from livepde.stepping import ForwardStage, Near, StepFailed
+from livepde.stepping import Near, StepFailed
 
 EXACT = lp.stepping.Newton(tolerance=1e-13, share=0.0)
 
@@ -71,27 +71,6 @@ def test_energy_never_grows(gain, damping):
     assert energy[0] > 1e-3
     assert np.diff(energy).max() <= 1e-13 * energy[0]
     assert energy[-1] < energy[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("gain", [1.0, 1e3, 1e5])
-def test_energy_of_the_papers_example(gain):
-    """Degenerate information: |q*| <= 0.00625, dying excitation, steps of 0.6."""
-
-    def q_exact(x):
-        return 0.025 * x[0] ** 2 - 0.025 * x[0]
-
-    def source(x, t):
-        return (np.pi**2 - 1 / (1 + t) + q_exact(x)) * np.sin(np.pi * x[0]) / (1 + t)
-
-    zero = {"boundary": 0.0}
-    model = reaction(line(30), ElementLineHermite(), f=source, q_dirichlet=zero)
-    times = 0.6 * np.arange(101)
-    q_true = model.initial_parameter(q_exact)
-    states = truth(model, q_true, lambda x: np.sin(np.pi * x[0]), times)
-    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(1.0), newton=EXACT)
-    energy = energies(model, law, q_true, states, times, u0=lambda x: 1.1 * np.sin(np.pi * x[0]))
-    assert np.diff(energy).max() <= 1e-13 * energy[0]
 
 
 @pytest.mark.slow
@@ -180,20 +159,6 @@ def test_order_in_time_of_the_coupled_step(scheme, order, resolved):
     steps = (20, 40, 80, 160)
     errors = [abs(partly_observed(scheme, n) - resolved).max() for n in steps]
     np.testing.assert_allclose(rates(errors), order, atol=0.15)
-
-
-@pytest.mark.slow
-def test_precomputed_products_do_not_change_the_numbers():
-    """A bilinear model, and the same one made to look time-dependent: two code paths."""
-    fast = partly_observed(lp.ImplicitEuler(), 10)
-    general = partly_observed(
-        lp.ImplicitEuler(), 10, A=lambda q, u, v, x: (1 + 0 * x.t) * q * u * v
-    )
-    curved = partly_observed(
-        lp.ImplicitEuler(), 10, A=lambda q, u, v, x: q * (u + 1e-13 * u**3) * v
-    )
-    np.testing.assert_allclose(general, fast, atol=1e-10)
-    np.testing.assert_allclose(curved, fast, atol=1e-10)
 
 
 def stage_of(model, split, rule, newton=EXACT, nu=0.0, **options):
@@ -320,20 +285,6 @@ def test_a_share_is_one_of_the_residual_that_the_prediction_had():
     found = solved(stage, problem, problem.c.copy, predicted)
     missed = dense.relative(predicted, *given)
     assert dense.relative(found, *given) <= 2 * min(0.03 * missed, newton.ceiling)
-
-
-@pytest.mark.slow
-def test_a_strict_tolerance_below_rounding_is_reached_as_far_as_numbers_go():
-    for seed in range(5):
-        stage, problem, dense, given = a_stage(
-            lp.laws.ResidualDamping(1.0),
-            gain=1e4,
-            size=1e4,
-            seed=seed,
-            newton=lp.stepping.Newton(1e-17),
-        )
-        y = solved(stage, problem, problem.c.copy)
-        assert dense.relative(y, *given) <= 1e-12
 
 
 @pytest.mark.slow
@@ -562,49 +513,3 @@ def test_checked_contract():
             lambda law, scheme=scheme: identifier(model, law, scheme=scheme, dt_max=0.08),
             samples,
         ).raise_if_failed()
-
-
-def free_stage(model, rule=None):
-    """Return a stage of a model without sensors, and its problem from c on."""
-    split = observe(model, lp.Full()).split(np.zeros(14, dtype=bool))
-    stage = stage_of(model, split, rule or lp.laws.ResidualDamping())
-
-    def problem(c, h=0.1):
-        return StageProblem(c, h, Moment(h), np.zeros(model.X.dim), Metric(1.0))
-
-    return stage, problem
-
-
-def test_forward_stage_agrees_with_the_coupled_stage_without_data():
-    model = excited(8)
-    stage, problem = free_stage(model)
-    rng = np.random.default_rng(1)
-    c = rng.standard_normal(model.X.dim + model.Q.dim)
-    c[: model.X.dim] *= model.X.free
-    y = solved(stage, problem(c), c.copy)
-    u = ForwardStage(model).solve(c[: model.X.dim], c[model.X.dim :], 0.1, Moment(0.1))
-    np.testing.assert_allclose(y[: model.X.dim], u, atol=1e-9)
-    np.testing.assert_allclose(y[model.X.dim :], c[model.X.dim :], atol=1e-9)
-
-
-def test_a_stage_that_cannot_converge():
-    model = excited(8)
-    stage, problem = free_stage(model)
-    c = np.full(model.X.dim + model.Q.dim, np.nan)
-    with pytest.raises(StepFailed) as caught:
-        stage.solve(problem(c), c.copy)
-    assert caught.value.code == "not_finite"
-
-
-def test_a_model_in_the_plane_is_identified():
-    mesh = MeshQuad().refined(3)
-    model = reaction(mesh, ElementQuad1(), f=lambda x, t: 20 * (1 + np.sin(3 * t) * x[0] + x[1]))
-    q_true = model.initial_parameter(lambda x: 1 + 2 * x[0] * x[1])
-    times = 0.1 * np.arange(60)
-    states = truth(model, q_true, 0.0, times)
-    ident = identifier(model, lp.GradientLaw(gain=1e4))
-    for t, u in zip(times[1:], states[1:], strict=True):
-        estimate = ident.step(t, ident.observed.G @ u)
-    mass = model.parameter_mass
-    error = estimate.q - q_true
-    assert np.sqrt(error @ mass @ error / (q_true @ mass @ q_true)) < 0.1

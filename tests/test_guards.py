@@ -11,7 +11,7 @@ from factories import driven_rod, filter_alone, observe, readings
 from skfem import ElementLineP1
 
 import livepde as lp
-from livepde.laws.excitation_gate import ExcitationLevel, Probes, pairs
+from livepde.laws.equation_tests import ExcitationLevel, Probes, pairs
 from livepde.laws.history import added, empty_log, opened
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import Scale
@@ -136,17 +136,6 @@ def test_an_estimate_that_ran_away_comes_back(size: float, length: int):
     assert found[-1].parameters["q"][1] < 0.5
 
 
-@pytest.mark.long
-def test_what_guards_did_is_said():
-    model = explosive()
-    stream = [(t, z + 3.0 * (60 <= k < 70)) for k, (t, z) in enumerate(samples(model, 2.0, 80))]
-    law = filter_alone(drift=0.1, gate=np.inf)
-    identifier = lp.Identifier(model, POINTS, law, u0=0.0)
-    said = " ".join(doubts(identifier.run(stream).to_xarray()))
-    assert "diverged and was restarted" in said
-    assert "used with increased noise" in said
-
-
 @pytest.mark.slow
 def test_a_failure_that_nothing_helps_against_is_a_status():
     """An input that no state can follow: the same status and estimate as without guards."""
@@ -254,27 +243,6 @@ def test_a_prediction_runs_away_beyond_all_that_was_seen():
     assert scale.beyond(np.array([[np.nan, 2.0]]), np.array([[0.1, 0.001]])) == 25.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("gain", [1.0, 1e4])
-def test_a_gain_too_large_for_the_noise_is_said(gain: float):
-    ends = {"left": lambda x, t: 1 + np.sin(t) + 0.0 * x[0], "right": 1.0}
-    model = lp.Model(
-        lp.Field(MESH, ElementLineP1(), dirichlet=ends),
-        {"c": lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.Normal(1.0))},
-        A=lambda q, u, v, x: q.c * u * v,
-        B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-    rng, forward, u = np.random.default_rng(0), ForwardStage(model), model.initial(0.0)
-    q = model.initial_parameter({"c": lambda x: 2 + np.sin(np.pi * x[0])})
-    identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=gain), u0=0.0)
-    stream = []
-    for t0, t1 in pairwise((0.05 * np.arange(301)).tolist()):
-        u = forward.solve(u, q, t1 - t0, lp.fem.Moment(t1))
-        stream.append((t1, (u + 0.01 * rng.standard_normal(len(u)))[model.X.free > 0]))
-    said = doubts(identifier.run(stream).to_xarray())
-    assert any("the gain is too large for the noise" in s for s in said) == (gain > 1.0)
-
-
 def reaction(drive: Any) -> lp.Model:
     """u_t - 0.3 u_xx + c u = 0 between ends that a function of time drives."""
     ends = {
@@ -327,21 +295,6 @@ def test_at_rest_the_unknowns_stay_where_noise_would_carry_them_away(sigma: floa
 
 
 @pytest.mark.slow
-def test_a_rest_without_the_gate_loses_what_was_learned():
-    """Relative errors against the truth: at the start of the rest, and after 30 s of it."""
-    model = reaction(lambda t: 1.0 * (t < 20.0))
-    stream = list(full(model, 1000))
-
-    def error(c: Any) -> float:
-        true = 2 + np.sin(np.pi * c["x"].values)
-        return float(np.linalg.norm(c.values - true) / np.linalg.norm(true))
-
-    held, free = (learned(model, stream, **o)["c"] for o in ({}, {"gate": None}))
-    assert error(held[-1]) < 1.2 * error(held[399])
-    assert error(free[-1]) > 7.0 * error(held[-1])
-
-
-@pytest.mark.slow
 def test_the_law_goes_on_when_excitation_returns():
     model = reaction(lambda t: 1.0 * (t < 2.0 or t > 20.0))
     data = learned(model, full(model, 1000), gain=1.0)
@@ -352,16 +305,6 @@ def test_the_law_goes_on_when_excitation_returns():
     before, after = (float(np.abs(data["c"][k].values - true).max()) for k in (399, -1))
     assert after < 0.6 * before
     assert any("samples, last at t = 20" in s for s in doubts(data))
-
-
-@pytest.mark.long
-def test_a_process_faster_than_the_samples_is_not_at_rest():
-    values = np.random.default_rng(1).standard_normal(700)
-    fast = learned(m := reaction(lambda t: values[round(t / 2.0)]), full(m, 600, h=2.0))
-    assert not holds(fast).any()
-    later = lambda t: 1.0 if t < 200.0 else values[round(t / 2.0)]  # noqa: E731
-    late = learned(m := reaction(later), full(m, 600, h=2.0))
-    assert not holds(late).any()
 
 
 @pytest.mark.slow
@@ -441,22 +384,6 @@ def test_exact_exciting_data_after_a_large_transient_are_never_held(gain, sensor
     assert last.correlation < 0.5  # this, it would be held
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("gain", [1.0, 1e4])
-@pytest.mark.parametrize("c1", [0.1, 1.0])
-def test_noise_at_rest_is_held_whatever_the_gain(gain, c1):
-    model = reaction(lambda t: 1.0 * (t < 50.0))
-    law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
-    identifier = lp.Identifier(model, lp.Full(), law, u0=0.0)
-    held = [
-        not np.isnan(identifier.step(*sample).diagnostics.at_rest)
-        for sample in full(model, 400, h=0.5)
-    ]
-    first = held.index(True)
-    assert 100 < first < 300
-    assert all(held[first:])
-
-
 def test_probes_see_the_same_by_assembly_in_every_unit():
     model = reaction(lambda t: 1.0)
     split = observe(model, lp.Full()).split()
@@ -469,21 +396,6 @@ def test_probes_see_the_same_by_assembly_in_every_unit():
     probes.fixed, probes.pairs = None, pairs(model, split)
     np.testing.assert_allclose(probes(w, q, lp.fem.Moment(0.0)), seen, rtol=1e-10)
     np.testing.assert_allclose([e @ model.Q.dual(e) for e in probes.pairs[1].T], 1.0)
-
-
-@pytest.mark.slow
-def test_a_rest_goes_through_a_checkpoint(tmp_path: Any):
-    model = reaction(lambda t: 1.0 * (t < 5.0))
-    stream = list(full(model, 300))
-    identifier = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
-    for t, z in stream[:150]:
-        identifier.step(t, z)
-    identifier.save(tmp_path / "rest.bin")
-    again = lp.Identifier(model, lp.Full(), lp.GradientLaw(gain=100.0), u0=0.0)
-    again.load(tmp_path / "rest.bin")
-    pairs = [(identifier.step(t, z), again.step(t, z)) for t, z in stream[150:]]
-    assert any(one.diagnostics.at_rest == 1.0 for one, _ in pairs)
-    assert all(one.diagnostics.named() == other.diagnostics.named() for one, other in pairs)
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,10 @@ from skfem import ElementLineP1, ElementLineP2
 import livepde as lp
 from benchmarks import scale
 from livepde.errors import LawError
-from livepde.laws.coupled import StageForms
-from livepde.laws.information import InformationMetric, trace_probes
-from livepde.laws.normal_equations import diagonal_bound
-from livepde.laws.sample_smoothing import Balance, NoiseDetector
-from livepde.reproduce import seed, seed_excited
+from livepde.laws.coupled.equation import StageForms
+from livepde.laws.information import InformationMetric, diagonal_bound, trace_probes
+from livepde.laws.observed_part import Balance, NoiseDetector
+from livepde.reproduce import seed
 from livepde.streams import Twin
 
 AUTO = lp.GradientLaw(gain="auto")
@@ -108,26 +107,6 @@ def test_seed_reaches_its_floor_without_a_gain() -> None:
     assert errors[20] <= 0.06  # and it was there at t = 12: kept while the excitation dies
 
 
-@pytest.mark.slow
-def test_excited_twin_with_exact_data() -> None:
-    model, full = seed_excited.build()
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=full,
-        times=seed_excited.TIMES[:201],
-        q_true=seed_excited.q_true,
-        u_true=seed_excited.u_true,
-    )
-    identifier = lp.Identifier(model, full, AUTO, q0=0.0, u0=lambda x: seed_excited.u_true(x, 0.0))
-    for s in twin:
-        estimate = identifier.step(s.t, s.z)
-    assert twin.error(estimate.q) <= 0.005
-    assert (
-        0.1 < estimate.diagnostics.departure < 0.6
-    )  # H1 is rough, and its q is smooth: as expected
-
-
 @cache
 def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[str, float]]:
     return run(*rod(), **dict(options))[1:]
@@ -183,18 +162,6 @@ def test_what_a_right_model_may_do_is_no_departure() -> None:
         assert learning.departure(twice, q0 + 20.0 * once) == pytest.approx(far)
 
 
-@pytest.mark.slow
-def test_what_has_faded_was_told_all_the_same() -> None:
-    model, twin = rod()
-    law, seen = AUTO, twin.observation
-    identifier = lp.Identifier(model, seen, law, q0=0.0, u0=0.0)
-    for sample in twin:
-        found = identifier.step(sample.t, sample.z).diagnostics
-    learned = identifier._state.metric
-    assert learned.given == pytest.approx(2.0 * learned.total.sum(), rel=0.2)  # J weighs by t/T
-    assert found.information == learned.total.sum() / learned.spread
-
-
 @pytest.mark.long
 def test_the_weight_of_noisy_data_does_not_depend_on_the_sampling_rate() -> None:
     # Noise of one spectral density: a deviation that grows with the root of the rate.
@@ -245,12 +212,6 @@ def test_exact_data_are_not_smoothed() -> None:
         assert max(alphas) == 0.0
 
 
-@pytest.mark.long
-def test_more_noise_less_weight_on_the_data() -> None:
-    found = [run(*rod(), noise=noise)[2].information for noise in (0.0, 0.01, 0.03, 0.1)]
-    assert found == sorted(found, reverse=True)
-
-
 @pytest.mark.slow
 def test_what_was_learned_stays_without_excitation() -> None:
     mesh = lp.interval(0, 1, 20)
@@ -280,18 +241,6 @@ def test_what_was_learned_stays_without_excitation() -> None:
     assert errors[-1] <= 1.5 * errors[40]  # at t = 20 there is nothing but noise
 
 
-@pytest.mark.slow
-def test_a_gap_and_partial_sensors() -> None:
-    model, twin = rod(observation=lp.Subdomain(lambda x: x[0] > 0.4))
-    identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
-    for k, s in enumerate(twin):
-        z = s.z.copy()
-        z[: 3 if k % 2 else 0] = np.nan
-        estimate = identifier.step(s.t, z)
-        assert estimate.status.ok
-    assert twin.error(estimate.q) <= 0.6
-
-
 def test_averages_of_a_diffusivity_are_refused() -> None:
     mesh = lp.interval(0, 1, 20)
     model = lp.Model(
@@ -303,33 +252,6 @@ def test_averages_of_a_diffusivity_are_refused() -> None:
     sensors = lp.Averages({"a": lambda x: x[0] < 0.5, "b": lambda x: x[0] > 0.5})
     with pytest.raises(LawError, match="use SensitivityLaw"):
         lp.Identifier(model, sensors, AUTO, u0=0.0)
-
-
-@pytest.mark.slow
-def test_a_run_can_be_saved_and_continued(tmp_path) -> None:
-    model, twin = rod()
-    samples = list(twin)
-    whole = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
-    for s in samples[:40]:
-        whole.step(s.t, s.z)
-    whole.save(tmp_path / "state.bin")
-    other = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0)
-    other.load(tmp_path / "state.bin")
-    for s in samples[40:60]:
-        one, two = whole.step(s.t, s.z), other.step(s.t, s.z)
-    assert np.array_equal(one.q, two.q)
-
-
-@pytest.mark.slow
-def test_divided_steps_learn_the_same() -> None:
-    errors = []
-    for dt_max in (np.inf, 0.05):
-        model, twin = rod(dt_max=dt_max)
-        identifier = lp.Identifier(model, twin.observation, AUTO, q0=0.0, u0=0.0, dt_max=dt_max)
-        for s in twin:
-            estimate = identifier.step(s.t, s.z)
-        errors.append(twin.error(estimate.q))
-    assert max(errors) <= 0.02
 
 
 def test_what_cannot_be_is_one_sentence() -> None:

@@ -9,8 +9,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
-from livepde.cases.preview import StatedNoise
-from livepde.laws.input_noise import ROWS
+from livepde.laws.noise_rows import ROWS
 from livepde.stepping import Alexander2, ImplicitEuler
 
 H, STEPS = 0.01, 40
@@ -79,67 +78,6 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     assert ratio[1] == pytest.approx(1.0, rel=tolerance)
     near = 1.0 if flux or isinstance(scheme, ImplicitEuler) else 1.25
     assert 1.0 - tolerance <= ratio[0] <= near + tolerance
-
-
-@pytest.mark.slow
-def test_a_model_that_is_not_linear_has_it_too():
-    model, noise = rod(std=1e-9, cube=5.0), 1e-3
-    inputs = np.array([channel(k) for k in range(6)])
-    known = states(model, inputs, ImplicitEuler())
-    square = 0.0
-    for k in range(1, 6):
-        off = inputs.copy()
-        off[k] += noise
-        square = square + (states(model, off, ImplicitEuler()) - known) ** 2
-    one = lp.Identifier(
-        model,
-        lp.Points(SENSORS, noise=1.0),
-        lp.SensitivityLaw(shadows=None),
-        u0=0.0,
-        scheme=ImplicitEuler(),
-        halvings=0,
-        input_noise={"left": noise},
-    )
-    for k, value in enumerate(inputs):
-        one.step(H * k, {"left": value})
-    factor = one.observed.G @ one.latent_belief().u_factor
-    assert np.sqrt((factor**2).sum(axis=1)) == pytest.approx(np.sqrt(square), rel=0.01)
-
-
-def truth(seed: int, noise: float, sensor: float) -> tuple[float, list[tuple[float, dict]]]:
-    """Return k from the prior, and what a rod with a noisy boundary channel shows."""
-    rng = np.random.default_rng(seed)
-    k = 1.0 + 0.3 * float(np.clip(rng.standard_normal(), -2.0, 2.0))
-    inputs = [channel(j) for j in range(STEPS + 1)]
-    one = lp.Identifier(rod(), lp.Points(SENSORS, noise=1.0), filter_alone(), u0=0.0, q0={"k": k})
-    samples = []
-    for j, value in enumerate(inputs):
-        one.step(H * j, {"left": value})
-        belief = one.latent_belief()
-        z = one.observed.predict(belief.u, belief.q, None) + sensor * rng.standard_normal(2)
-        read = {"left": value + noise * rng.standard_normal()}
-        samples.append((H * j, {**dict(zip(SENSORS, z.tolist(), strict=True)), **read}))
-    return k, samples
-
-
-@pytest.mark.study
-def test_an_interval_with_the_noise_of_the_boundary_holds():
-    inside = {True: 0, False: 0}
-    for seed in range(20):
-        k, samples = truth(seed, 0.1, 0.01)
-        for stated in inside:
-            one = lp.Identifier(
-                rod(),
-                lp.Points(SENSORS, noise=0.01),
-                StatedNoise(),
-                u0=0.0,
-                input_noise={"left": 0.1} if stated else None,
-            )
-            belief = one.run(samples).last.belief
-            std = np.sqrt((belief.q_factor[0] ** 2).sum())
-            inside[stated] += abs(belief.q[0] - k) < 1.96 * std
-    assert inside[True] >= 18
-    assert inside[False] <= 12
 
 
 # --- initial states ----------------------------------------------------------------------------
@@ -295,17 +233,3 @@ def test_members_of_a_fleet_start_from_readings_of_their_own():
     for j, one in enumerate(each):
         assert found.q[j] == pytest.approx(one.belief.q, rel=1e-9)
         assert found.q_std[j] == pytest.approx(one.belief.q_std, rel=1e-9)
-
-
-@pytest.mark.slow
-def test_a_fleet_steps_as_its_members_do():
-    model, points = rod(), lp.Points(SENSORS, noise=0.01)
-    options = {"u0": 0.0, "input_noise": {"left": 0.1}}
-    fleet = lp.Fleet(model, points, lp.SensitivityLaw(), 2, **options)
-    ones = [lp.Identifier(model, points, lp.SensitivityLaw(), **options) for _ in range(2)]
-    assert fleet.together
-    for k in range(8):
-        z = {"T_1": np.array([0.1, 0.2]) * k, "T_5": np.zeros(2), "left": np.array([1.0, 1.1])}
-        found = fleet.step(H * k, z)
-        each = [one.step(H * k, {n: v[j] for n, v in z.items()}) for j, one in enumerate(ones)]
-    assert np.asarray(found.q)[:, 0] == pytest.approx([one.belief.q[0] for one in each], rel=1e-9)

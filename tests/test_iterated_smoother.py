@@ -66,21 +66,6 @@ def test_nothing_changes_where_all_is_linear(evolution):
         np.testing.assert_allclose(other.u, one.u, rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.slow
-def test_a_poor_prior_leaves_no_error_behind():
-    """From priors far off on both sides the estimate is the same, within what is left uncertain."""
-    found = []
-    for mean in (0.02, 0.5):
-        model = heat(lp.interval(0.0, 1.0, 16), lp.LogNormal(mean, 0.5 * mean))
-        start = lambda x: np.sin(2.0 * np.pi * x[0])  # noqa: E731
-        right = heat(lp.interval(0.0, 1.0, 16), lp.Normal(0.1, 0.1))
-        samples = readings(right, [0.1], start)
-        end = ends(model, lp.SensitivityLaw(), samples, start)[-1]
-        found.append(end.parameters["alpha"])
-    (low, std), (high, _) = found
-    assert abs(high - low) < 0.25 * std
-
-
 @pytest.mark.long
 def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     begun, descended = [], iterated_smoother._descended
@@ -98,33 +83,6 @@ def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
     assert len(begun) >= 6
     assert all(end <= first for first, end in begun)
     assert any(end < first - 1.0 for first, end in begun)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("explained", [True, False])
-def test_one_beginning_serves_where_all_is_linear_and_explained(monkeypatch, explained):
-    begun = []
-    descended = iterated_smoother._descended
-
-    def watched(samples, best):
-        begun[-1] += 1
-        return descended(samples, best)
-
-    smoothed = iterated_smoother.iterated_smoother
-
-    def counted(samples):
-        begun.append(0)
-        return smoothed(samples)
-
-    monkeypatch.setattr(iterated_smoother, "_descended", watched)
-    monkeypatch.setattr(iterated_smoother, "iterated_smoother", counted)
-    model = sourced()
-    samples = list(readings(model, [1.5]))
-    if not explained:  # a bias of ten standard deviations, which no source makes
-        samples = [(t, z + np.array([0.2, -0.2, 0.2])) for t, z in samples]
-    ends(model, lp.SensitivityLaw(**FADING, shadows=None, gate=np.inf), samples)
-    assert begun
-    assert max(begun) == 1 if explained else max(begun) == 3
 
 
 @pytest.mark.slow
@@ -190,28 +148,6 @@ def test_a_settled_run_iterates_no_more():
     moved = [not np.isnan(estimate.diagnostics.smoother_moved) for estimate in found]
     assert any(moved[:16])
     assert not any(moved[32:])
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_a_start_ends_where_the_linearisation_holds(monkeypatch, seed):
-    """A rod with two conductivities is through after few samples, and costs few steps till then."""
-    taken, assimilate = [], iterated_smoother.assimilate
-    monkeypatch.setattr(
-        iterated_smoother, "assimilate", lambda *args: taken.append(1) or assimilate(*args)
-    )
-    layers = {"k_0": lambda x: x[0] < 0.5, "k_1": lambda x: x[0] >= 0.5}
-    model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP1(), dirichlet={"boundary": 0.0}),
-        {"k": lp.Piecewise(layers, lp.Normal(1.0, 0.2))},
-        A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
-        f=10.0,
-    )
-    found = ends(model, lp.SensitivityLaw(**FADING), readings(model, [1.2, 0.8], seed=seed))
-    moved = [np.nan_to_num(estimate.diagnostics.smoother_moved) for estimate in found]
-    assert max(moved[:16]) > 0.0
-    assert not any(moved[32:])
-    assert len(taken) <= 2 * len(found)
 
 
 @pytest.mark.slow

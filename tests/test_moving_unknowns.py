@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from factories import advanced, driven_rod, line, observe, readings
+from factories import advanced, observe
 from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
@@ -263,27 +263,6 @@ def test_a_nonlinear_initial_state_is_linearised_anew(refit: Any, first: bool):
         estimate = identifier.step(0.1 * k, identifier.observed.G @ u)
     value, std = estimate.parameters["u0"]
     assert abs(value - 5.0) < std < 0.01
-
-
-@pytest.mark.long
-def test_a_periodic_unknown_is_found_with_its_phase():
-    def a(t: float) -> float:
-        return float(0.3 + 0.2 * np.cos(2 * np.pi * t / 10.0 + 0.4))
-
-    def rod(unknown: lp.fem.Unknown) -> lp.Model:
-        return driven_rod({"a": unknown}, lambda t: np.sin(3.0 * t), line(20))
-
-    model = rod(lp.Scalar(lp.Normal(0.2, 0.2), evolution=lp.fem.Periodic(10.0)))
-    points = lp.Points(SENSORS, noise=0.01)
-    law = lp.SensitivityLaw(shadows=None)
-    identifier = lp.Identifier(model, points, law)
-    errors = []
-    for t, z in readings(rod(lp.Normal(1.0)), points, a, np.arange(0.0, 20.0, 0.05), 0.01):
-        value, std = identifier.step(t, z).parameters["a"]
-        errors.append([value - a(t), std])
-    late = np.array(errors[200:])
-    assert np.sqrt((late[:, 0] ** 2).mean()) < 0.002
-    assert np.sqrt(((late[:, 0] / late[:, 1]) ** 2).mean()) < 2.0
 
 
 @pytest.mark.slow

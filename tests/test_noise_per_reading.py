@@ -181,20 +181,6 @@ def test_a_withheld_reading_may_have_noise_and_is_scored_all_the_same():
 
 
 @pytest.mark.slow
-def test_a_checkpoint_keeps_the_noise_of_stored_readings(tmp_path):
-    """Of those that an iterated start or a refit takes again."""
-    for law in (lp.SensitivityLaw(), lp.SensitivityLaw()):
-        one, two = identifier(law), identifier(law)
-        for k, (t, z, std) in enumerate(stream()):
-            if k == 11:
-                one.save(tmp_path / "state.bin")
-                two.load(tmp_path / "state.bin")
-            last = one.step(t, np.column_stack([z, std]))
-            again = two.step(t, np.column_stack([z, std])) if k >= 11 else None
-        assert same(last, again)
-
-
-@pytest.mark.slow
 def test_a_journal_keeps_noise_and_a_run_goes_on_with_it(tmp_path):
     samples = [
         lp.Sample(t, np.column_stack([z, std]) if k % 3 else z)

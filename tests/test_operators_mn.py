@@ -13,8 +13,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from experiments import degenerate
-from livepde.laws.coupled.split_forms import StageForms
-from livepde.laws.diffusion_operators import diffusion_operator
+from livepde.laws.coupled.equation import StageForms
+from livepde.laws.damping import diffusion_operator
 from livepde.runs.outcome import Outcome
 from livepde.stepping import Advance, ImplicitEuler
 

@@ -16,7 +16,7 @@ from benchmarks.honest.linear import diffusion, fine_times
 from livepde.cases import load
 from livepde.cli import app
 from livepde.fleet import Fleet
-from livepde.laws.pauses import InputHistory, pauses
+from livepde.laws.filter_state import InputHistory, pauses
 from livepde.runs import sampling_findings
 from livepde.stepping import Span
 from livepde.streams.sampling import clock_leaps, unit_factor
@@ -241,36 +241,6 @@ def test_the_law_and_the_report_have_the_same_pauses(seed: int) -> None:
         found += [k + 1] if history.pause[0] else []
     assert found == pauses(times)
     assert found
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shadows", [None, lp.laws.Shadows()])
-def test_a_run_goes_on_to_the_bit_before_and_after_a_pause(shadows: Any) -> None:
-    rows = samples()
-    whole = identifier(shadows=shadows)
-    for cut in (59, 60, 61):
-        first, second = identifier(shadows=shadows), identifier(shadows=shadows)
-        for t, z in rows[:cut]:
-            first.step(t, z)
-        second.restore(first.dump())
-        for t, z in rows[cut:]:
-            second.step(t, z)
-        if cut == 59:
-            for t, z in rows:
-                whole.step(t, z)
-        assert second.dump() == whole.dump()
-
-
-@pytest.mark.slow
-def test_a_member_of_a_fleet_has_the_pause_of_a_single_run() -> None:
-    single, fleet = identifier(), Fleet(*parts(), members=["a", "b"], u0=20.0)
-    for t, z in samples():
-        one = single.step(t, z)
-        off = {"T_2": 0.01}
-        both = {name: [value, value + off.get(name, 0.0)] for name, value in z.items()}
-        found = fleet.step(t, both)
-    np.testing.assert_allclose(found.q[0], one.q, rtol=1e-9)
-    assert found.q[0] != found.q[1]
 
 
 @pytest.mark.slow

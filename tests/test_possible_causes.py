@@ -66,7 +66,7 @@ def test_refusals_count_no_longer_once_a_fit_of_all_readings_has_converged(conve
     fit = Fit(samples=50, cost=1.0, passes=2.0, readings=100, refused=0, converged=converged)
     other = Finding("stuck", "do not trust", "It is stuck.")
     verdict = Verdict.of([Finding("refused", "caution", "Many were refused."), other])
-    found = after_fit(lambda: verdict, fit)()
+    found = after_fit(verdict, fit)
     assert len(found.findings) == kept
     assert found.level == "do not trust"
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from experiments import reference
-from experiments.reference import Discretisation, LineSpace, Step, fitted, run
-from experiments.reference_settings import FULL, PAPER, SETTINGS, TWIN, VARYING, scaled
+from experiments.reference import Discretisation, Step, fitted, run
+from experiments.reference_settings import FULL, PAPER, SETTINGS, TWIN, scaled
 
 UNEVEN = np.array([0.0, 0.08, 0.2, 0.3, 0.45, 0.6, 0.7, 0.87, 0.95, 1.0])
 SHORT = replace(PAPER, steps=12)
@@ -81,33 +81,6 @@ def test_it_imports_numpy_and_the_standard_library_only():
     assert {m.partition(".")[0] for m in modules} - set(sys.stdlib_module_names) == {"numpy"}
 
 
-def test_hermite_functions_are_those_of_section_4():
-    N = 6
-    nodes = np.linspace(0, 1, N)
-    h, x = nodes[1], np.linspace(0.001, 0.999, 77)
-    values = LineSpace(nodes, "hermite", "clamped").basis(x)
-    assert values.shape == (len(x), 2 * (N - 2))
-    for j in range(1, N - 1):
-        left, right = (x - nodes[j - 1]) / h, (x - nodes[j]) / h
-        on_left, on_right = (left > 0) & (right <= 0), (right > 0) & (right < 1)
-        phi = on_left * (3 * left**2 - 2 * left**3) + on_right * (1 - 3 * right**2 + 2 * right**3)
-        psi = on_left * h * (left**3 - left**2) + on_right * h * (right**3 - 2 * right**2 + right)
-        np.testing.assert_allclose(values[:, 2 * j - 2], phi, atol=1e-14)
-        np.testing.assert_allclose(values[:, 2 * j - 1], psi, atol=1e-14)
-
-
-@pytest.mark.parametrize(("kind", "order"), [("P1", 2), ("hermite", 4)])
-def test_interpolants_converge(kind, order):
-    x = np.linspace(0, 1, 1001)
-    errors = []
-    for cells in (10, 20, 40):
-        s = np.linspace(0, 1, cells + 1)
-        space = LineSpace(s + 0.1 * np.sin(2 * np.pi * s), kind, "free")
-        found = space.basis(x) @ space.interpolate(lambda x: np.exp(np.sin(3 * x)))
-        errors.append(abs(found - np.exp(np.sin(3 * x))).max())
-    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.25)
-
-
 @pytest.mark.parametrize(("kind", "order"), [("P1", 2), ("hermite", 4)])
 def test_true_states_converge_in_space(kind, order):
     """One step of implicit Euler that is long enough for -u'' + q u = f."""
@@ -118,43 +91,6 @@ def test_true_states_converge_in_space(kind, order):
         _, states, _ = reference.truth(at, np.array([0.0, 1e12]))
         errors.append(np.sqrt(at.weights @ (at.v @ states[1] - np.sin(np.pi * at.x)) ** 2))
     np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), order, atol=0.25)
-
-
-@pytest.mark.parametrize("cut", [False, True])
-def test_five_points_are_exact_for_products_of_three_cubics(cut):
-    five, nine = (
-        Discretisation(
-            replace(PAPER, nodes=UNEVEN - 0.04 * np.sin(np.pi * UNEVEN), cut=cut, points=n)
-        )
-        for n in (5, 9)
-    )
-    u = np.random.default_rng(1).normal(size=len(five.X.free))
-    for name in ("M", "M_in", "B_in", "B_out", "M_op", "N_op", "G_Q"):
-        np.testing.assert_allclose(getattr(five, name), getattr(nine, name), atol=1e-11)
-    for inside in (1, -1):
-        parts = [at.A((inside * (at.inside - 0.5) > 0) * (at.v @ u)) for at in (five, nine)]
-        np.testing.assert_allclose(*parts, atol=1e-13)
-
-
-def test_spaces_fix_what_their_ends_say():
-    sizes = {
-        (kind, ends): len(LineSpace(UNEVEN, kind, ends).free)
-        for kind in ("constant", "P1", "hermite")
-        for ends in ("free", "zero", "clamped")
-    }
-    n = len(UNEVEN)
-    assert {sizes["constant", ends] for ends in ("free", "zero", "clamped")} == {1}
-    assert [sizes["P1", e] for e in ("free", "zero", "clamped")] == [n, n - 2, n - 2]
-    assert [sizes["hermite", e] for e in ("free", "zero", "clamped")] == [
-        2 * n,
-        2 * n - 2,
-        2 * n - 4,
-    ]
-    space = LineSpace(UNEVEN, "hermite", "zero")
-    extended = space.extend(space.interpolate(lambda x: x * (1 - x) + 7))
-    np.testing.assert_allclose(extended[1::2], 1 - 2 * UNEVEN, atol=1e-14)
-    assert extended[0] == extended[-2] == 0
-    assert extended[2] == pytest.approx(UNEVEN[1] * (1 - UNEVEN[1]) + 7)
 
 
 # --- splitting, norms and adjoints ---------------------------------------------------------------
@@ -177,39 +113,6 @@ def test_omega_is_what_the_splitting_says(nodes, cut, measured):
     assert weights @ at.x[at.inside] == pytest.approx((measured[1] ** 2 - measured[0] ** 2) / 2)
 
 
-def test_parts_add_up_to_the_whole():
-    whole, split = (Discretisation(replace(VARYING, omega=omega)) for omega in ((0, 1), (0.3, 1.0)))
-    np.testing.assert_allclose(split.B_in + split.B_out, whole.B_in, atol=1e-12)
-    np.testing.assert_allclose(split.M_op + split.N_op, whole.M_op, atol=1e-12)
-    assert not whole.B_out.any()
-    assert not whole.N_op.any()
-    assert list(whole.observed) == list(range(len(whole.X.free)))
-
-
-def test_data_are_on_the_closure_of_omega():
-    found = run(replace(SHORT, nodes=UNEVEN, cut=False))
-    seen = np.flatnonzero(found.Z.any(axis=0)) // 2
-    assert set(UNEVEN[seen]) == {0.3, 0.45, 0.6, 0.7, 0.87}
-    assert list(found.at.X.free[found.at.observed]) == [
-        i for j in range(3, 8) for i in (2 * j, 2 * j + 1)
-    ]
-
-
-@pytest.mark.parametrize("gain", [1.0, 1e4])
-def test_update_of_q_is_the_adjoint(gain):
-    """(A(w)* r, xi)_Q = (r, A(w) xi)_X with the inner product of Q scaled by 1/gain."""
-    found = run(replace(SHORT, gain=gain, nodes=UNEVEN))
-    at, step = found.at, step_of(found, 5)
-    u, q = found.U[5, at.X.free], found.Q[5, at.Q.free]
-    rate = (q - step.q_old) / at.setting.h
-    for xi in np.random.default_rng(2).normal(size=(5, len(q))):
-        in_Q = rate @ at.G_Q @ xi / gain
-        in_X = product(
-            at, at.inside * (at.v @ (u - step.u_alpha)), (at.v @ step.u_alpha) * (at.xi @ xi)
-        )
-        assert in_Q == pytest.approx(in_X, rel=1e-9)
-
-
 @pytest.mark.parametrize("nodes", [16, 31, 61, 121])
 def test_strong_norm_of_the_unobserved_part_does_not_depend_on_the_mesh(nodes):
     at = Discretisation(replace(PAPER, nodes=nodes))
@@ -220,43 +123,7 @@ def test_strong_norm_of_the_unobserved_part_does_not_depend_on_the_mesh(nodes):
     assert at.V_hat(p) == pytest.approx(3.10, abs=0.01)
 
 
-def test_strong_norm_tends_to_its_formula_for_smooth_functions_of_omega():
-    def bump(x):
-        s = (x - 0.3) / 0.57
-        return np.where((x.real > 0.3) & (x.real < 0.87), (4 * s * (1 - s)) ** 4, 0)
-
-    norms = []
-    for nodes in (31, 61, 121):
-        at = Discretisation(replace(PAPER, nodes=nodes))
-        r = at.X.interpolate(bump)
-        strong = at.v @ r - at.X.basis(at.x, 2) @ r
-        norms.append(at.V_tilde(r) / np.sqrt(at.weights @ strong**2))
-    assert norms == sorted(norms)
-    assert norms[-1] == pytest.approx(1, abs=0.02)
-
-
-@pytest.mark.parametrize("nodes", [16, 31, 61])
-def test_Lipschitz_constant_is_at_most_one(nodes):
-    """||C(q*, u + v + w) - C(q*, u)||_X <= L_C (||v||_V~ + ||w||_V^), v in V~^inf, w in V^^inf."""
-    at = Discretisation(replace(PAPER, nodes=nodes))
-    q = at.xi @ at.Q.interpolate(PAPER.q_true)
-    for part, B, strong in ((at.inside, at.B_in, at.M_op), (~at.inside, at.B_out, at.N_op)):
-        within = np.flatnonzero(~at.v[~part].any(axis=0))
-        of = np.ix_(within, within)
-        C = (B + reference.form(at.v, at.weights * q, at.v))[of]
-        white = np.linalg.inv(np.linalg.cholesky(at.M[of]))
-        ratio = white @ C @ np.linalg.inv(strong[of]) @ np.linalg.inv(white)
-        assert np.linalg.norm(ratio, 2) <= 1
-
-
 # --- reconstruction ------------------------------------------------------------------------------
-
-
-def test_alpha_in_L2_divides_by_one_plus_alpha():
-    at = Discretisation(replace(PAPER, alpha=0.25))
-    z = np.zeros(len(at.X.free))
-    z[at.observed] = at.X.interpolate(lambda x: np.sin(3 * x))[at.observed]
-    np.testing.assert_allclose(at.reconstruct(z), z / 1.25, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("omega", [(0.0, 1.0), (0.3, 0.87)])
@@ -281,22 +148,6 @@ def test_reconstruction_minimises_Tikhonov(omega):
 
 
 # --- equations and solver ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rule", [{"c1": 2.0}, {"c1": 0.0, "mu": 0.3}, {"c1": 2.0, "mu": 0.3}])
-@pytest.mark.parametrize("nu", [0.0, 0.1])
-def test_jacobian_is_the_derivative(rule, nu):
-    found = run(replace(SHORT, nodes=UNEVEN, steps=3, nu=nu, **rule))
-    at, step = found.at, step_of(found, 2)
-    rng = np.random.default_rng(4)
-    r = found.U[2, at.X.free] - step.u_alpha + 0.01 * rng.normal(size=len(at.X.free))
-    direction, width = rng.normal(size=len(r)), 1e-6
-
-    def equation(r):
-        return sum(step.terms_u(r, step.q(r), step.theta(r)))
-
-    slope = (equation(r + width * direction) - equation(r - width * direction)) / (2 * width)
-    np.testing.assert_allclose(step.jacobian(r, None) @ direction, slope, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.long
@@ -340,19 +191,6 @@ def test_estimates_of_q_do_not_depend_on_the_size_of_the_state(size, error):
     one, other = (run(replace(scaled(s, error), steps=150)) for s in (1.0, size))
     np.testing.assert_allclose(one.Q, other.Q, atol=1e-9)
     np.testing.assert_allclose(one.U, other.U / size, atol=1e-9)
-
-
-def test_truth_is_a_solution():
-    for base in (SHORT, replace(TWIN, steps=12), replace(VARYING, steps=12, nu=0.0)):
-        found = run(replace(base, q0=base.q_true))
-        np.testing.assert_allclose(found.Q, np.tile(found.q_true, (13, 1)), atol=1e-8)
-        np.testing.assert_allclose(found.U, found.U_true, atol=1e-8)
-
-
-def test_sigma_alone_lets_q_fade():
-    found = run(replace(SHORT, q0=PAPER.q_true, sigma=0.5, gain=1e-12))
-    fading = (1 + 0.5 * PAPER.h) ** -np.arange(13.0)
-    np.testing.assert_allclose(found.Q, fading[:, None] * found.q_true, atol=1e-9)
 
 
 @pytest.mark.slow

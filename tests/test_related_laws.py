@@ -12,7 +12,8 @@ from skfem import ElementLineP1
 import livepde as lp
 from experiments.related_laws import BaumeisterLaw, KueglerLaw, _FormsAtEstimate, _Linear
 from experiments.relatives import EXPECTED, LAWS, law, relatives
-from livepde.laws.coupled import CoupledStage, Metric, StageProblem, StageTerms
+from livepde.laws.coupled.coupled_stage import CoupledStage
+from livepde.laws.coupled.equation import Metric, StageProblem, StageTerms
 from livepde.model import mass_form
 from livepde.stepping import Newton
 from livepde.streams import Twin
@@ -111,25 +112,6 @@ def test_kueglers_stage_solves_its_equations(B: Any) -> None:
     learned = model.Q.gram @ (q - c[n:]) / (gain * h) - A_in.T @ r
     assert np.abs(state * model.X.free).max() < 1e-10
     assert np.abs(learned * model.Q.free).max() < 1e-10
-
-
-@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
-@pytest.mark.parametrize("options", [{"gain": 0.0}, {"gain": np.inf}, {"mu": -1.0}, {"mu": np.nan}])
-def test_bad_weights(kind: Any, options: dict[str, float]) -> None:
-    with pytest.raises(lp.errors.LawError, match="must be a number"):
-        kind(**options)
-
-
-@pytest.mark.parametrize("kind", [BaumeisterLaw, KueglerLaw])
-def test_no_sensor_of_the_parameter(kind: Any) -> None:
-    model = lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 2), ElementLineP1()),
-        lp.Normal(1.0),
-        A=lambda q, u, v, x: q * u * v,
-    )
-    sensors = lp.Points([0.0, 0.5, 1.0], direct={"z0": lambda q, x: q})
-    with pytest.raises(lp.errors.LawError, match="sees a parameter directly: use SensitivityLaw"):
-        lp.Identifier(model, sensors, kind())
 
 
 @pytest.mark.study

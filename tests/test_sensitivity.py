@@ -8,8 +8,6 @@ from factories import excited, excited_q, excited_u, laplace, line, observe, tru
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
-from livepde.diagnostics import check_law
-from livepde.laws.innovations import Innovations
 
 
 def source_model(**options):
@@ -143,30 +141,6 @@ def test_drift_and_memory_follow_a_jump():
     assert tracking.q_std[0] > 0
 
 
-def drifting_std(drift, step, count, cells=20, parts=400):
-    """Return the standard deviation of k near 1 after samples, by a dense filter.
-
-    Finite differences for `conductivity`, and a k that moves at random at all times within a step,
-    with variance V' = drift (1 - V): both in parts of the step.
-    """
-    h, dt, size = 1 / cells, step / parts, cells - 1
-    L = (np.diag(-2 * np.ones(size)) + np.eye(size, k=1) + np.eye(size, k=-1)) / h**2
-    right, inverse = np.eye(size)[-1] / h**2, np.linalg.inv(np.eye(size) - dt * L)
-    G = np.eye(size + 1)[[round(place * cells) - 1 for place in (0.3, 0.7)]]
-    u, P = np.zeros(size), np.diag([*np.zeros(size), 1.0])  # of the state and of k
-    F = np.zeros((size + 1, size + 1))
-    F[:-1, :-1], F[-1, -1] = inverse, np.exp(-0.5 * drift * dt)
-    for k in range(1, count * parts + 1):
-        end = right * warm(k * dt)["T"]
-        u = inverse @ (u + dt * (end + 1.0))
-        F[:-1, -1] = inverse @ (dt * (L @ u + end))
-        P = F @ P @ F.T
-        P[-1, -1] += 1 - np.exp(-drift * dt)
-        if k % parts == 0:
-            P = P - P @ G.T @ np.linalg.solve(G @ P @ G.T + 1e-4 * np.eye(2), G @ P)
-    return np.sqrt(P[-1, -1])
-
-
 @pytest.mark.slow
 def test_uncertainty_returns_to_the_prior_with_drift_and_without_data():
     model = conductivity()
@@ -253,37 +227,6 @@ def test_a_sensor_that_sees_a_parameter():
     np.testing.assert_allclose(estimate.innovation, 0.0, atol=1e-3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("refit", "scheme"), [(None, lp.Alexander2()), (lp.Refit(start=4), lp.ImplicitEuler())]
-)
-def test_passes_the_shipped_check(refit, scheme):
-    model, law = conductivity(), lp.SensitivityLaw(refit=refit)
-    sensors, samples = stream(model, 2.0, 0.1 * np.arange(9))
-    check_law(
-        law, lambda law: lp.Identifier(model, sensors, law, scheme=scheme), samples
-    ).raise_if_failed()
-
-
-@pytest.mark.slow
-def test_a_nonlinear_model_finds_its_rate():
-    model = lp.Model(
-        lp.Field(line(12), ElementLineP2(), quadrature=6),
-        lp.Normal(1.0, std=1.0),
-        A=lambda q, u, v, x: -q * u * (1 - u) * v,
-        B=lambda u, v, x: 0.1 * laplace(u, v, x),
-    )
-    start = 0.2
-    times = 0.1 * np.arange(31)
-    sensors = lp.Points([0.2, 0.8], noise=0.001)
-    G = sensors.matrix(model.state_space)
-    states = truth(model, np.array([1.6]), start, times, SCHEME)
-    ident = lp.Identifier(model, sensors, lp.SensitivityLaw(), u0=start)
-    for t, u in zip(times[1:], states[1:], strict=True):
-        estimate = ident.step(t, G @ u)
-    assert estimate.q[0] == pytest.approx(1.6, abs=1e-3)
-
-
 def test_a_refit_that_fails_keeps_the_estimate_of_the_filter(monkeypatch):
     """It is reported; the stream continues, and the samples are fitted again when doubled."""
     model = conductivity()
@@ -321,35 +264,6 @@ class TestRefusals:
             lp.Identifier(
                 excited(4), lp.Points([0.5], noise=0.1), lp.SensitivityLaw(modes={"p": 3})
             )
-
-
-class TestConsistency:
-    def fed(self, innovations):
-        value = Innovations.start(1)
-        for e in innovations:
-            value = value.add(np.array([[e]]))
-        return value
-
-    def test_white_innovations_of_the_right_size_change_nothing_much(self):
-        value = self.fed(np.random.default_rng(0).standard_normal(4000))
-        assert value.ratio == pytest.approx(1.0, abs=0.15)
-        assert abs(value.correlation) < 0.15
-        assert 1.0 <= value.inflation < 1.4
-
-    def test_large_innovations_inflate(self):
-        value = self.fed(3.0 * np.random.default_rng(1).standard_normal(2000))
-        assert value.inflation == pytest.approx(3.0, rel=0.3)
-
-    def test_correlated_innovations_inflate(self):
-        rng = np.random.default_rng(2)
-        e, found = 0.0, []
-        for _ in range(4000):
-            e = 0.9 * e + np.sqrt(1 - 0.81) * rng.standard_normal()
-            found.append(e)
-        assert self.fed(found).inflation == pytest.approx(np.sqrt(1.9 / 0.1), rel=0.4)
-
-    def test_before_any_innovation(self):
-        assert Innovations.start(2).inflation == 1.0
 
 
 @pytest.mark.parametrize("name", ["refit", "jumps", "guards"])

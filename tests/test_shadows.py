@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import livepde as lp
 from livepde.laws.member_arrays import changed
 from livepde.models import heat
 from livepde.runs.run_verdict import doubts
-from livepde.stepping import Alexander2, ImplicitEuler
+from livepde.stepping import ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 
 NOISE, WIDTH, COUNT = 0.003, 0.1, 150
@@ -243,20 +242,6 @@ def test_no_interval_is_much_wider_than_that_of_the_prior() -> None:
     assert (estimate.q_std <= 1.5 * 0.3).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("refit", [None, lp.Refit()])
-def test_goes_on_from_a_checkpoint_to_the_bit(tmp_path: Path, refit: Any) -> None:
-    law, rows = lp.SensitivityLaw(refit=refit), samples()[:90]
-    whole = identifier(8, law)
-    ran(whole, rows[:50])
-    whole.save(tmp_path / "state.bin")
-    again = identifier(8, law)
-    again.load(tmp_path / "state.bin")
-    one, other = ran(whole, rows[50:]), ran(again, rows[50:])
-    np.testing.assert_array_equal(one.q_std, other.q_std)
-    assert one.diagnostics.named() == other.diagnostics.named()
-
-
 @pytest.mark.long
 def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     """About a reference that stays, shifts are those of the plain filter."""
@@ -268,14 +253,6 @@ def test_a_refit_keeps_shadows_or_takes_them_again() -> None:
     for kind in ("step", "mesh"):
         one, other = shifts(plain, kind), shifts(refitted, kind)
         assert np.abs(one - other).max() < 0.3 * np.abs(one).max()
-
-
-@pytest.mark.slow
-def test_holds_with_gaps() -> None:
-    rows = samples()
-    gappy = [(t, z, i) if k % 7 else (t, [np.nan, np.nan], i) for k, (t, z, i) in enumerate(rows)]
-    estimate = ran(identifier(8), gappy)
-    assert abs(estimate.diagnostics.shifts.by("mesh")["k"]) > 0.0
 
 
 @pytest.mark.long
@@ -322,17 +299,6 @@ def test_says_where_the_mesh_is_not_followed() -> None:
         assert "coefficients of the given mesh" in estimate.verdict.untested[0]
         assert "more cells" in estimate.verdict.untested[0]
     assert not ran(identifier(8), samples()[:30]).verdict.untested
-
-
-@pytest.mark.long
-def test_a_block_in_three_dimensions_says_that_its_mesh_is_not_tested() -> None:
-    mesh = lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (8, 8, 8))
-    model = heat(mesh, alpha=lp.LogNormal(0.1, 0.05), dirichlet={"left": lp.Channel("T")})
-    sensors = lp.Points([(0.3, 0.5, 0.5)], noise=NOISE)
-    given = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=None), u0=0.0)
-    for t, _, inputs in samples()[:22]:
-        estimate = given.step(t, [0.0], inputs)
-    assert any("more cells" in text for text in estimate.verdict.untested)
 
 
 def test_a_shadow_that_is_not_finite_begins_anew() -> None:
@@ -392,7 +358,3 @@ def test_refuses_shadows_of_nothing() -> None:
         lp.SensitivityLaw(shadows=True)  # type: ignore[arg-type]
     with pytest.raises(lp.errors.LawError, match="largest must be at least 1"):
         lp.laws.Shadows(largest=0)
-
-
-def test_orders_of_both_schemes_are_known() -> None:
-    assert (ImplicitEuler.order, Alexander2.order) == (1, 2)

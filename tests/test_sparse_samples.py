@@ -10,7 +10,7 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from benchmarks.silent.exact_walk import Exact
-from livepde.laws.process_noise import MOST, grades
+from livepde.laws.noise_rows import MOST, grades
 
 WALK, REVERTING = {"rate": 0.3, "std": 2.0}, {"time": 3.0, "std": 1.0}
 KINDS: dict[str, dict[str, float]] = {"walk": WALK, "reverting": REVERTING}

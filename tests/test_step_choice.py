@@ -103,17 +103,6 @@ def test_a_stated_dt_max_is_an_upper_bound() -> None:
     assert estimate.steps % 3 == 0
 
 
-@pytest.mark.long
-def test_the_bound_on_the_cost_is_said_where_it_bites() -> None:
-    law = lp.SensitivityLaw(shadows=Shadows(parts=2))
-    estimate = ran(given := identifier(law))
-    assert parts_of(given).max() == 2
-    (found,) = [one for one in estimate.verdict.findings if one.what == "step"]
-    assert "at most 2 parts" in found.text
-    assert "law.shadows.parts" in found.remedy
-    assert not [one for one in ran(identifier()).verdict.findings if one.what == "step"]
-
-
 OTHERS = [pytest.param(stop, marks=pytest.mark.long) for stop in (9, 25)]
 
 

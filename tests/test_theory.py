@@ -18,15 +18,15 @@ from typer.testing import CliRunner
 import livepde as lp
 from livepde import diagnostics as dg
 from livepde.errors import ConfigurationError
-from livepde.laws.coupled.split_forms import StageForms
-from livepde.laws.damping_bounds import (
+from livepde.laws.coupled.equation import StageForms
+from livepde.laws.damping import (
     Constants,
     ExactBound,
     Norms,
     SmoothedBound,
+    diffusion_operator,
     unobserved_damping,
 )
-from livepde.laws.diffusion_operators import diffusion_operator
 from livepde.observation import Tikhonov
 from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise, Twin

@@ -217,13 +217,6 @@ def test_a_prior_alone_is_one_number(prior: Any):
     assert FunctionSpace.of(prior, "q").prior == [0.5]
 
 
-def test_a_prior_alone_holds_for_a_region():
-    own = lp.Piecewise(HALVES, lp.Normal(0.4, 0.1), unit="m", own={"r": lp.LogNormal(0.3, 0.1)})
-    left, right = own.separated("a").values()
-    assert (left.prior, right.prior) == (lp.Normal(0.4, 0.1), lp.LogNormal(0.3, 0.1))
-    assert (left.unit, right.unit) == ("m", "m")
-
-
 @pytest.mark.slow
 def test_positive_unknowns_are_found_and_stay_positive():
     times = np.arange(0.0, 6.0, 0.05)
@@ -356,29 +349,6 @@ def test_an_initial_state_is_given_once():
         lp.Identifier(model, lp.Points(SENSORS, noise=1.0), lp.SensitivityLaw(), u0=1.0)
 
 
-@pytest.mark.long
-def test_the_gate_refuses_outliers_and_a_sensor_that_stays_away():
-    times = np.arange(0.0, 8.0, 0.05)
-    samples = data(lambda t: 0.3, times)
-    for k in (50, 80, 81, 110):
-        samples[k][1][1] += 1.0
-    model = rod({"a": lp.Normal(0.2, 0.2)})
-    open_gate = lp.SensitivityLaw(gate=np.inf)
-    plain = estimates(model, open_gate, samples)[-1].parameters["a"][0]
-    found = estimates(model, lp.SensitivityLaw(gate=5.0), samples)
-    assert abs(found[-1].parameters["a"][0] - 0.3) < 0.002 < abs(plain - 0.3)
-    assert [e.t for e in found if e.diagnostics.refused > 0.0] == [
-        pytest.approx(times[k]) for k in (50, 80, 81, 110)
-    ]
-    for t, z in samples[60:]:
-        z[1] += 0.5 if t else 0.0
-    lasting = estimates(model, lp.SensitivityLaw(gate=5.0, gate_patience=7), samples)
-    refused = [e.diagnostics.refused > 0.0 for e in lasting]
-    # One of several sensors is not believed because it insists.
-    assert all(refused[60:])
-    assert abs(lasting[-1].parameters["a"][0] - 0.3) < 0.003
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [({"gate": 0.0}, "gate must be positive"), ({"gate_patience": 0}, "gate_patience")],
@@ -422,28 +392,6 @@ def test_functions_with_kinks_have_their_derivatives(kink: Any):
         return (q.a**2 + lp.fem.absolute(q.a - 3.0)) * kink(u) * v
 
     check_model(rod({"a": lp.Normal(0.4, 0.1)}, A), u=0.1, spread=1e-3).raise_if_failed()
-
-
-@pytest.mark.slow
-def test_a_first_sample_at_the_start_says_what_is_unknown_there():
-    model = rod(
-        {"u0": lp.Normal(1.0, 1.0)},
-        lambda q, u, v, x: 0.1 * u * v + 0.0 * q.u0 * v,
-        initial=lambda q, v, x: q.u0 * v,
-    )
-    for refit in (None, lp.Refit()):
-        sensors = lp.Points(SENSORS, noise=NOISE)
-        identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(refit=refit))
-        start = model.initial_state(np.array([2.0]))
-        first = identifier.step(0.0, identifier.observed.G @ start)
-        np.testing.assert_allclose(first.innovation, 1.0, atol=0.1)
-        assert first.parameters["u0"][0] == pytest.approx(2.0, abs=0.01)
-        forward, u = ForwardStage(model), start
-        for t in (0.1, 0.2, 0.3):
-            u = advanced(forward, u, np.array([2.0]), t - 0.1, t)
-            estimate = identifier.step(t, identifier.observed.G @ u)
-        value, std = estimate.parameters["u0"]
-        assert abs(value - 2.0) < 3 * std < 0.03
 
 
 HALVES = {"l": lambda x: x[0] < 0.5, "r": lambda x: x[0] >= 0.5}

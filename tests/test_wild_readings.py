@@ -60,20 +60,6 @@ def test_nothing_of_a_usual_run_is_wild() -> None:
     assert not [number for number in refused if number == 1.0]
 
 
-def test_a_state_goes_on_from_a_checkpoint_at_a_wild_reading(tmp_path: Path) -> None:
-    samples = [(row["t"], {n: row[n] for n in SENSORS}, row["left"]) for row in live_rod.rows(45)]
-    samples[40][1]["a"] = 9999.0
-    whole, first, second = identifier(), identifier(), identifier()
-    for k, (t, z, left) in enumerate(samples):
-        expected = whole.step(t, z, {"left": left})
-        if k <= 40:
-            first.step(t, z, {"left": left})
-    second.restore(first.dump())
-    for t, z, left in samples[41:]:
-        found = second.step(t, z, {"left": left})
-    assert np.array_equal(found.q, expected.q)
-
-
 def test_a_live_run_reports_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_rod, "identifier", lambda **_: identifier())
     given = list(live_rod.rows(60))

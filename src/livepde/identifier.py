@@ -43,7 +43,7 @@ from livepde.laws import (
     stepped,
 )
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.step_ledger import StepLedger
+from livepde.laws.verdict import StepLedger
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed

@@ -12,7 +12,7 @@ from typing import Any
 from livepde.fem import Field, smooth
 from livepde.identifier import Identifier
 from livepde.laws import Damping, GradientLaw, ResidualDamping, diffusion_operator
-from livepde.laws.diffusion_operators import Diffusivity
+from livepde.laws.damping import Diffusivity
 from livepde.model import Model
 from livepde.observation import Observation
 from livepde.stepping import Newton

@@ -14,7 +14,7 @@ from scipy.linalg import eigh
 from livepde.diagnostics.state_parts import DENSE, Border, Images, Part, lanczos
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
-from livepde.laws.damping_bounds import Constants
+from livepde.laws.damping import Constants
 from livepde.linalg import Array, IntArray
 from livepde.model import Model, h1_form
 from livepde.observation import Observed, Split

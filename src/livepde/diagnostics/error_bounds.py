@@ -13,9 +13,9 @@ from livepde.diagnostics.check_report import Check, CheckReport
 from livepde.diagnostics.constants import Spaces
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
-from livepde.laws.damping import Damping
-from livepde.laws.damping_bounds import (
+from livepde.laws.damping import (
     Constants,
+    Damping,
     Norms,
     nu_exact,
     nu_noisy,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.errors import ConfigurationError
-from livepde.laws.damping_bounds import Norms
+from livepde.laws.damping import Norms
 from livepde.linalg import Array
 
 # Growth of the constant from the first to the second half of a run that counts as none.

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
 
-from livepde.laws.damping_bounds import Norms
+from livepde.laws.damping import Norms
 from livepde.linalg import Array, IntArray
 from livepde.spaces import HilbertSpace
 

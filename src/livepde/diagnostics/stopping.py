@@ -11,7 +11,7 @@ import scipy.sparse as sp
 from livepde.diagnostics.constants import Spaces
 from livepde.diagnostics.error_bounds import Errors
 from livepde.errors import ConfigurationError
-from livepde.laws.damping_bounds import Constants, Norms
+from livepde.laws.damping import Constants, Norms
 from livepde.linalg import Array
 from livepde.observation import Observed, Tikhonov
 

@@ -24,8 +24,7 @@ from livepde.diagnostics.stopping import (
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
-from livepde.laws.damping import Damping
-from livepde.laws.damping_bounds import Constants, Norms
+from livepde.laws.damping import Constants, Damping, Norms
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed

@@ -26,7 +26,7 @@ from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEng
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
-from livepde.laws.step_ledger import COUNTS
+from livepde.laws.verdict import COUNTS
 from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from livepde.laws.assimilation import MemberReports
-from livepde.laws.damping import ConstantDamping, Damping, Residual, ResidualDamping
-from livepde.laws.damping_bounds import (
+from livepde.laws.damping import (
+    ConstantDamping,
     Constants,
+    Damping,
     ExactBound,
     NoisyBound,
     Norms,
+    Residual,
+    ResidualDamping,
     SmoothedBound,
+    diffusion_operator,
     unobserved_damping,
 )
-from livepde.laws.diffusion_operators import diffusion_operator
-from livepde.laws.excitation_gate import ExcitationGate
+from livepde.laws.equation_tests import ExcitationGate
 from livepde.laws.gradient import GradientLaw
-from livepde.laws.guards import Guards
-from livepde.laws.jumps import Jumps
 from livepde.laws.law import (
     AnyLaw,
     Belief,
@@ -30,7 +31,7 @@ from livepde.laws.law import (
     numerical,
     stepped,
 )
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Guards, Jumps, Refit
 from livepde.laws.sensitivity import SensitivityLaw
 from livepde.laws.shadows import Shadows
 from livepde.laws.step_diagnostics import Diagnostics

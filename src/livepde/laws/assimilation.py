@@ -83,48 +83,22 @@ class MemberReports:
 
 
 class GateDecision(NamedTuple):
-    """What a gate has decided on a sample.
+    """What a gate has decided on a sample."""
 
-    Attributes
-    ----------
-    refused
-        Readings that do not correct the unknowns, shape (members, sensors).
-    anchored
-        Those of them that correct the state alone.
-    """
-
-    refused: Mask
-    anchored: Mask
+    refused: Mask  # readings that do not correct the unknowns, shape (members, sensors)
+    anchored: Mask  # those of them that correct the state alone
 
 
 class Assimilation(NamedTuple):
-    """Outcome of the assimilation of a sample.
+    """Outcome of the assimilation of a sample."""
 
-    Attributes
-    ----------
-    predicted
-        Predicted value of each sensor, shape (members, sensors).
-    steps
-        Substeps taken, one number for all members or shape (members,).
-    status
-        Why no member could be stepped, or ok.
-    finite
-        Members whose numbers are finite, shape (members,).
-    refused
-        Values that the gate refused, shape (members, sensors).
-    worst
-        Largest innovation of all members in units of the noise; 0 without.
-    anchored
-        Those that correct the state alone; None: none does.
-    """
-
-    predicted: Array
-    steps: int | IntArray
-    status: Status
-    finite: Mask
-    refused: Mask
-    worst: float
-    anchored: Mask | None = None
+    predicted: Array  # predicted value of each sensor, shape (members, sensors)
+    steps: int | IntArray  # substeps taken, one number for all members or shape (members,)
+    status: Status  # why no member could be stepped, or ok
+    finite: Mask  # members whose numbers are finite, shape (members,)
+    refused: Mask  # values that the gate refused, shape (members, sensors)
+    worst: float  # largest innovation of all members in units of the noise; 0 without
+    anchored: Mask | None = None  # those that correct the state alone; None: none does
 
     @property
     def decision(self) -> GateDecision:
@@ -141,20 +115,12 @@ def no_readings(x: FilterState, sensors: int) -> Assimilation:
 
 @dataclass(frozen=True)
 class UpdateOptions:
-    """Predict and update with the options of a law.
+    """Predict and update with the options of a law."""
 
-    Attributes
-    ----------
-    gate
-        Which readings are used.
-    adaptive
-        True if the noise is a first guess whose multiple is found from the samples.
-    decision
-        An earlier decision of the gate on the sample, which holds again; None: the gate decides.
-    """
-
-    gate: Gate = field(default_factory=Gate)
+    gate: Gate = field(default_factory=Gate)  # which readings are used
+    # True if the noise is a first guess whose multiple is found from the samples.
     adaptive: bool = False
+    # An earlier decision of the gate on the sample, which holds again; None: the gate decides.
     decision: GateDecision | None = None
 
 
@@ -275,12 +241,9 @@ def _far(
     The gate is as much wider as the innovations are usually larger than expected, so that a noise
     that is stated too small does not close it.
 
-    Parameters
-    ----------
-    e, d, variance
-        Normalised innovations, and innovations with their variance, in units of the noise.
-    shift
-        Known errors of the innovations, which widen the gate but after a pause; None: none.
+    `e`, `d`, `variance`: normalised innovations, and innovations with their variance, in units of
+    the noise. `shift`: known errors of the innovations, which widen the gate but after a pause;
+    None: none.
     """
     # Values within the bare gate pass, whatever widens it: most samples are spared the limits.
     near, quiet = np.abs(e) <= beyond, not np.count_nonzero(x.screened.refused)

@@ -15,16 +15,15 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
-from livepde.laws.outliers import near_most, near_neighbours
-from livepde.laws.refit import WILD, refitted
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Refit
+from livepde.laws.refit import WILD, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
@@ -46,23 +45,15 @@ CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelie
 
 
 class Unit(NamedTuple):
-    """A unit that a column may have.
+    """A unit that a column may have."""
 
-    Attributes
-    ----------
-    name, expected
-        The unit, and the expected one; empty if they are not known.
-    factor, constant
-        Of the conversion of its values.
-    times
-        How many times too large or too small its values are.
-    """
-
+    # The unit, and the expected one; empty if they are not known.
     name: str
     expected: str
+    # Of the conversion of its values.
     factor: float
     constant: float
-    times: float = np.nan
+    times: float = np.nan  # how many times too large or too small its values are
 
 
 UNITS: tuple[Unit, ...] = (
@@ -87,24 +78,13 @@ class Explained(NamedTuple):
 
 @dataclass(frozen=True)
 class Error:
-    """An error of a column, or of two.
+    """An error of a column, or of two."""
 
-    Attributes
-    ----------
-    kind
-        "offset", "gain", "lag", "unit" or "exchange".
-    names
-        The columns.
-    size
-        Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
-    unit
-        Number in `UNITS`.
-    """
-
-    kind: str
-    names: tuple[str, ...]
+    kind: str  # "offset", "gain", "lag", "unit" or "exchange"
+    names: tuple[str, ...]  # the columns
+    # Of an offset in the unit of the column, of a gain as a factor less one, of a lag in time.
     size: float = 0.0
-    unit: int = 0
+    unit: int = 0  # number in `UNITS`
 
     @property
     def numbers(self) -> int:
@@ -114,25 +94,14 @@ class Error:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """The stored samples of one member as columns that may be wrong.
+    """The stored samples of one member as columns that may be wrong."""
 
-    Attributes
-    ----------
-    work, state
-        Parts of the law without gate, and the member with the first samples of its window.
-    places
-        Column of the log of each sensor and each input.
-    inputs
-        Names of the inputs.
-    options
-        Those of a fit.
-    """
-
+    # Parts of the law without gate, and the member with the first samples of its window.
     work: SensitivityWork
     state: SensitivityState
-    places: dict[str, int]
-    inputs: tuple[str, ...]
-    options: Refit
+    places: dict[str, int]  # column of the log of each sensor and each input
+    inputs: tuple[str, ...]  # names of the inputs
+    options: Refit  # those of a fit
 
     @classmethod
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
@@ -246,12 +215,11 @@ class _Fit:
     @classmethod
     def about(cls, one: Passed) -> _Fit:
         used = np.isfinite(one.residuals)
-        J, r = one.slopes[used], one.residuals[used]
-        inverse = np.linalg.inv(np.eye(len(one.xi)) + J.T @ J)
-        g = J.T @ r - one.xi
+        H, g = one.model(used)
+        inverse = np.linalg.inv(H)
         step = inverse @ g
         cost = one.cost(used) - 0.5 * float(g @ step)
-        return cls(one, J, np.asarray(inverse), step, cost)
+        return cls(one, one.slopes[used], np.asarray(inverse), step, cost)
 
     def freed(self, g: Array) -> tuple[float, float]:
         """Return by how much the cost falls if residuals may change along g, and the size."""
@@ -305,18 +273,12 @@ class _Trials:
         self.base_readings = columns.samples().readings
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors, and by how much they lower a cost, as the model about a fit has it.
-
-        An error that is the same wherever it is asked for is asked for everywhere.
-        """
-        for name in self.columns.places:
-            yield from (
-                (cost - at.cost + gained, error) for gained, error in self._of_one(at, name)
-            )
-        yield from ((cost - at.cost + gained, error) for gained, error in self._exchanged(at))
+        """Iterate over errors, and by how much they lower a cost by the model about a fit."""
+        each = [*(self._of_one(at, name) for name in self.columns.places), self._exchanged(at)]
+        for gained, error in chain(*each):
+            yield cost - at.cost + gained, error
 
     def _of_one(self, base: _Fit, name: str) -> Iterator[tuple[float, Error]]:
-        """Iterate over errors of one column."""
         columns, values = self.columns, self.columns.column(name)
         if len(values) < FEWEST_ROWS // 2:
             return
@@ -338,7 +300,6 @@ class _Trials:
             yield from self._units(base, name, slopes)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
-        """Return a size that is possible."""
         columns = self.columns
         if kind == "gain":
             return float(np.clip(theta, -0.9, 9.0))
@@ -371,7 +332,6 @@ class _Trials:
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
-        """Iterate over pairs of columns that may be exchanged."""
         columns = self.columns
         for pair in combinations(columns.places, 2):
             first, second = (columns.column(name) for name in pair)
@@ -450,7 +410,6 @@ def _noise(residuals: Array) -> float:
 
 
 def _cause(columns: Columns, error: Error, share: float) -> Cause:
-    """Return an error as a cause."""
     first, size = error.names[0], error.size
     problem = columns.work.filter.problem
     units = dict(zip(problem.observed.names, problem.observed.units, strict=True))

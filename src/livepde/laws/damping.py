@@ -1,7 +1,9 @@
-"""Damping rules: how strongly the estimate is pulled to the observed state.
+"""Damping: how strongly the estimate is pulled to the observed state, and bounds of the paper.
 
 The paper writes mu R M (r / ||r||_V~). At r = 0 that is 0/0, so a rule returns
-theta = mu / ||r||_V~, which multiplies R M r. A rule may use only quantities known online.
+theta = mu / ||r||_V~, which multiplies R M r. A rule may use only quantities known online. Every
+formula of a bound returns theta, too (mu / ||r_alpha||_V~ with noise), never mu. In a twin
+experiment its arguments are the true norms; a rule is given bounds of them by the user.
 """
 
 from __future__ import annotations
@@ -11,10 +13,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from livepde.errors import LawError
+from livepde.fem import dot, grad
+
+Diffusivity: TypeAlias = float | Callable[[Any], Any]
 
 
 class Residual:
@@ -151,3 +157,340 @@ class ConstantDamping(Damping):
     def slopes(self, r: Residual) -> tuple[float, float, float]:
         squared = r.V + self.floor**2 * r.observed.V
         return 0.0, 0.0, -0.5 * self.mu * squared**-1.5 if squared > 0.0 else 0.0
+
+
+@dataclass(frozen=True)
+class DiffusionOperator:
+    """The integrand |D| grad v . grad phi + v phi of M and N.
+
+        (M v, phi)_X = integral over omega of |D| grad v . grad phi + v phi                 (MN1)
+
+    and (MN2) the same for N over Omega without omega: the law integrates each over its part. With
+    |D| both are coercive whatever the sign of D,
+    (M v, v)_X = ||sqrt|D| grad v||^2 + ||v||^2 = ||v||_VX~^2 with c_M = 1; in their own norms M and
+    N are bounded as long as D does not change its sign on omega nor outside.
+
+    Parameters
+    ----------
+    D
+        Diffusivity: a number, or a function of x; of any sign.
+    """
+
+    D: Diffusivity
+
+    def __call__(self, v: Any, phi: Any, x: Any) -> Any:
+        """Return the integrand."""
+        D = self.D(x) if callable(self.D) else self.D
+        return np.abs(D) * dot(grad(v), grad(phi)) + v * phi
+
+
+def diffusion_operator(D: Diffusivity) -> DiffusionOperator:
+    """Return M of (MN1), or N of (MN2), for `GradientLaw(M_op=..., N_op=...)`.
+
+    >>> import livepde as lp
+    >>> MN = diffusion_operator(-1.0)
+    >>> law = lp.GradientLaw(nu=2.0, M_op=MN, N_op=MN)
+    """
+    return DiffusionOperator(D)
+
+
+@dataclass(frozen=True)
+class Norms:
+    """||x||_X, ||x||_VX and ||x||_V of one part of the state, or bounds of them.
+
+    Spaces with a tilde for an observed part (r, d), with a hat for the unobserved part (p).
+    """
+
+    X: float = 0.0
+    VX: float = 0.0
+    V: float = 0.0
+
+    def residual(self, observed: Norms) -> Residual:
+        """Return these norms, of r, and those of u_alpha as a damping rule takes them."""
+        seen = Residual(observed.X**2, observed.VX**2, lambda: observed.V**2)
+        return Residual(self.X**2, self.VX**2, lambda: self.V**2, lambda: seen)
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The constants of Assumption ass:equation for a discretised model.
+
+    `diagnostics.constants` computes them; a user who knows better ones gives those.
+
+    Attributes
+    ----------
+    L_C
+        Lipschitz constant of C(q, .) (LipschitzC), in 1/time.
+    C_A
+        ||A(u* + v)||_{Q -> X} <= C_A (1 + ||v||) (AbdV), (AbdX), (AbdVV).
+    c_M, C_M
+        (M v, v)_X >= c_M ||v||_VX~^2, and ||R M v||_X <= C_M ||v||_V~.
+    c_N, C_N
+        The same of N on the unobserved part.
+    observed_V_VX, observed_VX_X
+        Embedding constants C_{V~ VX~} and C_{VX~ X}.
+    hidden_V_VX, hidden_VX_X
+        Embedding constants C_{V^ VX^} and C_{VX^ X}; 0 if everything is observed.
+    observed_ratio, hidden_ratio
+        Largest ||v||_V ||v||_X / ||v||_VX^2 of each part: 1/c_int of (interpol).
+    sampled
+        Names of the constants that were estimated from below by sampling; all others are bounds.
+    """
+
+    L_C: float
+    C_A: float
+    c_M: float = 1.0
+    C_M: float = 1.0
+    c_N: float = 1.0
+    C_N: float = 1.0
+    observed_V_VX: float = 1.0
+    observed_VX_X: float = 1.0
+    hidden_V_VX: float = 1.0
+    hidden_VX_X: float = 1.0
+    observed_ratio: float = 1.0
+    hidden_ratio: float = 1.0
+    sampled: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("c_M", "C_M", "c_N", "C_N"):
+            if not getattr(self, name) > 0:
+                raise LawError(f"Constants: {name} must be positive; got {getattr(self, name)}.")
+        for name in ("L_C", "C_A", "hidden_V_VX", "hidden_VX_X", "hidden_ratio"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise LawError(f"Constants: {name} must be a number >= 0; got {value}.")
+
+
+def _over(numerator: float, denominator: float) -> float:
+    """Return a quotient; 0/0 is 0, as nothing is asked then."""
+    if numerator <= 0.0:
+        return 0.0
+    return numerator / denominator if denominator > 0.0 else np.inf
+
+
+def theta_exact(c: Constants, p_V: float, r: Norms, c1: float = 0.0) -> float:
+    """Return the least theta for exact data, Assumptions cond:mu_1 and, with c1, cond:mu02.
+
+    mu >= max{2 L_C/c_M ||p||_V^, c_1 ||r||_X} ||r||_X ||r||_V~ / ||r||_VX~^2.
+
+    >>> theta_exact(Constants(L_C=2.0, C_A=1.0), p_V=0.5, r=Norms(1.0, 2.0, 4.0))
+    0.5
+    """
+    return _over(max(2.0 * c.L_C / c.c_M * p_V, c1 * r.X) * r.X, r.VX**2)
+
+
+def theta_noisy(
+    c: Constants,
+    e: float,
+    p_V: float,
+    r: Norms,
+    d: Norms,
+    sigma: float = 0.0,
+    c1: float = 0.0,
+) -> float:
+    """Return the least theta for noisy data, Assumptions ass:mu_nu and, with c1, ass:mu_noisy.
+
+    mu >= max{4 L_C/c_M (||d||_V~ + ||p||_V^) ||r||_X
+    + 4 C_A/c_M (1 + ||d||_V~ + ||p||_V^) ||e||_Q ||d||_X, 2 sigma/c_M ||r||_X^2, c_1 ||r||_X^2}
+    ||r_alpha||_V~ / ||r||_VX~^2.
+
+    `e`: ||e||_Q in the gain-scaled norm. `r`: of the true residual r = R (u - u*), not of r_alpha.
+    `d`: of the data error u_alpha - R u*.
+    """
+    rough = d.V + p_V
+    pull = 4.0 / c.c_M * (c.L_C * rough * r.X + c.C_A * (1.0 + rough) * e * d.X)
+    return _over(max(pull, 2.0 * sigma / c.c_M * r.X**2, c1 * r.X**2), r.VX**2)
+
+
+def theta_smoothed(
+    c: Constants, p_V: float, r: Norms, d_V: float, rate_X: float, c1: float = 0.0
+) -> float:
+    """Return the least theta for smoothed data, ass:mu_nu_smooth and, with c1, cond:mu_smooth_2.
+
+    mu >= max{2/c_M (L_C (||d||_V~ + ||p||_V^) + ||d~||_X), c_1 ||r_alpha||_X}
+    ||r_alpha||_X ||r_alpha||_V~ / ||r_alpha||_VX~^2.
+
+    `r`: of r_alpha, which is known online. `rate_X`: ||d~||_X of the rate of the data error.
+    """
+    pull = 2.0 / c.c_M * (c.L_C * (d_V + p_V) + rate_X)
+    return _over(max(pull, c1 * r.X) * r.X, r.VX**2)
+
+
+def nu_exact(c: Constants, e: float, p: Norms) -> float:
+    """Return the least nu for exact data, Assumption cond:nu."""
+    embedding = 0.5 * c.hidden_V_VX * c.hidden_VX_X
+    weight = 4.0 * (c.L_C + c.C_A * (e + embedding)) / c.c_N
+    return weight * _over(p.V * p.X, p.VX**2)
+
+
+def nu_noisy(c: Constants, e: float, p: Norms, d_V: float) -> float:
+    """Return the least nu for noisy and smoothed data, Assumptions ass:mu_nu, ass:mu_nu_smooth."""
+    rough = 4.0 * (c.L_C + c.C_A * e) / c.c_N * (p.V + d_V)
+    rough += 2.0 * c.C_A * c.hidden_V_VX * c.hidden_VX_X / c.c_N * p.V
+    return _over(rough * p.X, p.VX**2)
+
+
+def unobserved_damping(c: Constants, e_bound: float) -> float:
+    """Return a constant nu for `GradientLaw` that satisfies Assumption cond:nu for every p.
+
+    The unknown quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is at most `c.hidden_ratio`, so the bound
+    needs only ||e||_Q, which never exceeds its start: e_bound^2 = ||e(0)||_Q^2 + ||r(0)||_X^2.
+    With d != 0 there is no such constant: the noisy bound grows without limit as p vanishes.
+
+    It is a large number, of the order of the inverse size of an element, and the bound on mu has
+    then to cover nu times the flux of u through the boundary of omega, too: `ExactBound` with a
+    p_bound of about nu ||P u*||_V^.
+
+    >>> unobserved_damping(Constants(1.0, 0.0, hidden_ratio=2.0), e_bound=1.0)
+    8.0
+    """
+    # Norms of which the quotient ||p||_V^ ||p||_X / ||p||_VX^^2 is the largest possible one.
+    return nu_exact(c, e_bound, Norms(c.hidden_ratio, 1.0, 1.0))
+
+
+def _check_bounds(name: str, **values: float) -> None:
+    for key, value in values.items():
+        if not (np.isfinite(value) and value >= 0):
+            raise LawError(f"{name}: {key} must be a number >= 0; got {value}.")
+
+
+@dataclass(frozen=True)
+class ExactBound(Damping):
+    """The whole lower bound on mu for exact data, cond:mu_1 (c1 = 0) and cond:mu02.
+
+    theta = max{2 L_C/c_M p_bound / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2.
+
+    Parameters
+    ----------
+    constants
+        Of the model.
+    p_bound
+        Upper bound of ||p||_V^, known to the user; 0 for full observation.
+    c1
+        As in `ResidualDamping`.
+    floor
+        A share of ||u_alpha||_X: the first term is 0/0 at r = 0. Where ||r||_X is smaller the pull
+        is linear, and weaker than the bound.
+    """
+
+    constants: Constants
+    p_bound: float
+    c1: float = 1.0
+    floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _check_bounds("ExactBound", p_bound=self.p_bound, c1=self.c1)
+        if not self.floor > 0:
+            raise LawError(f"ExactBound: floor must be positive; got {self.floor}.")
+
+    def theta(self, r: Residual) -> float:
+        c = self.constants
+        return _pulled(r, 2.0 * c.L_C / c.c_M * self.p_bound, self.c1, self.floor)
+
+
+@dataclass(frozen=True)
+class SmoothedBound(Damping):
+    """The lower bound on mu for smoothed data, ass:mu_nu_smooth (c1 = 0) and cond:mu_smooth_2.
+
+    theta = max{2/c_M (L_C (d_bound + p_bound) + rate_bound) / ||r||_X, c_1}
+    ||r||_X^2 / ||r||_VX~^2 with r = R u - u_alpha: the only one of the paper's bounds whose
+    residual is known online.
+
+    Parameters
+    ----------
+    p_bound, d_bound, rate_bound
+        Bounds of ||p||_V^, ||d||_V~ and ||d~||_X.
+    c1, floor
+        As in `ExactBound`.
+    """
+
+    constants: Constants
+    p_bound: float
+    d_bound: float
+    rate_bound: float
+    c1: float = 1.0
+    floor: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _check_bounds(
+            "SmoothedBound",
+            p_bound=self.p_bound,
+            d_bound=self.d_bound,
+            rate_bound=self.rate_bound,
+            c1=self.c1,
+        )
+        if not self.floor > 0:
+            raise LawError(f"SmoothedBound: floor must be positive; got {self.floor}.")
+
+    def theta(self, r: Residual) -> float:
+        c = self.constants
+        rough = c.L_C * (self.d_bound + self.p_bound) + self.rate_bound
+        return _pulled(r, 2.0 / c.c_M * rough, self.c1, self.floor)
+
+
+@dataclass(frozen=True)
+class NoisyBound(Damping):
+    """The lower bound on mu for noisy data, ass:mu_nu (c1 = 0) and ass:mu_noisy.
+
+    The paper's bound holds the true r. Online, ||r||_X <= ||r_alpha||_X + ||d||_X and
+    ||r||_VX~ >= ||r_alpha||_VX~ - ||d||_VX~ stand in for it, so the rule asks for at least the pull
+    of the paper, as long as the residual stands out of the noise. Where it does not, no theta
+    satisfies the bound (condition (cond_d) fails as well), and the rule returns `theta_max`.
+
+    Parameters
+    ----------
+    p_bound, e_bound
+        Bounds of ||p||_V^ and of ||e||_Q in the gain-scaled norm.
+    d_bound
+        Bounds of the norms of the data error d.
+    sigma
+        That of the law.
+    c1
+        The c~_1 of ass:mu_noisy.
+    theta_max
+        The largest pull, in 1/time.
+    """
+
+    constants: Constants
+    p_bound: float
+    e_bound: float
+    d_bound: Norms
+    sigma: float = 0.0
+    c1: float = 0.0
+    theta_max: float = 1e3
+
+    def __post_init__(self) -> None:
+        _check_bounds(
+            "NoisyBound",
+            p_bound=self.p_bound,
+            e_bound=self.e_bound,
+            d_X=self.d_bound.X,
+            d_VX=self.d_bound.VX,
+            d_V=self.d_bound.V,
+            sigma=self.sigma,
+            c1=self.c1,
+            theta_max=self.theta_max,
+        )
+
+    def theta(self, r: Residual) -> float:
+        d = self.d_bound
+        # The true r is not known: ||r||_X is bounded from above, ||r||_VX~ from below.
+        least = np.sqrt(r.VX) - d.VX
+        if least <= 0.0:
+            return self.theta_max
+        size = Norms(float(np.sqrt(r.X)) + d.X, float(least))
+        asked = theta_noisy(
+            self.constants, self.e_bound, self.p_bound, size, d, self.sigma, self.c1
+        )
+        return min(asked, self.theta_max)
+
+
+def _pulled(r: Residual, pull: float, c1: float, floor: float) -> float:
+    """Return max{pull / ||r||_X, c_1} ||r||_X^2 / ||r||_VX~^2, floored; c_1 where all is zero."""
+    size = float(np.sqrt(max(r.X, floor**2 * r.observed.X))) if pull > 0.0 else 0.0
+    return max(pull / size if size > 0.0 else 0.0, c1) * _share(r)
+
+
+def _share(r: Residual) -> float:
+    """Return ||r||_X^2 / ||r||_VX~^2, 1 at r = 0."""
+    return r.X / r.VX if r.VX > 0.0 else 1.0

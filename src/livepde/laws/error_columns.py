@@ -46,22 +46,14 @@ class StatePoint(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """A shape of error of the process, with columns that differ by their course in time.
+    """A shape of error of the process, with columns that differ by their course in time."""
 
-    Attributes
-    ----------
-    kind, subject
-        What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
-        "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
-    mode
-        Number of its shape in space.
-    load, lift, start
-        Its load, its boundary values, and its value at the start, (n,); None for zero.
-    """
-
+    # What it is: "source", "conductivity", "flow", "loss", "boundary", "late boundary", "flux",
+    # "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
     kind: str
     subject: str = ""
-    mode: int = 0
+    mode: int = 0  # number of its shape in space
+    # Its load, its boundary values, and its value at the start, (n,); None for zero.
     load: Load | Array | None = None
     lift: Load | Array | None = None
     start: Array | None = None
@@ -100,15 +92,7 @@ SMALL = _Numbers((4, 9), (3, 3), (2, 3), 9)
 
 
 class ErrorColumns:
-    """Errors that a model and its sensors can have.
-
-    Parameters
-    ----------
-    samples
-        The samples, which tell the length of the run.
-    numbers
-        How many shapes the families have.
-    """
+    """Errors that a model and its sensors can have."""
 
     def __init__(self, samples: StoredSamples, numbers: _Numbers) -> None:
         self.samples, self.numbers = samples, numbers
@@ -177,7 +161,6 @@ class ErrorColumns:
                 yield Answer("initial", name, k, start=u * free), ALWAYS
 
     def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over boundary values and channels that are off, and late."""
         model, lifts = self.model, boundary_lifts(self.model)
         for name, lift in lifts.items():
             yield Answer("boundary", name, lift=lift), ALWAYS
@@ -192,7 +175,6 @@ class ErrorColumns:
             yield Answer("flux", name, load=load), ALWAYS
 
     def _unknowns(self) -> Iterator[tuple[Answer, Course]]:
-        """Iterate over unknowns that drift or jump during the run."""
         reduction = self.samples.filter.reduction
         for label, place in reduction.stay[:MOST_UNKNOWNS]:
             load = _changed(self.model, reduction.Phi[:, place])
@@ -235,11 +217,6 @@ class ErrorColumns:
         """Return the readings of all answers, states at samples, and predicted readings.
 
         Shapes (samples, sensors, columns), (n,) for each sample, and (samples, sensors).
-
-        Parameters
-        ----------
-        one
-            The trajectory about which they are linear.
         """
         samples, model = self.samples, self.model
         stage, free = ForwardStage(model), model.X.free
@@ -304,7 +281,6 @@ class ErrorColumns:
 
 
 def _band(place: float, wide: float) -> Callable[[Any], Any]:
-    """Return a hat function of the first coordinate."""
     return lambda x: np.maximum(1.0 - np.abs(x[0] - place) / wide, 0.0)
 
 

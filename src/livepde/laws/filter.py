@@ -9,7 +9,8 @@ P = [U C]^T [U C] the joint covariance of u and a,
     update    d = z - h(u, q),  Y = U H_u^T + C Phi^T H_q^T,  W W^T = (I + Y N^-1 Y^T)^-1
               [u; a] += [U C]^T W W^T Y N^-1 d,   [U C] <- W^T [U C]
 
-For unknowns that stay as they are U = C L^T with the sensitivity L = du/da.
+For unknowns that stay as they are U = C L^T with the sensitivity L = du/da. The covariance that is
+reported is wider where the innovations require it (`robust_factors`).
 """
 
 from __future__ import annotations
@@ -22,24 +23,15 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from scipy.linalg import lapack
 
-from livepde.laws.anchor import Anchor
 from livepde.laws.filter_state import FilterState, along, extended, with_rows
-from livepde.laws.input_noise import after_pause, with_input_noise
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, join, product, put, take
-from livepde.laws.member_sensors import MemberSensors
-from livepde.laws.process_noise import NoiseRows, grades, pieces
+from livepde.laws.member_sensors import Anchor, MemberSensors
+from livepde.laws.noise_rows import NoiseRows, after_pause, grades, pieces, with_input_noise
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping import (
-    Interval,
-    MemberStage,
-    Span,
-    StageOfMembers,
-    StepFailed,
-    advance,
-)
+from livepde.stepping import Interval, MemberStage, Span, StageOfMembers, StepFailed, advance
 from livepde.verdict import Judge
 
 Steps: TypeAlias = int | IntArray
@@ -50,18 +42,12 @@ BLOCK = 32  # columns that LAPACK's QR takes at once
 
 
 class Update(NamedTuple):
-    """Matrices and vectors of an update, with W as in the docstring of this module.
+    """Matrices and vectors of an update, with W as in the docstring of this module."""
 
-    Attributes
-    ----------
-    W, Y
-        Shapes (members, r, r) and (members, r, sensors).
-    half, misfit
-        W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
-    """
-
+    # Shapes (members, r, r) and (members, r, sensors).
     W: Array
     Y: Array
+    # W^T Y d, shape (members, r), and d^T (I + Y^T Y)^-1 d, shape (members,).
     half: Array
     misfit: Array
 
@@ -82,38 +68,26 @@ class Filter:
     """Predicts and updates, linear about the point of a `FilterState`.
 
     Overflow is no error here: callers check that the results are finite.
-
-    Attributes
-    ----------
-    problem, stage, sensors, reduction
-        Model and sensors; the implicit stage of all members; the observation operator of all
-        members; the reduced coordinates of the unknowns.
-    noise
-        Standard deviation of each sensor, shape (sensors,).
-    rank, scale
-        A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
-        coefficients of the state then: the square root of the mass of each.
-    drift
-        Prior variances gained per unit of time by unknowns without an evolution of their own, one
-        for each member number, shape (numbers,), or (1,) for all.
-    fading
-        Time constant with which the cross-covariance of state and unknowns decays.
-    judge
-        Keeps the sums behind the verdict; None: there is no verdict.
-    shadows
-        Discretisation errors that are followed beside the filter; None: none is.
     """
 
+    # Model and sensors; the implicit stage of all members; the observation operator of all members;
+    # the reduced coordinates of the unknowns.
     problem: Problem
     stage: MemberStage
     sensors: MemberSensors
     reduction: Reduction
-    noise: Array
+    noise: Array  # standard deviation of each sensor, shape (sensors,)
+    # A square root of more than `rank` rows is compressed; `scale`, shape (n,), weighs the
+    # coefficients of the state then: the square root of the mass of each.
     rank: int
     scale: Array
+    # Prior variances gained per unit of time by unknowns without an evolution of their own, one for
+    # each member number, shape (numbers,), or (1,) for all.
     drift: Array
+    # Time constant with which the cross-covariance of state and unknowns decays.
     fading: float = np.inf
-    judge: Judge | None = None
+    judge: Judge | None = None  # keeps the sums behind the verdict; None: there is no verdict
+    # Discretisation errors that are followed beside the filter; None: none is.
     shadows: ShadowSet | None = None
 
     def drifts(self, member: IntArray) -> Array:
@@ -400,13 +374,9 @@ class Filter:
     ) -> tuple[dict[str, Array], Update]:
         """Return the fields of the state after a sample, and the matrices of the update.
 
-        Parameters
-        ----------
-        Y, d
-            Observed square root, (members, r, sensors), and innovations, (members, sensors), in
-            units of the noise; zero where no value is.
-        causes
-            `FilterState.causes` before the update.
+        `Y`, `d`: observed square root, (members, r, sensors), and innovations, (members, sensors),
+        in units of the noise; zero where no value is. `causes`: `FilterState.causes` before the
+        update.
         """
         W, half, misfit = contraction(Y, d)
         Wt, row = W.transpose(0, 2, 1), half[:, None]
@@ -429,10 +399,8 @@ class Filter:
         past, dpast = np.concatenate([x.past, x.C], axis=2), np.concatenate([x.dpast, now], axis=1)
         return changed(x, past=past, dpast=dpast)
 
-    def relinearised(self, x: FilterState, kept: Mask | None = None) -> FilterState:
+    def relinearised(self, x: FilterState) -> FilterState:
         """Return the state with its linearisation point at the estimate, within the bounds.
-
-        Members in `kept`, shape (members,), keep their linearisation point; None: no member does.
 
         Bounds (`Reduction.ends`) hold for linearisation points and for reported estimates, not for
         the linear filter: an excess beyond them stays in da and du, so that no information of the
@@ -451,10 +419,6 @@ class Filter:
                 du[k] = along(x, k, da[k])
                 u[k] -= du[k]
                 estimate[k] = x.q[k] + self.reduction.Phi @ shift
-        if kept is not None and kept.any():
-            rows = kept[:, None]
-            u, q = np.where(rows, x.u, u), np.where(rows, x.q, estimate)
-            return changed(x, u=u, q=q, du=np.where(rows, x.du, du), da=np.where(rows, x.da, da))
         return changed(x, u=u, q=estimate, du=du, da=da)
 
     def inflated(self, x: FilterState, size: float, chosen: Mask | None = None) -> FilterState:
@@ -542,3 +506,48 @@ def contraction(Y: Array, d: Array) -> tuple[Array, Array, Array]:
 def _upper(r: int) -> Array:
     """Return ones in the upper triangle of an r by r matrix."""
     return np.triu(np.ones((r, r)))
+
+
+def robust_factors(reduction: Reduction, x: FilterState) -> tuple[Array, Array]:
+    """Return a square root [U C] of the robust covariance, (members, r, n) and (members, r, k).
+
+    The sandwich V = P (1 + lambda F) P of Huber (1967) and White (1982), with the prior inside: in
+    units of the prior of this time P is the covariance of the filter, F = P^-1 - 1 the information
+    of the samples, and lambda the square of `Innovations.inflation`, the factor by which a mean of
+    the innovations scatters more than the filter expects. A direction with the remaining share p of
+    its prior variance gets the variance p (p + lambda (1 - p)), and never more than its prior: an
+    unobserved direction keeps its variance, however wrong the sensors are.
+
+    The uncertainty of the state beside the unknowns has no prior: its variance counts `lambda`
+    times.
+    """
+    inflation = x.innovations.inflation
+    if (inflation == 1.0).all():
+        return x.U, x.C
+    k = x.C.shape[2]
+    finite = np.isfinite(x.C).all(axis=(1, 2)) & np.isfinite(inflation)
+    C = reduction.in_prior_units(np.where(finite[:, None, None], x.C, 0.0), x.age)
+    # In the principal axes of the posterior relative to the prior each direction has its share p of
+    # its own, `left` squared.
+    rotation, left, _ = np.linalg.svd(C)
+    share = np.minimum(left * left, 1.0)
+    # Factors on standard deviations: for the first k rows as the docstring says, for the others,
+    # which are the state's alone, the square root of lambda.
+    widths = np.repeat(inflation[:, None], rotation.shape[1], axis=1)
+    widened = share + inflation[:, None] ** 2 * (1.0 - share)
+    widths[:, :k] = np.sqrt(np.minimum(widened, 1.0 / np.maximum(share, np.finfo(float).tiny)))
+    widths[~finite] = 1.0
+    rows = widths[:, :, None] * rotation.transpose(0, 2, 1)
+    return rows @ x.U, rows @ x.C
+
+
+def reported_factors(filter_: Filter, x: FilterState) -> tuple[Array, Array]:
+    """Return a square root [U C] of the covariance that is reported, as `robust_factors` does.
+
+    It has one row more for the discretisation error, where shadows follow it.
+    """
+    U, C = robust_factors(filter_.reduction, x)
+    if filter_.shadows is None:
+        return U, C
+    u, a = filter_.shadows.widening(x)
+    return np.concatenate([U, u], axis=1), np.concatenate([C, a], axis=1)

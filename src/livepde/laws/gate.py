@@ -1,90 +1,66 @@
-"""The gate: which readings are used, which sensors are excluded, and when they return."""
+"""The gate: which readings are used, which sensors are excluded, and when they return.
+
+Laws without a covariance cannot weigh an innovation: `ReadingRange` leaves out wild values, such as
+9999, far outside all that has been measured. If the readings of the sensor stay there, the process
+has moved.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from livepde.laws.member_arrays import changed
 from livepde.linalg import Array, IntArray, Mask
+from livepde.stepping import Interval
 
 MOVED = 20.0  # standard deviations of the noise: a smaller range does not show the process's size
 LASTING = 100  # readings that misfit, after which constants have to explain them as well
 CALM = 50  # samples without a correction of the state, after which a disturbance is over
 SETTLED = 20  # readings used, before which a lasting misfit may come from a poor start
 ABSURD = 10.0  # ranges outside of the past, as the runaway of `Guards`
+PATIENCE = 3  # wild readings in a row, after which the process has moved
 
 
 @dataclass(frozen=True, eq=False)
 class Screened:
-    """What the gate remembers of each sensor; arrays have the shape (members, sensors).
+    """What the gate remembers of each sensor; arrays have the shape (members, sensors)."""
 
-    Attributes
-    ----------
-    refused, changes
-        Refusals in a row, and how many of these readings differed from the one before.
-    fits
-        Readings in a row that fit, of a sensor of which too many did not.
-    taken
-        Readings that were used, at most `SETTLED`.
-    aside
-        Sensors that are set aside.
-    apart
-        Sensors that are believed, and correct the state but not the unknowns.
-    since, off
-        Time of the first refusal in a row, and the last innovation; NaN without a refusal.
-    low, high
-        Range of the readings that were used; NaN before.
-    last, run, longest
-        The last reading, how often it has been repeated, and the longest repetition of a reading
-        that was used.
-    strain
-        Readings that misfit while they corrected the state, since a disturbance began.
-    calm
-        Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
-    """
-
+    # Refusals in a row, and how many of these readings differed from the one before.
     refused: IntArray
     changes: IntArray
-    fits: IntArray
-    taken: IntArray
-    aside: Mask
-    apart: Mask
+    fits: IntArray  # readings in a row that fit, of a sensor of which too many did not
+    taken: IntArray  # readings that were used, at most `SETTLED`
+    aside: Mask  # sensors that are set aside
+    apart: Mask  # sensors that are believed, and correct the state but not the unknowns
+    # Time of the first refusal in a row, and the last innovation; NaN without a refusal.
     since: Array
     off: Array
+    # Range of the readings that were used; NaN before.
     low: Array
     high: Array
+    # The last reading, how often it has been repeated, and the longest repetition of a reading that
+    # was used.
     last: Array
     run: IntArray
     longest: IntArray
+    # Readings that misfit while they corrected the state, since a disturbance began.
     strain: IntArray
+    # Samples of a disturbance since a sensor was `apart`, at most `CALM`, shape (members,).
     calm: IntArray
 
     @classmethod
     def start(cls, sensors: int, members: int = 1) -> Screened:
         """Return the value before any sample."""
-        never, none = np.full((members, sensors), np.nan), np.zeros((members, sensors), np.int64)
-        no = none > 0
-        return cls(
-            refused=none,
-            changes=none,
-            fits=none,
-            taken=none,
-            aside=no,
-            apart=no,
-            since=never,
-            off=never,
-            low=never,
-            high=never,
-            last=never,
-            run=none,
-            longest=none,
-            strain=none,
-            calm=np.full(members, CALM),
-        )
+        none = np.zeros((members, sensors), np.int64)
+        counts = ("refused", "changes", "fits", "taken", "run", "longest", "strain")
+        same: dict[str, Any] = dict.fromkeys(counts, none)
+        same |= dict.fromkeys(("since", "off", "low", "high", "last"), none + np.nan)
+        same |= dict.fromkeys(("aside", "apart"), none > 0)
+        return cls(calm=np.full(members, CALM), **same)
 
     def fitted(self, z: Array, present: Mask) -> Screened:
         """Return the value after a sample that all fit, of members that refuse nothing."""
@@ -121,24 +97,12 @@ class Screened:
 
 
 class Gated(NamedTuple):
-    """Outcome of the gate for a sample, each of shape (members, sensors).
+    """Outcome of the gate for a sample, each of shape (members, sensors)."""
 
-    Attributes
-    ----------
-    kept
-        Readings that are used.
-    anchored
-        Readings that correct the state alone.
-    counted
-        Readings that count in the test for jumps.
-    state
-        What the gate remembers.
-    """
-
-    kept: Mask
-    anchored: Mask
-    counted: Mask
-    state: Screened
+    kept: Mask  # readings that are used
+    anchored: Mask  # readings that correct the state alone
+    counted: Mask  # readings that count in the test for jumps
+    state: Screened  # what the gate remembers
 
 
 @dataclass(frozen=True)
@@ -176,14 +140,9 @@ class Gate:
     ) -> Gated:
         """Return what is used of a sample at time t.
 
-        Parameters
-        ----------
-        z, d, noise
-            Readings, innovations and their noise, shapes (members, sensors).
-        far, used
-            Readings that do not fit, and those that are present.
-        pause
-            Members for which the sample follows a pause, shape (members,).
+        `z`, `d`, `noise`: readings, innovations and their noise, shapes (members, sensors). `far`,
+        `used`: readings that do not fit, and those that are present. `pause`: members for which the
+        sample follows a pause, shape (members,).
         """
         last, run, same = x.shown(z, used)
         outside, absurd = self._out_of_range(x, z, noise)
@@ -242,3 +201,52 @@ class Gate:
         span = np.fmax.reduce(ranges, axis=1, initial=0.0)[:, None]
         moved = span > MOVED
         return moved & (beyond > span), moved & (beyond > ABSURD * span)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingRange:
+    """Range of the readings of each sensor, shapes (sensors,)."""
+
+    # Range of the readings that were used; NaN before any.
+    low: Array
+    high: Array
+    count: IntArray  # number of readings that were used, at most `SETTLED`
+    wild: IntArray  # wild readings in a row; of a sensor whose last reading was used 0
+
+    @classmethod
+    def start(cls, sensors: int) -> ReadingRange:
+        """Return the value before any reading."""
+        never, none = np.full(sensors, np.nan), np.zeros(sensors, dtype=np.int64)
+        return cls(low=never, high=never, count=none, wild=none)
+
+    def screened(self, interval: Interval, noise: Array | None) -> tuple[Interval, ReadingRange]:
+        """Return an interval without wild readings at both ends, and the value after it."""
+        z = interval.z1
+        wild = self._wild(z, 0.0 if noise is None else MOVED * noise)
+        before = self.wild > 0
+        lasting = wild & (self.wild >= PATIENCE)
+        wild &= ~lasting
+        used = np.where(wild, np.nan, z)
+        present = np.isfinite(used)
+        after = ReadingRange(
+            low=np.fmin(self.low, used),
+            high=np.fmax(self.high, used),
+            count=np.minimum(self.count + present, SETTLED),
+            wild=np.where(wild, self.wild + 1, np.where(present, 0, self.wild)),
+        )
+        if not (wild.any() or before.any()):
+            return interval, after
+        z0 = np.where(before, np.nan, interval.z0)
+        return replace(interval, z0=z0, z1=used), after
+
+    def _wild(self, z: Array, least: float | Array) -> Mask:
+        """Return which readings are far outside their past and that of the other sensors."""
+        known = self.count >= SETTLED
+        none: Mask = np.zeros(len(z), dtype=bool)
+        if not known.any():
+            return none
+        # A process that begins to move is seen by one sensor first: the scale is that of all.
+        scale = np.maximum(np.nanmax(self.high) - np.nanmin(self.low), least)
+        with np.errstate(invalid="ignore"):
+            far: Mask = (z > self.high + ABSURD * scale) | (z < self.low - ABSURD * scale)
+        return known & far & (scale > 0.0)

@@ -40,13 +40,7 @@ def opened(log: Array, span: Span) -> Array:
 
 
 def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
-    """Return a log with the sample at the end of a span, of those members that took it.
-
-    Parameters
-    ----------
-    parts
-        In how many parts the substeps of the span were divided, shape (members,).
-    """
+    """Return a log with the sample at the end of a span, of those members that took it."""
     longer = _extended(log)
     row, sensors = longer[:, -1], span.z1.shape[1]
     row[:, 0] = span.t1
@@ -86,14 +80,7 @@ def _extended(log: Array) -> Array:
 
 
 def withdrawn(log: Array, sensors: Mask, since: Array) -> Array:
-    """Return a log without the readings of some sensors since a time.
-
-    Parameters
-    ----------
-    sensors, since
-        Sensors of each member, and the time of the first reading to leave out, shapes (members,
-        sensors).
-    """
+    """Return a log without the readings of some sensors since a time."""
     gone = sensors[:, None] & (log[:, :, :1] >= since[:, None])
     readings = log[:, :, 1 : 1 + sensors.shape[1]]
     if np.isnan(readings[gone]).all():
@@ -109,7 +96,6 @@ def trimmed(log: Array, first: int) -> Array:
 
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
-    """Return the rows that the one member of a log took."""
     sensors = (log.shape[2] - 2 - len(channels)) // 2
     found = []
     for row in log[0][np.isfinite(log[0, :, 0])]:
@@ -131,19 +117,7 @@ def intervals_since(log: Array, channels: tuple[str, ...]) -> list[Interval]:
     return [Interval.between(first, last) for first, last in pairwise(_rows(log, channels))]
 
 
-def with_readings(log: Array, sensors: int) -> Mask:
-    """Return whether each sample that one member took, shape (rows, ...), has a reading."""
-    taken = log[np.isfinite(log[:, 0]), 1 : 1 + sensors]
-    return np.asarray(np.isfinite(taken).any(axis=1))
-
-
 def reaching(shown: Sequence[bool] | Mask, readings: int) -> int:
-    """Return how many samples, from the last one back, hold so many with a reading; all if fewer.
-
-    Parameters
-    ----------
-    shown
-        Whether a sample has a reading, in time order; one does at least.
-    """
+    """Return how many samples, from the last one back, hold so many with a reading, or all."""
     places = np.flatnonzero(shown)
     return len(shown) - int(places[max(len(places) - readings, 0)])

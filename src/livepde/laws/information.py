@@ -1,4 +1,7 @@
-"""Metric of the information that the data have given: how `GradientLaw(gain="auto")` tunes itself.
+"""The metric of Q in which q learns: a constant gain, or the information that the data have given.
+
+A rule returns the `Metric` of the second line for each stage, and carries its statistics from
+sample to sample. With the metric of the information `GradientLaw(gain="auto")` tunes itself.
 
 The first line of the method says, on the observed part, that q leaves the equation error
 
@@ -66,34 +69,40 @@ failed status, and the data go on to tell J, b and S.
 
 S does not contain a bias that q absorbs without a trace: smoothing that takes too much or too
 little leaves an equation error that moves with w, as a wrong q does. The remedy is smoothing
-without this bias (`livepde.laws.sample_smoothing`).
+without this bias (`livepde.laws.observed_part`).
+
+*Rows.* A diagonal D >= M (Gershgorin; the lumped mass for P1) makes A^T R D^{-1} R^T A as sparse as
+A^T A where sensors select coefficients. Else the rows are those of a basis of N(G)^perp, D is M,
+and the matrix is dense.
+
+Rows are of two kinds, which are kept apart: those of tests within omega, which see nothing but the
+data, and the others, which hold fluxes of the unobserved part.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from livepde.errors import LawError
-from livepde.laws.coupled import Metric
-from livepde.laws.coupled.split_forms import StageForms
-from livepde.laws.metrics import MetricRule, MetricStep, StepBegin, Transition
-from livepde.laws.normal_equations import (
-    NormalEquations,
-    ProjectedRows,
-    SelectedRows,
-    diagonal_bound,
-)
+from livepde.fem import Moment
+from livepde.laws.coupled.equation import Metric, StageForms
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Memo, Pattern
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
+HOLD = 1e12  # times smaller is a gain that keeps q where it is
+
+MetricStep = Callable[[float], Metric]
+"""Step h of a stage -> its metric."""
 PULL = 10.0  # theta h: r forgets within a step
 HELD = 1e6  # times heavier than a sample is a prior that keeps q where it is
 LEADING, DRAWS = 4, 4  # modes and draws of the prior, for traces: their error is a few per cent
@@ -110,43 +119,107 @@ CHANCE = 1e-6  # that a right model leaves its prior
 RESOLUTION = np.array([1e9, 1e5])  # largest ratio of information to prior, rows of both kinds
 
 
+@dataclass(frozen=True)
+class NoState:
+    """Empty state of a rule that carries nothing from sample to sample."""
+
+
+@dataclass(frozen=True, eq=False)
+class StepBegin:
+    """A step before it is taken."""
+
+    # Parameter at its beginning, and w = u_alpha + P u with the data at its end.
+    q: Array
+    w: Array
+    # Time and inputs at its end, and how long it is.
+    moment: Moment
+    length: float
+
+
+@dataclass(frozen=True, eq=False)
+class Transition:
+    """A step that was taken, for a rule to learn from."""
+
+    forms: StageForms  # the forms of the stage
+    # Parameter as the stage has found it, and w = u_alpha + P u, at its end.
+    q: Array
+    w: Array
+    change: Array  # by how much q has changed, shape (m,)
+    # Returns the equation error of the data at its end, shape (n,), R^T eps = -theta R^T M_op r -
+    # R^T M r'.
+    error: Callable[[], Array]
+    # Time and inputs at its end, and how long it was.
+    moment: Moment
+    length: float
+
+
+State = TypeVar("State")
+
+
+class MetricRule(ABC, Generic[State]):
+    """Abstract rule for the metric of Q."""
+
+    @abstractmethod
+    def init(self, q0: Array) -> State:
+        """Return the state before the first sample."""
+
+    @abstractmethod
+    def step(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
+        """Return the metric of the stages of a step."""
+
+    @abstractmethod
+    def frozen(self, state: State, forms: StageForms, begin: StepBegin) -> MetricStep:
+        """Return the same for a step in which q is held."""
+
+    def learn(self, state: State, after: Transition) -> State:
+        """Return the state after a step."""
+        return state
+
+    def doubt(self, state: State, q: Array) -> str:
+        """Return why an estimate is not to be believed; empty if it may be."""
+        return ""
+
+    def diagnostics(self, state: State, q: Array, length: float) -> Diagnostics[float]:
+        """Return gain, information and departure after a step, as far as known."""
+        return Diagnostics()
+
+
+@dataclass(frozen=True, eq=False)
+class ConstantMetric(MetricRule[NoState]):
+    """G_Q/gain, and the stabilising term sigma q of (noisy_q)."""
+
+    gain: float
+    sigma: float
+
+    def init(self, q0: Array) -> NoState:
+        return NoState()
+
+    def step(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
+        return lambda _: Metric(1.0 / self.gain, self.sigma)
+
+    def frozen(self, state: NoState, forms: StageForms, begin: StepBegin) -> MetricStep:
+        return lambda _: Metric(HOLD / self.gain)
+
+
 @dataclass(frozen=True, eq=False)
 class Information:
-    """Sums over the samples so far, and the metric that was made of them last.
+    """Sums over the samples so far, and the metric that was made of them last."""
 
-    Attributes
-    ----------
-    origin
-        q0, shape (m,).
-    matrix, right
-        Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
-    total
-        trace(G_Q^{-1} J) of the same, shape (2,).
-    given
-        trace(G_Q^{-1} J) of all rows without fading.
-    force
-        A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m).
-    power
-        Means of the power of forces and of half that of their changes, each measured against smooth
-        and against rough functions, shape (2, 2).
-    seen
-        Means of the traces that they are relative to, shape (2,).
-    elapsed, samples
-        Time and number of samples.
-    spread, held, weighed
-        S, data of J, and trace(G_Q^{-1} J) in the current H.
-    """
-
-    origin: Array
+    origin: Array  # q0, shape (m,)
+    # Data of J in its pattern, shape (2, entries), and b, shape (2, m), of both kinds of rows.
     matrix: Array
     right: Array
-    total: Array
-    given: float
-    force: Array
+    total: Array  # trace(G_Q^{-1} J) of the same, shape (2,)
+    given: float  # trace(G_Q^{-1} J) of all rows without fading
+    force: Array  # A^T D^{-1} eps of the last sample, and its representative in Q, shape (2, m)
+    # Means of the power of forces and of half that of their changes, each measured against smooth
+    # and against rough functions, shape (2, 2).
     power: Array
-    seen: Array
+    seen: Array  # means of the traces that they are relative to, shape (2,)
+    # Time and number of samples.
     elapsed: float
     samples: int
+    # S, data of J, and trace(G_Q^{-1} J) in the current H.
     spread: float
     held: Array
     weighed: float
@@ -191,10 +264,7 @@ def trace_probes(space: HilbertSpace) -> Array:
 
 
 def _root(inverse: Callable[[Array], Array], x: Array, modes: Array) -> Array:
-    """Return the square root of an operator times x, on the orthogonal complement of some modes.
-
-    By Lanczos' method.
-    """
+    """Return by Lanczos' method the root of an operator times x, orthogonal to some modes."""
     size, basis, T = float(np.linalg.norm(x)), [], np.zeros((LANCZOS, LANCZOS))
     y = x / size
     for k in range(LANCZOS):
@@ -236,17 +306,8 @@ def _pattern(model: Model, selects: bool) -> Pattern:
 class InformationMetric(MetricRule[Information]):
     """H/PULL instead of G_Q/gain, with H = S G_Q + J.
 
-    Parameters
-    ----------
-    model
-        With its prior.
-    selects
-        True if sensors select coefficients: then J is sparse.
-
-    Attributes
-    ----------
-    pattern
-        Of J.
+    `model`: with its prior. `selects`: True if sensors select coefficients: then J is sparse.
+    `pattern` is that of J.
     """
 
     def __init__(self, model: Model, selects: bool) -> None:
@@ -349,13 +410,7 @@ class InformationMetric(MetricRule[Information]):
         return np.array([dual @ own, dual @ (dual / self.diagonal)])
 
     def _renewed(self, state: Information, change: Array) -> Information:
-        """Return the state with an H that is new if the last one has aged.
-
-        Parameters
-        ----------
-        change
-            The last change of q, shape (m,).
-        """
+        """Return the state with an H that is new if the last one has aged."""
         if not np.all(state.seen > 0.0):
             return state
         least = float((state.total / RESOLUTION).sum())
@@ -398,3 +453,135 @@ class InformationMetric(MetricRule[Information]):
             information=float(state.total.sum()) / spread,
             departure=self.departure(state, q),
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Gain:
+    """Contribution of one sample to the normal equations, per unit of time."""
+
+    # A^T R D^{-1} R^T A of both kinds of rows, data in the pattern of J, shape (2, entries).
+    matrix: Array
+    right: Array  # A^T R D^{-1} R^T y of the same, y = A q - eps, shape (2, m)
+    force: Array  # A^T R D^{-1} R^T eps of all rows, shape (m,)
+    trace: Array  # trace(G_Q^{-1} matrix), shape (2,)
+
+
+class NormalEquations(ABC):
+    """Abstract contributions of samples of one set of sensors to the normal equations."""
+
+    @abstractmethod
+    def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
+        """Return the contribution of a sample."""
+
+    @abstractmethod
+    def trace(self, A: Array, probes: Array) -> Array:
+        """Return `Gain.trace` alone."""
+
+
+class SelectedRows(NormalEquations):
+    """Sensors that select coefficients: D is diagonal and J as sparse as A^T A.
+
+    `pattern`: of A, shape (n, m). `inverse`: D^{-1} of the rows of both kinds, zero elsewhere,
+    shape (2, n). `free`: one for each free coefficient of q, shape (m,). `J`: pattern of J.
+    """
+
+    def __init__(self, pattern: Pattern, inverse: Array, free: Array, J: Pattern) -> None:
+        self.pattern = pattern
+        self.inverse = inverse
+        self.free = free
+        self.shape = (2, J.nnz)
+        rows, cols = pattern.rows, pattern.indices
+        whole = inverse.sum(axis=0)
+        # Each pair of entries of a row is a term of J; those above the diagonal are mirrored.
+        entry = np.flatnonzero((whole[rows] > 0.0) & (free[cols] > 0.0))
+        # Each entry of A, numbered by `entry`, meets all of those in its row: `left` repeats it as
+        # often, and `right` counts through them from the first of the row.
+        own = rows[entry]
+        counts = np.bincount(own, minlength=pattern.shape[0])
+        first = (np.cumsum(counts) - counts)[own]
+        before = np.cumsum(counts[own]) - counts[own]
+        rank = np.arange(counts[own].sum()) - np.repeat(before, counts[own])
+        left = np.repeat(entry, counts[own])
+        right = entry[np.repeat(first, counts[own]) + rank]
+        upper = cols[left] <= cols[right]
+        left, right = left[upper], right[upper]
+        kind = (inverse[1] > 0.0)[rows[left]].astype(np.intp)
+        at = J.positions(cols[left], cols[right]) + J.nnz * kind
+        order = np.argsort(at, kind="stable")
+        self.left, self.right = left[order].astype(np.intp), right[order].astype(np.intp)
+        self.weights = whole[rows[self.left]]
+        self.places, self.starts = np.unique(at[order], return_index=True)
+        entries = self.places % J.nnz
+        mirrored = J.positions(J.indices[entries], J.rows[entries])
+        self.mirrored = mirrored + (self.places - entries)
+
+    def _matrix(self, A: Array) -> Array:
+        data = np.zeros(self.shape)
+        if len(self.starts):
+            # Terms are sorted by their place in J, so that each entry of J is the sum of a segment.
+            terms = A[self.left]
+            terms *= A[self.right]
+            terms *= self.weights
+            flat, sums = data.ravel(), np.add.reduceat(terms, self.starts)
+            flat[self.places] = sums
+            flat[self.mirrored] = sums
+        return data
+
+    def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
+        matrix = self.pattern.compact(A)
+        images = matrix @ np.column_stack([self.free * q, probes])
+        y = images[:, 0] - error
+        columns = np.column_stack([*(self.inverse * y), self.inverse.sum(axis=0) * error])
+        products = (matrix.T @ columns).T * self.free
+        trace = self.inverse @ np.square(images[:, 1:]).sum(axis=1)
+        return Gain(self._matrix(A), products[:2], products[2], trace)
+
+    def trace(self, A: Array, probes: Array) -> Array:
+        images = self.pattern.compact(A) @ probes
+        trace: Array = self.inverse @ np.square(images).sum(axis=1)
+        return trace
+
+
+class ProjectedRows(NormalEquations):
+    """Sensors of any other kind: rows of a basis V of N(G)^perp, D = M, and J dense.
+
+    All of them see the unobserved part.
+
+    `pattern`: of A, shape (n, m). `basis`: V, shape (n, k). `mass`: M, shape (n, n). `free`,
+    `free_q`: one for each free coefficient of u and q.
+    """
+
+    def __init__(
+        self, pattern: Pattern, basis: Array, mass: sp.csr_array, free: Array, free_q: Array
+    ) -> None:
+        self.pattern = pattern
+        values, vectors = np.linalg.eigh(basis.T @ (mass @ basis))
+        # Columns V C with (V C)^T M (V C) = I, so that R M^{-1} R^T = (V C) (V C)^T.
+        self.basis = free[:, None] * (basis @ (vectors / np.sqrt(values)))
+        self.free = free_q
+
+    def gain(self, A: Array, q: Array, error: Array, probes: Array) -> Gain:
+        rows = (self.pattern.matrix(A).T @ self.basis).T * self.free
+        eps = self.basis.T @ error
+        matrix, right = (rows.T @ rows).ravel(), rows.T @ (rows @ q - eps)
+        return Gain(
+            np.stack([np.zeros_like(matrix), matrix]),
+            np.stack([np.zeros_like(right), right]),
+            rows.T @ eps,
+            np.array([0.0, ((rows @ probes) ** 2).sum()]),
+        )
+
+    def trace(self, A: Array, probes: Array) -> Array:
+        images = self.basis.T @ (self.pattern.matrix(A) @ probes)
+        return np.array([0.0, (images**2).sum()])
+
+
+def diagonal_bound(mass: sp.csr_array) -> Array:
+    """Return the diagonal D >= M of Gershgorin's circles, scaled to a unit diagonal of M."""
+    diagonal = mass.diagonal()
+    root = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scale = sp.diags_array(1.0 / root)
+    rows = abs(scale @ mass @ scale).sum(axis=1)
+    # diag(row sums) less the scaled M is diagonally dominant, and so has no negative eigenvalue.
+    bound: Array = np.where(diagonal > 0.0, root**2 * np.maximum(rows, 1.0), 0.0)
+    return bound

@@ -29,24 +29,17 @@ TERMS = np.ravel_multi_index(([0, 0, 1, 0, 1, 0, 2], [0, 0, 1, 4, 5, 3, 2]), (4,
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """Fading moments of the normalised innovations e_k = d_k / sqrt(expected variance).
+    """Fading moments of the normalised innovations e_k = d_k / sqrt(expected variance)."""
 
-    Attributes
-    ----------
-    sums
-        Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2;
-        number of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
-    sensors
-        Shape (members, 4, sensors), of each sensor: 1 once it has brought an e, else 0; its last e;
-        the exponential average of e over `SLOW` samples (`slow`); the variance of that for white
-        noise of size 1 (`slow_variance`).
-    newest
-        e of the last sample, shape (members, sensors), NaN where missing; also of values that a
-        gate has refused twice in a row.
-    """
-
+    # Shape (members, 7), fading over `WINDOW` samples: number of e; of squared weights; e^2; number
+    # of pairs (e_k, e_(k-1)); their product; `slow_variance`; square of `slow`.
     sums: Array
+    # Shape (members, 4, sensors), of each sensor: 1 once it has brought an e, else 0; its last e;
+    # the exponential average of e over `SLOW` samples (`slow`); the variance of that for white
+    # noise of size 1 (`slow_variance`).
     sensors: Array
+    # e of the last sample, shape (members, sensors), NaN where missing; also of values that a gate
+    # has refused twice in a row.
     newest: Array
 
     @classmethod

@@ -5,6 +5,8 @@ unknowns are as uncertain as their prior that error counts, so the first samples
 again, about trajectories of the unknowns that are found by damped Gauss-Newton steps: the iterated
 Kalman smoother of Bell (1994). It accepts a step only if it makes the samples and the prior
 together more probable, and serves unknowns that stay and unknowns that move.
+
+A `Window` is what plain Gauss-Newton steps of a reference act on, such as those of one sample.
 """
 
 from __future__ import annotations
@@ -16,10 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import eigh
 
+from livepde.fem import Moment
 from livepde.laws.assimilation import absorb, assimilate
 from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState
-from livepde.laws.gauss_newton import Window, placed
+from livepde.laws.filter_state import FilterState, along, coordinates
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed, put_each, take
 from livepde.laws.sensitivity_state import NEVER, SensitivityState, SensitivityWork, new_window
@@ -27,6 +29,8 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Mask
 from livepde.stepping import Interval
 
+AGREED = 0.5  # standard deviations between reference and estimate at which the steps stop
+TRUSTED = 1.0  # prior standard deviations that a step moves the reference at most: a trust region
 HALF = 0.5  # share of a variance that is left, below which a linearisation may have mattered
 ITERATIONS = 6  # Gauss-Newton steps at most
 HALVINGS = 4  # of a step that makes samples and prior less probable
@@ -38,24 +42,78 @@ STRIDE = 2.0  # prior standard deviations that a step moves an unknown at most
 OUTLIER = 6.0  # standard deviations of the noise beyond which a reading counts no more
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Window:
+    """Some samples of one member: the filter before and after them."""
+
+    # The filter where the window begins, and after the samples.
+    start: FilterState
+    now: FilterState
+    # Latent parameter at the start from which the reference of `now` comes, shape (m,).
+    reference: Array
+    # True if the window begins with the initial state that the model says (`Model.initial`).
+    initial: bool
+    # Time and inputs at the start, and the time since.
+    moment: Moment
+    length: float
+
+
+def _missed(filter_: Filter, window: Window) -> Array:
+    """Return by how much the reference misses the estimate at the window's start, shape (k,)."""
+    reduction, drift = filter_.reduction, float(filter_.drifts(window.now.member)[0])
+    estimate = reduction.bounded(filter_.estimate(window.now)[0])
+    start = reduction.traced(estimate, window.start.q[0], window.length, drift)
+    return reduction.reduced(start - window.reference)
+
+
+def next_reference(filter_: Filter, window: Window) -> Array:
+    """Return the reference at the window's start that is next: towards the estimate, (m,)."""
+    step = _missed(filter_, window)
+    step = step * min(1.0, TRUSTED / max(float(np.abs(step).max()), 1e-300))
+    q: Array = window.reference + filter_.reduction.Phi @ step
+    return q
+
+
+def missed_most(filter_: Filter, window: Window) -> float:
+    """Return by how many prior standard deviations the reference misses the estimate."""
+    return float(np.abs(_missed(filter_, window)).max(initial=0.0))
+
+
+def distance(filter_: Filter, window: Window) -> float:
+    """Return the distance between estimate and reference, in standard deviations."""
+    now = window.now
+    shift = filter_.reduction.transition(window.length) @ _missed(filter_, window)
+    # In standard deviations that are inflated as the reported ones are.
+    return deviations(now, shift) / float(now.innovations.inflation[0])
+
+
+def placed(filter_: Filter, window: Window, q: Array) -> FilterState:
+    """Return the filter at the start of the window, linear about q."""
+    model, reduction = filter_.problem.model, filter_.reduction
+    now, start = window.now, window.start
+    start = replace(start, level=now.level, samples=now.samples, kept=now.kept)
+    shift = reduction.reduced(q - start.q[0])
+    # Such an initial state moves with q along du_0/dq, and is uncertain by the unknowns alone.
+    if window.initial:
+        initial = model.initial_directions(q, reduction.Phi, window.moment)
+        u, du = model.initial_state(q, window.moment), -initial @ shift
+        U = start.C @ initial.T
+        return replace(start, q=q[None], u=u[None], du=du[None], da=-shift[None], U=U)
+    # The estimate does not move with the reference: du and da fall by as much.
+    moved = along(start, 0, shift)
+    return replace(start, q=q[None], u=start.u + moved, du=start.du - moved, da=start.da - shift)
+
+
 @dataclass(frozen=True, eq=False)
 class _Pass:
-    """The samples, assimilated linear about one trajectory of the unknowns.
+    """The samples, assimilated linear about one trajectory of the unknowns."""
 
-    Attributes
-    ----------
-    trajectory, smoothed
-        Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
-        which the filter was linear, and those that it then estimates from all samples.
-    x
-        The filter after the last sample.
-    misfit
-        Minus twice the logarithm of the probability of the trajectory, up to a constant.
-    """
-
+    # Reduced unknowns at the start and in each interval, shape (1 + intervals, k): those about
+    # which the filter was linear, and those that it then estimates from all samples.
     trajectory: Array
     smoothed: Array
-    x: FilterState
+    x: FilterState  # the filter after the last sample
+    # Minus twice the logarithm of the probability of the trajectory, up to a constant.
     misfit: float
 
 
@@ -92,13 +150,18 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
         moved = math.inf if best is None else apart(work.filter, best.x, state.now)
         found = None if best is None else best.x
         if best is not None and searched is not samples:
-            if moved <= holds and usual(state.now) and _is_square(state.now):
-                found = _accompanied(best.x, state.now)
+            now = state.now
+            if moved <= holds and usual(now) and now.C.shape[1] == now.C.shape[2]:
+                # Ledger and errors of the discretisation are linear about the trajectory, on the
+                # rows of the square root, which are those of the prior: updates move them alike.
+                found = changed(best.x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
             else:
                 whole = samples.about(best.trajectory)
                 found = None if whole is None else whole.x
         if found is not None:
-            state = changed(state, now=work.filter.relinearised(_without_past(found)))
+            # Earlier values would cost columns in each later update.
+            found = changed(found, past=found.past[:, :, :0], dpast=found.dpast[:, :0])
+            state = changed(state, now=work.filter.relinearised(found))
         stays = shares[-1] < HALF and not work.filter.moves
         if stays and count >= ENOUGH and moved <= holds:
             return changed(state, due=np.array([NEVER])), moved
@@ -115,30 +178,13 @@ def iterated_smoother(samples: _Samples) -> _Pass | None:
         if one is None:
             continue
         ends.append(_descended(samples, one))
+        step = (one.smoothed - one.trajectory)[-1]
+        held = deviations(one.x, step) <= HOLDS * math.sqrt(len(step))
         # Gauss-Newton steps end in a local minimum: other beginnings are spared only if this one
         # explains the samples, and either these are many or its first linearisation held.
-        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or _holds(one)):
+        if samples.explained(ends[-1]) and (len(samples.intervals) >= ENOUGH or held):
             break
     return min(ends, key=lambda one: one.misfit, default=None)
-
-
-def _without_past(x: FilterState) -> FilterState:
-    """Return a filter without earlier values, which would cost columns in each later update."""
-    return changed(x, past=x.past[:, :, :0], dpast=x.dpast[:, :0])
-
-
-def _is_square(x: FilterState) -> bool:
-    """True if the rows of the square root are those of the prior, moved by updates alone."""
-    return bool(x.C.shape[1] == x.C.shape[2])
-
-
-def _accompanied(x: FilterState, now: FilterState) -> FilterState:
-    """Return a filter with the ledger and the errors of the discretisation of another one.
-
-    For two that are near each other: these data are linear about the trajectory, and stand on the
-    rows of the square root, which updates move alike.
-    """
-    return changed(x, ledger=now.ledger, causes=now.causes, shadows=now.shadows)
 
 
 def usual(x: FilterState) -> bool:
@@ -158,18 +204,11 @@ def _beginnings(samples: _Samples) -> Iterator[Array]:
     yield np.zeros(shape)
 
 
-def _holds(one: _Pass) -> bool:
-    """True if samples and prior together are most probable where the pass is linear."""
-    step = (one.smoothed - one.trajectory)[-1]
-    return _deviations(one.x, step) <= HOLDS * math.sqrt(len(step))
-
-
 def _descended(samples: _Samples, best: _Pass) -> _Pass:
-    """Return the pass about a most probable trajectory near that of another."""
     for _ in range(ITERATIONS):
         step = best.smoothed - best.trajectory
         # Where the step is within the uncertainty, the second-order error is far below it.
-        if _deviations(best.x, step[-1]) <= CONVERGED:
+        if deviations(best.x, step[-1]) <= CONVERGED:
             break
         step *= min(1.0, STRIDE / max(float(np.abs(step).max()), 1e-300))
         better = _damped(samples, best, step)
@@ -202,13 +241,12 @@ def _damped(samples: _Samples, best: _Pass, step: Array) -> _Pass | None:
 def apart(filter_: Filter, x: FilterState, other: FilterState) -> float:
     """Return how far estimates of two filters are apart, in standard deviations of the first."""
     shift = filter_.reduction.reduced(filter_.estimate(x) - filter_.estimate(other))[0]
-    return _deviations(x, shift)
+    return deviations(x, shift)
 
 
-def _deviations(x: FilterState, shift: Array) -> float:
-    # The length of the least xi with C^T xi = shift, where xi ~ N(0, I).
-    weights = np.linalg.lstsq(x.C[0].T, shift, rcond=None)[0]
-    return float(np.linalg.norm(weights))
+def deviations(x: FilterState, shift: Array) -> float:
+    """Return the length of a shift of the unknowns of one member in standard deviations."""
+    return float(np.linalg.norm(coordinates(x.C[0], shift)))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -338,13 +376,7 @@ def missed(filter_: Filter, x: FilterState, interval: Interval) -> float:
 
 
 def moved(filter_: Filter, before: Array, after: Array, h: float, gained: Array) -> float:
-    """Return the squared increment of a trajectory in a time h, in units of its process noise.
-
-    Parameters
-    ----------
-    gained
-        Variance of the process noise of each coordinate in that time, shape (k,).
-    """
+    """Return the squared increment of a trajectory in a time h, in units of its process noise."""
     increment = after - filter_.reduction.transition(h) @ before
     return float((increment[gained > 0.0] ** 2 / gained[gained > 0.0]).sum())
 

@@ -476,7 +476,7 @@ class Law(ABC, Generic[Work, State]):
     def stepped_alone(self, work: Work) -> str:
         """Return why the members of a fleet are stepped one by one; empty if as arrays.
 
-        A law that steps them as arrays has `begin_members`, `step_members` and `member_belief`.
+        A law that steps them as arrays has `step_members` and `member_belief`.
         """
         return f"{type(self).__name__} steps one at a time"
 

@@ -41,7 +41,6 @@ def _each(function: Callable[..., Any], first: Any, *others: Any) -> Any:
 
 
 def _members(state: Any) -> int:
-    """Return the number of members of a state."""
     while not isinstance(state, np.ndarray):
         state = next(iter(vars(state).values()))
     return len(state)

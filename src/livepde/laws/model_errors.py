@@ -17,8 +17,8 @@ import numpy as np
 
 from livepde.fem import Scalar
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
+from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
-from livepde.laws.refit_options import Refit
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.observation import Points
@@ -113,7 +113,6 @@ Roots: TypeAlias = Callable[[float], Array]
 
 
 def _families(known: Mapping[str, tuple[IntArray, Roots]]) -> Iterator[Family]:
-    """Iterate over random errors: each kind, and several at once."""
     groups: list[tuple[tuple[str, ...], tuple[float, ...]]]
     groups = [((name,), FAMILY_SIZES) for name in known]
     groups += [(names, JOINT_SIZES) for names in JOINT if set(names) <= set(known)]
@@ -130,11 +129,8 @@ def model_errors(
 ) -> ModelErrors | str:
     """Return misfit and intervals that allow for errors of the model, or why there are none.
 
-    Parameters
-    ----------
-    std, shift
-        Reported standard deviations of the latent unknowns, and their shifts by the discretisation,
-        (m,).
+    `std`, `shift`: reported standard deviations of the latent unknowns, and their shifts by the
+    discretisation, (m,).
     """
     one = _best(samples)
     if one is None:
@@ -171,8 +167,7 @@ def _best(samples: StoredSamples) -> Passed | None:
         return one
     # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
     there = np.isfinite(one.residuals)
-    J, r = one.slopes[there], one.residuals[there]
-    step = np.linalg.solve(np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi)
+    step = np.linalg.solve(*one.model(there))
     better = samples.about(samples.within_bounds(one.xi + step))
     return one if better is None or better.cost(there) > one.cost(there) else better
 
@@ -198,18 +193,12 @@ def _columns(values: Array, used: Mask) -> Iterator[tuple[Array, Mask]]:
 def _allowed(
     samples: StoredSamples, mixture: Mixture, variance: Array, std: Array
 ) -> Iterator[Allowed]:
-    """Iterate over the unknowns with their intervals.
-
-    Parameters
-    ----------
-    variance, std
-        Variance that the noise alone leaves of the latent unknowns, and their reported standard
-        deviations, (m,).
-    """
     problem, reduction = samples.filter.problem, samples.filter.reduction
     latent, base = problem.model.latent, samples.state.start.q[0]
     own = set(problem.observed.observation.unknowns)
-    own |= {name for name, item in latent.parts.items() if _corrects(item.unknown)}
+    for name, item in latent.parts.items():
+        if isinstance(item.unknown, Scalar) and item.unknown.corrects:  # an input
+            own.add(name)
     low, high = mixture.interval
     known = samples.filter.estimate(samples.state.now)[0]
     both = (known, base + low, base + high, known - QUANTILE * std, known + QUANTILE * std)
@@ -237,22 +226,13 @@ def _allowed(
         yield Allowed.of(name, unit, numbers, of_sensor=name in own)
 
 
-def _corrects(unknown: object) -> bool:
-    """Return whether an unknown corrects an input."""
-    return isinstance(unknown, Scalar) and unknown.corrects
-
-
 def linear_model(
     samples: StoredSamples, one: Passed, used: Mask, T: Array
 ) -> tuple[LinearModel, Causes, list[Family]]:
     """Return the readings in use as a linear model, and what may be wrong.
 
-    Parameters
-    ----------
-    one, used
-        The best fit, and the readings that it uses.
-    T
-        What is asked for, as rows on the coordinates xi, (numbers, r).
+    `one`, `used`: the best fit, and the readings that it uses. `T`: what is asked for, as rows on
+    the coordinates xi, (numbers, r).
     """
     work = len(samples.spans) * samples.filter.problem.model.X.dim
     fine = len(samples.spans) >= MANY and work * MOST_COLUMNS < MOST_WORK

@@ -1,120 +1,298 @@
-"""The observed part u_alpha of the state over one interval: G^+ z, or G_alpha z (section 3.2)."""
+"""The observed part u_alpha of the state over one interval: G^+ z, or G_alpha z (section 3.2).
+
+Noisy samples are smoothed for `GradientLaw(gain="auto")`, with no noise level given.
+
+The law differentiates the readings: noise of w and noise of B(w) are correlated, and the part that
+smoothing removes from B(w) moves with w. Neither averages out, and both look like a wrong q. So
+alpha is not the one of the best u_alpha, but the one where the two biases cancel. With z the data,
+n their noise, and L = (|.|^2)^{1/2}, second derivatives for `Tikhonov("V")`,
+
+    E (u_alpha, L (u_alpha - u)) = 0,    that is    E (u_alpha, L (z - u_alpha)) = E (u_alpha, L n).
+
+Smoothing is Tikhonov's, iterated: u_j minimises ||G v - z||_Z^2 + alpha |v - u_{j-1}|^2. Its
+factors on the modes of G and |.| are 1 - f, f = (alpha k/(s + alpha k))^ORDER: the bias of smooth
+functions falls with the power, that of noise does not. Both sides of the balance are running means
+over the samples so far, for each alpha of a grid, and alpha is the first where they meet.
+
+The level of the noise is read from the rougher half of the modes, where a smooth state has next to
+none, and there from products of successive differences in time,
+
+    E (z_k - z_{k-1}) (z_{k-1} - z_{k-2}) = -sigma^2:
+
+noise turns back, a motion goes on. The level is not taken larger than the observation states. Noise
+is independent from sensor to sensor with the standard deviations that the observation states, or
+white in Z if it states none.
+
+Exact data turn back nowhere. The same products, of second derivatives of the data, detect this
+(`NoiseDetector`) before any mode is computed, since the modes are those of a dense matrix: then
+alpha is zero and a sample costs a few products with a sparse one.
+"""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Generic, TypeVar
+from typing import TypeAlias
 
 import numpy as np
+import scipy.sparse as sp
 
+from livepde.errors import LawError
+from livepde.laws.information import NoState
 from livepde.laws.law import Problem
-from livepde.laws.metrics import NoState
-from livepde.laws.sample_smoothing import Balance, NoiseDetector, SmoothingOperator
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, Memo
-from livepde.observation import Reconstructed, Split
+from livepde.observation import Observed, Reconstructed, Split, Tikhonov
+from livepde.observation.reconstruction import Spectral, penalty_matrix
 from livepde.stepping import Interval
 
+ORDER = 4  # of the iterated Tikhonov method
+GRID = np.geomspace(1e-12, 1e8, 161)  # alpha in units of its scale
+LARGEST = 3000  # sensors: the modes are those of a dense matrix
+ROUNDING = 1e-14  # of second derivatives, relative to the sum of their terms
+FEWEST = 8  # modes below which their rougher half says nothing about noise
 LARGEST_MEMO = 8  # smoothers kept for different sets of present sensors
 
-State = TypeVar("State")
+
+@dataclass(frozen=True, eq=False)
+class Balance:
+    """Running means over the samples."""
+
+    left: Array  # (u_alpha, L (z - u_alpha)) for each alpha, shape (alphas,)
+    noise: Array  # E (u_alpha, L n) for noise of the stated level, or of level 1, shape (alphas,)
+    power: float  # square of the noise level, as a multiple of that
+    # Number of samples, and of those that told of the level.
+    samples: int
+    pairs: int
+    # The last two samples and the boundary values at their times, shapes (2, sensors), (2, n).
+    z: Array
+    boundary: Array
+    # Sum of the cosines by which samples have turned back so far; those of exact data go on.
+    turned: float
+
+    @classmethod
+    def none(cls, sensors: int, n: int) -> Balance:
+        """Return the means before the first sample."""
+        left, z = np.zeros(len(GRID)), np.full((2, sensors), np.nan)
+        return cls(left, left, 0.0, 0, 0, z, np.zeros((2, n)), 0.0)
+
+    def followed(self, z: Array, boundary: Array) -> Balance:
+        """Return the same with one more sample, of which nothing else is taken."""
+        samples, known = np.stack([self.z[1], z]), np.stack([self.boundary[1], boundary])
+        return replace(self, z=samples, boundary=known)
 
 
-class ObservedPath(ABC):
+def smooths(observed: Observed) -> bool:
+    """Return true if smoothing is chosen here: by default for samples of a function.
+
+    Averages are not differentiated, so noise of theirs needs no smoothing in space. Raises
+    `LawError` for noisy samples of which the law cannot say how to smooth them.
+    """
+    observation = observed.observation
+    if not observation.nodal or observation.reconstruction.regularises:
+        return False
+    if len(observed.state.fields) == 1 and observed.size <= LARGEST:
+        return True
+    if observed.noise is not None:
+        raise LawError(
+            f"GradientLaw: gain='auto' chooses how to smooth a state of one component with up to "
+            f"{LARGEST} sensors: give the observation a reconstruction=, such as Tikhonov('X'), or "
+            "leave out noise= if the data are exact."
+        )
+    return False
+
+
+class NoiseDetector:
+    """Distinguishes noisy samples of one set of present sensors from exact ones.
+
+    Second derivatives of noise are large and turn back with the next sample.
+    """
+
+    def __init__(self, observed: Observed, split: Split) -> None:
+        shown = split.R.diagonal()
+        penalty = penalty_matrix("V", observed, shown[:, None])
+        self.split = split
+        self.rows = sp.csr_array(penalty[np.flatnonzero(shown)])
+        diagonal = penalty.diagonal()[np.flatnonzero(shown)]
+        self.scale = np.divide(1.0, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
+        self.small = int(shown.sum()) < FEWEST
+
+    def add(self, balance: Balance, z: Array, boundary: Array) -> tuple[Balance, bool]:
+        """Return the means with the noise products of a sample, and whether there is noise."""
+        samples = np.stack([*balance.z, z])
+        if np.isfinite(samples[:, self.split.present]).all():
+            known = [*balance.boundary, boundary]
+            pairs = zip(samples, known, strict=True)
+            u = np.stack([self.split.reconstruct(*pair) + pair[1] for pair in pairs])
+            before, now = np.diff(self.rows @ u.T, axis=1).T
+            size = math.sqrt(float((before**2 @ self.scale) * (now**2 @ self.scale)))
+            rounding = abs(self.rows) @ np.abs(u).max(axis=0) * ROUNDING
+            if size > float(rounding**2 @ self.scale):
+                # The cosine: each pair of changes counts the same, however large a start was.
+                turned = balance.turned - float(before @ (self.scale * now)) / size
+                balance = replace(balance, turned=turned)
+        return balance, self.small or balance.turned > 0.0
+
+
+class SmoothingOperator:
+    """G_alpha for one set of present sensors, and the terms of a sample in the balance."""
+
+    def __init__(self, observed: Observed, present: Array) -> None:
+        self.spectral = filter_ = Spectral(Tikhonov("V"), observed, present)
+        self.stated = observed.noise is not None
+        self.size = filter_.size
+        if self.size == 0:
+            return
+        s, k = filter_.s, filter_.k
+        # Only Dirichlet values are in the boundary, so only their rows are ever asked for.
+        self.fixed = observed.X.fixed
+        self.pulled = np.ascontiguousarray(filter_.pulled[self.fixed].T)
+        self.G = sp.csr_array(filter_.G[:, self.fixed])
+        stiff = k > 0.0
+        self.inverse = np.where(stiff, 1.0 / np.where(stiff, k, 1.0), 0.0)
+        # s Var(n) of each mode: one for noise that is white in Z.
+        if observed.noise is None:
+            self.variance = np.ones(self.size)
+        else:
+            spread = filter_.fitted * observed.noise[present]
+            self.variance = (spread**2).sum(axis=1) / s
+        self.removed = self._removed(GRID[:, None] * filter_.rho)
+        # On the modes L is (k/s)^(1/2), and the inner product of Z weighs by s: (k s)^(1/2)
+        # together.
+        self.told = self.removed * (1.0 - self.removed)
+        self.weight = np.sqrt(k * s)
+        self.noise = (1.0 - self.removed) @ (np.sqrt(k / s) * self.variance)
+
+    def _removed(self, alpha: Array | float) -> Array:
+        s, k = self.spectral.s, self.spectral.k
+        out: Array = (alpha * k / (s + alpha * k)) ** ORDER
+        return out
+
+    def _rough(self, z: Array, boundary: Array) -> tuple[Array, Array]:
+        """Return the modes of the data, and those less the smooth continuation of the boundary.
+
+        For samples z of shape (samples, sensors), with boundary values of shape (samples, n).
+        """
+        filter_, held = self.spectral, boundary[:, self.fixed].T
+        known = z[:, filter_.present].T - self.G @ held
+        modes = (filter_.fitted @ known) / filter_.s[:, None]
+        return modes, modes + (self.pulled @ held) * self.inverse[:, None]
+
+    def add(self, balance: Balance, z: Array, boundary: Array) -> Balance:
+        """Return the means with one more sample, z of shape (sensors,)."""
+        if self.size == 0 or not np.isfinite(z[self.spectral.present]).all():
+            return balance
+        pair = self.size >= FEWEST and np.isfinite(balance.z[:, self.spectral.present]).all()
+        samples = np.vstack([z, balance.z]) if pair else z[None]
+        e = self._rough(samples, np.vstack([boundary, balance.boundary])[: len(samples)])[1].T
+        left = self.told @ (self.weight * e[0] ** 2)
+        share = 1.0 / (balance.samples + 1)
+        power, pairs = balance.power, balance.pairs
+        if pair:
+            # e holds this sample, the one before the last, and the last one, in this order.
+            back = -self.spectral.s * (e[0] - e[2]) * (e[2] - e[1]) / self.variance
+            half = slice(0, self.size // 2)  # s ascends: the roughest come first
+            pairs += 1
+            power += (float(back[half].mean()) - power) / pairs
+        return replace(
+            balance.followed(z, boundary),
+            left=balance.left + share * (left - balance.left),
+            noise=balance.noise + share * (self.noise - balance.noise),
+            power=power,
+            samples=balance.samples + 1,
+            pairs=pairs,
+        )
+
+    def alpha(self, balance: Balance) -> float:
+        """Return the first alpha where smoothing takes as much as noise has brought."""
+        if self.size == 0:
+            return 0.0
+        power = max(balance.power, 0.0)
+        if self.stated:
+            power = min(power, 1.0) if self.size >= FEWEST else 1.0
+        if power == 0.0:
+            return 0.0
+        excess = balance.left - power * balance.noise
+        above = np.flatnonzero(excess > 0.0)
+        if not len(above):
+            return float(GRID[-1] * self.spectral.rho)
+        first = int(above[0])
+        if first == 0:
+            return 0.0
+        # Between two alphas of the grid the excess is taken as linear in log(alpha).
+        low, high = excess[first - 1], excess[first]
+        part = low / (low - high)
+        return float(GRID[first - 1] ** (1 - part) * GRID[first] ** part * self.spectral.rho)
+
+    def __call__(self, alpha: float, z: Array, boundary: Array) -> Array:
+        """Return u_alpha, shape (n,)."""
+        if self.size == 0:
+            return np.zeros(len(boundary))
+        modes, rough = (part[:, 0] for part in self._rough(z[None], boundary[None]))
+        u: Array = self.spectral.phi @ (modes - self._removed(alpha) * rough)
+        return u
+
+
+Find: TypeAlias = Callable[[Array, Array | None], Reconstructed]
+
+
+class ObservedPath:
     """u_alpha at any time of an interval, each found once."""
 
-    def __init__(self, problem: Problem, interval: Interval) -> None:
+    def __init__(self, problem: Problem, interval: Interval, find: Find) -> None:
         self.problem = problem
         self.interval = interval
+        self._find = find  # from measurements, and Dirichlet values or None if all are zero
         self._found: dict[float, Reconstructed] = {}
 
     def at(self, t: float) -> Reconstructed:
         """Return u_alpha at a time."""
         if t not in self._found:
-            self._found[t] = self.find(self.interval.z(t), self.boundary(t))
+            model, known = self.problem.model, None
+            if not model.homogeneous:
+                known = model.impose(np.zeros(model.X.dim), self.interval.at(t))
+            self._found[t] = self._find(self.interval.z(t), known)
         return self._found[t]
-
-    def boundary(self, t: float) -> Array | None:
-        """Return the Dirichlet values, shape (n,); None if all of them are zero."""
-        model = self.problem.model
-        if model.homogeneous:
-            return None
-        return model.impose(np.zeros(model.X.dim), self.interval.at(t))
-
-    @abstractmethod
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        """Return u_alpha from measurements."""
 
     def diagnostics(self) -> Diagnostics[float]:
         """Return smoothing and misfit at the end of the interval, as far as known."""
-        return Diagnostics()
-
-
-class ObservedPart(ABC, Generic[State]):
-    """Abstract rule for u_alpha; its evolving part is an explicit state."""
-
-    @abstractmethod
-    def init(self) -> State:
-        """Return the state before the first sample."""
-
-    @abstractmethod
-    def over(self, state: State, split: Split, interval: Interval) -> tuple[State, ObservedPath]:
-        """Return the state after the sample at the end of an interval, and u_alpha over it."""
-
-
-@dataclass(frozen=True, eq=False)
-class GeneralizedInverse(ObservedPart[NoState]):
-    """u_alpha = G^+ z."""
-
-    problem: Problem
-
-    def init(self) -> NoState:
-        return NoState()
-
-    def over(
-        self, state: NoState, split: Split, interval: Interval
-    ) -> tuple[NoState, ObservedPath]:
-        return state, _InversePath(self.problem, interval, split)
-
-
-class _InversePath(ObservedPath):
-    def __init__(self, problem: Problem, interval: Interval, split: Split) -> None:
-        super().__init__(problem, interval)
-        self.split = split
-
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        return Reconstructed(self.split.reconstruct(z, boundary), 0.0, 0.0, None)
-
-
-@dataclass(frozen=True, eq=False)
-class RegularizedInverse(ObservedPart[NoState]):
-    """u_alpha = G_alpha z, by the `reconstruction` of the observation."""
-
-    problem: Problem
-
-    def init(self) -> NoState:
-        return NoState()
-
-    def over(
-        self, state: NoState, split: Split, interval: Interval
-    ) -> tuple[NoState, ObservedPath]:
-        return state, _RegularizedPath(self.problem, interval)
-
-
-class _RegularizedPath(ObservedPath):
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        present = self.interval.present
-        return self.problem.observed.reconstruct(z, boundary=boundary, present=present)
-
-    def diagnostics(self) -> Diagnostics[float]:
         found = self.at(self.interval.t1)
         return Diagnostics(alpha=found.alpha, misfit=found.misfit)
 
 
-class SelfChosenSmoothing(ObservedPart[Balance]):
-    """u_alpha smoothed as the noise of the samples asks for (`livepde.laws.sample_smoothing`)."""
+def exact(split: Split, z: Array, boundary: Array | None, alpha: float = np.nan) -> Reconstructed:
+    """Return u_alpha = G^+ z."""
+    return Reconstructed(split.reconstruct(z, boundary), alpha, np.nan, None)
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """u_alpha = G^+ z, or G_alpha z if the `reconstruction` of the observation regularises."""
+
+    problem: Problem
+
+    def init(self) -> NoState:
+        """Return the state before the first sample."""
+        return NoState()
+
+    def over(
+        self, state: NoState, split: Split, interval: Interval
+    ) -> tuple[NoState, ObservedPath]:
+        """Return the state after the sample at the end of an interval, and u_alpha over it."""
+        observed = self.problem.observed
+        if not observed.observation.reconstruction.regularises:
+            return state, ObservedPath(self.problem, interval, partial(exact, split))
+
+        def find(z: Array, boundary: Array | None) -> Reconstructed:
+            return observed.reconstruct(z, boundary=boundary, present=interval.present)
+
+        return state, ObservedPath(self.problem, interval, find)
+
+
+class SelfChosenSmoothing:
+    """u_alpha smoothed as the noise of the samples requires."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
@@ -122,14 +300,16 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
         self._smoothers: Memo[bytes, SmoothingOperator] = Memo(LARGEST_MEMO)
 
     def init(self) -> Balance:
+        """Return the state before the first sample."""
         return Balance.none(self.problem.observed.size, self.problem.model.X.dim)
 
     def over(
         self, state: Balance, split: Split, interval: Interval
     ) -> tuple[Balance, ObservedPath]:
+        """Return the state after the sample at the end of an interval, and u_alpha over it."""
         model, key = self.problem.model, split.present.tobytes()
         detector = self._detectors.get(key, lambda: NoiseDetector(self.problem.observed, split))
-        smoother, alpha = None, 0.0
+        find: Find = partial(exact, split)
         samples = [(interval.t1, interval.z1)]
         if np.isnan(state.z).all():  # the first interval
             samples.insert(0, (interval.t0, interval.z0))
@@ -140,33 +320,21 @@ class SelfChosenSmoothing(ObservedPart[Balance]):
                 make = partial(SmoothingOperator, self.problem.observed, split.present)
                 smoother = self._smoothers.get(key, make)
                 state = smoother.add(state, z, boundary)
-                alpha = smoother.alpha(state)
+                # The alpha of the last sample serves all of the interval.
+                find = _smoothed(smoother, smoother.alpha(state), split, model.X.dim)
             else:
                 state = state.followed(z, boundary)
-        # The alpha of the last sample serves all of the interval.
-        if smoother is None:
-            return state, _InversePath(self.problem, interval, split)
-        return state, _SmoothedPath(self.problem, interval, split, smoother, alpha)
+        return state, ObservedPath(self.problem, interval, find)
 
 
-class _SmoothedPath(_InversePath):
-    def __init__(
-        self,
-        problem: Problem,
-        interval: Interval,
-        split: Split,
-        smoother: SmoothingOperator,
-        alpha: float,
-    ) -> None:
-        super().__init__(problem, interval, split)
-        self.smoother = smoother
-        self.alpha = alpha
+def _smoothed(smoother: SmoothingOperator, alpha: float, split: Split, n: int) -> Find:
+    def find(z: Array, boundary: Array | None) -> Reconstructed:
+        if alpha == 0.0:
+            return exact(split, z, boundary, alpha)
+        known = np.zeros(n) if boundary is None else boundary
+        return Reconstructed(smoother(alpha, z, known), alpha, np.nan, None)
 
-    def find(self, z: Array, boundary: Array | None) -> Reconstructed:
-        if self.alpha == 0.0:
-            return super().find(z, boundary)
-        known = np.zeros(self.problem.model.X.dim) if boundary is None else boundary
-        return Reconstructed(self.smoother(self.alpha, z, known), self.alpha, 0.0, None)
+    return find
 
-    def diagnostics(self) -> Diagnostics[float]:
-        return Diagnostics(alpha=self.alpha)
+
+ObservedPart: TypeAlias = Inverse | SelfChosenSmoothing

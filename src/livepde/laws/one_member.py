@@ -13,20 +13,18 @@ import numpy as np
 
 from livepde.laws.assimilation import UpdateOptions, assimilate
 from livepde.laws.filter_state import FilterState, unaccompanied
-from livepde.laws.gate import Screened
-from livepde.laws.gauss_newton import (
-    CONVERGED,
+from livepde.laws.history import intervals_since, reaching
+from livepde.laws.iterated_smoother import (
+    AGREED,
     Window,
     distance,
     missed_most,
     next_reference,
     placed,
 )
-from livepde.laws.guards import Guards
-from livepde.laws.history import intervals_since, reaching
-from livepde.laws.jumps import Jumps
 from livepde.laws.law import Report, Status
 from livepde.laws.member_arrays import changed
+from livepde.laws.policies import Guards, Jumps
 from livepde.laws.sensitivity_state import (
     SensitivityState,
     SensitivityWork,
@@ -122,7 +120,7 @@ def _iterated(
             start=begin, now=x, reference=begin.q[0], initial=False, moment=start, length=length
         )
         far = missed_most(filter_, window) > guards.reach
-        if not (far and distance(filter_, window) > CONVERGED):
+        if not (far and distance(filter_, window) > AGREED):
             return levelled(x, temper), tempered
         found = _converged(work, window, interval, guards.iterations)
         if found is not None:
@@ -148,7 +146,7 @@ def _converged(
         if not report.status.ok:
             return None
         window = replace(window, now=x, reference=q)
-        if distance(filter_, window) <= CONVERGED:
+        if distance(filter_, window) <= AGREED:
             # Once more about the same reference, now with ledger and discretisation errors.
             x, report = _filtered(work, placed(filter_, last, q), interval)
             return x if report.status.ok else None
@@ -194,13 +192,7 @@ def _rescued(
 
 
 def _since(work: SensitivityWork, state: SensitivityState, row: int) -> list[Interval]:
-    """Return the intervals that one member has taken since a row of the log."""
     return intervals_since(state.log[:, row:], work.filter.problem.channels)
-
-
-def _doubted(screened: Screened) -> int:
-    """Return how many readings in a row were rejected of a sensor that is not excluded."""
-    return int(np.where(screened.aside, 0, screened.refused).max())
 
 
 def _retaken(
@@ -278,7 +270,9 @@ def _watched(
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
-        onset = max(jumps.onset(state.watch, e), _doubted(new.now.screened))
+        screened = new.now.screened
+        doubted = int(np.where(screened.aside, 0, screened.refused).max())
+        onset = max(jumps.onset(state.watch, e), doubted)
         guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         before = _most_likely(work, jumps, state.older, known, guess)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()

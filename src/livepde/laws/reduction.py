@@ -20,17 +20,10 @@ MOST_MODES = 60  # of a field with modes="auto"
 
 @dataclass(frozen=True, eq=False)
 class ReducedEvolution:
-    """How one unknown moves by itself, in reduced coordinates.
+    """How one unknown moves by itself, in reduced coordinates."""
 
-    Attributes
-    ----------
-    part
-        Slice of its reduced coordinates: copies times modes.
-    model, std
-        Evolution model of the latent coefficients, and their prior standard deviation.
-    """
-
-    part: slice
+    part: slice  # slice of its reduced coordinates: copies times modes
+    # Evolution model of the latent coefficients, and their prior standard deviation.
     model: Evolution
     std: float
 
@@ -62,21 +55,12 @@ class ReducedEvolution:
 
 @dataclass(frozen=True, eq=False)
 class Reduction:
-    """Reduced coordinates a ~ N(0, I) of all unknowns, q = prior + Phi a.
+    """Reduced coordinates a ~ N(0, I) of all unknowns, q = prior + Phi a."""
 
-    Attributes
-    ----------
-    problem
-        Model and sensors.
-    Phi
-        Prior standard deviations for numbers, leading modes of the prior for fields, shape (m, k).
-    evolutions
-        Evolution models of the coordinates of each unknown.
-    """
-
-    problem: Problem
+    problem: Problem  # model and sensors
+    # Prior standard deviations for numbers, leading modes of the prior for fields, shape (m, k).
     Phi: Array
-    evolutions: tuple[ReducedEvolution, ...]
+    evolutions: tuple[ReducedEvolution, ...]  # evolution models of the coordinates of each unknown
 
     @classmethod
     def of(cls, problem: Problem, modes: int | str | dict[str, int]) -> Reduction:
@@ -148,13 +132,7 @@ class Reduction:
         return numbers + modes
 
     def named(self, names: Sequence[str] | None, who: str) -> Mask:
-        """Return the coordinates of some unknowns, shape (k,); None means all.
-
-        Raises
-        ------
-        LawError
-            There is no unknown of that name; the message begins with `who`.
-        """
+        """Return the coordinates of some unknowns, shape (k,), None: all; raises `LawError`."""
         parts, space = list(self.problem.model.latent.parts), self.problem.model.parameter_space
         missing = [name for name in names or () if name not in space.parts]
         if missing:
@@ -182,13 +160,6 @@ class Reduction:
 
         A drifting unknown gains the less, the closer its variance is to that of the prior: without
         data it is never less certain than at first.
-
-        Parameters
-        ----------
-        variance
-            Of the coordinates of each member, shape (members, k).
-        drift
-            Prior variances gained per unit of time by unknowns that stay, shape (members,).
         """
         gained = _growth(self.evolutions, h)
         if not drift.any():
@@ -279,13 +250,7 @@ class Reduction:
         )
 
     def directions(self, q: Array, C: Array) -> Array:
-        """Return how the physical parameter changes along rows of a, (members, r, m).
-
-        Parameters
-        ----------
-        q, C
-            Latent parameters, (members, dim), and rows, (members, r, k).
-        """
+        """Return how the physical parameter changes along rows of a, (members, r, m)."""
         latent, along = self.problem.model.latent, C @ self.Phi.T
         if latent.plain:
             return along
@@ -298,15 +263,7 @@ class Reduction:
         )
 
     def traced(self, q: Array, start: Array, h: float, drift: float) -> Array:
-        """Return the latent parameter that is expected to have become q in a time h, shape (m,).
-
-        Parameters
-        ----------
-        start
-            A latent parameter at the earlier time: its part outside the modes is kept, shape (m,).
-        drift
-            As for `gained`.
-        """
+        """Return the latent parameter that is expected to have become q in a time h, shape (m,)."""
         if not (self.moves or drift):
             return q
         prior = self.problem.model.latent.prior
@@ -326,17 +283,13 @@ class Reduction:
                 left[item.part] = np.tile(space.beyond(self.Phi[first]), item.evolution.copies)
         return left
 
-    @cached_property
-    def _unseen(self) -> Array:
-        return np.asarray(np.sqrt(self._left_out))
-
     def rest(self, age: float, drift: float) -> Array:
         """Return the standard deviation of latent coefficients in the omitted modes, (m,).
 
         These coefficients keep their prior, and have moved for a time `age`.
         """
         if age == 0.0 or not self._left_out.any():
-            return self._unseen
+            return np.asarray(np.sqrt(self._left_out))
         grown = []
         for evolution, item in zip(
             self.evolutions, self.problem.model.latent.parts.values(), strict=True

@@ -4,21 +4,45 @@ Levenberg-Marquardt steps within a trust region in prior standard deviations (Mo
 and Toint 2000), with a second-order part that follows curved valleys (Transtrum and Sethna 2012).
 Where the end does not explain the samples, the search begins again at the best of some screened
 points. The gate acts once a search has ended, and may take back readings.
+
+A refit that is due is made at once, or in a thread while samples continue. It is a function of the
+state where it began, so that it may run at any time, and again after a restart. When the filter
+goes over to it depends on the number of samples alone.
 """
 
 from __future__ import annotations
 
 import math
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import scipy
 
-from livepde.laws.outliers import FEW, near_most, near_neighbours, usual_size
-from livepde.laws.refit_options import Refit
+from livepde.laws.assimilation import assimilate
+from livepde.laws.filter_state import FilterState
+from livepde.laws.history import intervals_since
+from livepde.laws.iterated_smoother import HOLDS, apart, iterate_starts, usual
+from livepde.laws.law import numerical
+from livepde.laws.member_arrays import changed, put_each, take
+from livepde.laws.policies import Refit
+from livepde.laws.sensitivity_state import (
+    FitState,
+    Fork,
+    SensitivityState,
+    SensitivityWork,
+    new_window,
+)
+from livepde.laws.step_diagnostics import Diagnostics
 from livepde.laws.stored_samples import Passed, StoredSamples
-from livepde.linalg import Array, Mask
+from livepde.linalg import Array, Mask, nonfinite_allowed
 
+NEIGHBOURS = 3  # in time, to each side of a value
+FEW = 2 * NEIGHBOURS  # values of a sensor up to which all count as near
+NORMAL = 1.4826  # standard deviation of normal values over the median of their sizes
 DELTA = 1.5  # prior standard deviations of the first step at most: 0.5 to 3 do much the same
 ENDS = 0.03  # posterior standard deviations of a last step
 ENDS_EARLY = 1.0  # the same where the samples will be fitted again when there are twice as many
@@ -41,32 +65,69 @@ GATE_ROUNDS = 4
 WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
 GATE = 4.0  # the same for residuals, from those before and after them
 LEVERAGE = 0.1  # least share of its noise that the residual of a reading in use is taken to keep
+AT_ONCE = 64  # samples up to which a refit takes no thread of its own: it is as short as ten steps
+NEAR = 1.0  # standard deviations within which a refit that another one follows keeps these sums
+LATER = 8  # a refit of n samples is used n / 8 samples after it began
+AT_A_TIME = 3  # samples since then that a step takes with the filter of the refit
+
+UNDER_WAY: WeakKeyDictionary[FilterState, Future[SensitivityState]] = WeakKeyDictionary()
+LOCK = threading.Lock()
+
+
+def usual_size(values: Array) -> float:
+    """Return the standard deviation by the median of the sizes of values, at least 1."""
+    return max(1.0, NORMAL * float(np.median(np.abs(values)))) if len(values) else 1.0
+
+
+def near_neighbours(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of their neighbours.
+
+    A model error, which changes slowly, stays.
+    """
+    return _near(values, limit, _of_neighbours)
+
+
+def near_most(values: Array, limit: float) -> Mask:
+    """Return which values lie within `limit` usual distances from the median of all of a sensor.
+
+    A sensor that shows a wrong constant for some time has neighbours that agree with it.
+    """
+    return _near(values, limit, np.median)
+
+
+def _near(values: Array, limit: float, centre: Callable[[Array], Array]) -> Mask:
+    """Return which values lie within `limit` usual distances from the centre of their sensor."""
+    near = np.isfinite(values)
+    for k, column in enumerate(values.T):
+        (places,) = near[:, k].nonzero()
+        if len(places) > FEW:
+            away = column[places] - centre(column[places])
+            near[places, k] = np.abs(away) <= limit * usual_size(away)
+    return near
+
+
+def _of_neighbours(values: Array) -> Array:
+    """Return the median of the neighbours of each value, itself left out, shape (count,)."""
+    count, reach = len(values), NEIGHBOURS
+    windows = np.lib.stride_tricks.sliding_window_view(values, 2 * reach + 1)
+    inner = np.median(np.delete(windows, reach, axis=1), axis=1)
+    edges = {k: np.r_[0:k, k + 1 : 2 * reach + 1] for k in range(reach)}
+    first = [np.median(values[which]) for which in edges.values()]
+    last = [np.median(values[count - 1 - which]) for which in edges.values()]
+    return np.concatenate([first, inner, last[::-1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """End of a search.
+    """End of a search."""
 
-    Attributes
-    ----------
-    best
-        The samples about the trajectory where it ended.
-    used
-        Readings in use, shape (samples, sensors).
-    converged
-        True if no step lowers the cost any more, and samples that are not explained pin all
-        unknowns: then the model is in error, not the search.
-    passes
-        Passes over the samples that it took.
-    screened
-        True if it began again at screened points, and none explains the samples.
-    """
-
-    best: Passed
-    used: Mask
+    best: Passed  # the samples about the trajectory where it ended
+    used: Mask  # readings in use, shape (samples, sensors)
+    # True if no step lowers the cost any more, and samples that are not explained pin all unknowns:
+    # then the model is in error, not the search.
     converged: bool
-    passes: float
-    screened: bool
+    passes: float  # passes over the samples that it took
+    screened: bool  # True if it began again at screened points, and none explains the samples
 
 
 def refitted(
@@ -74,13 +135,9 @@ def refitted(
 ) -> Found | None:
     """Return the end of a search from the present estimate; None if no trajectory is possible.
 
-    Parameters
-    ----------
-    last
-        True for the end of a run: the search converges. Else it ends within a standard deviation,
-        as the same samples are fitted again later.
-    screened
-        How many samples the last search had that began again at screened points in vain.
+    `last`: True for the end of a run: the search converges. Else it ends within a standard
+    deviation, as the same samples are fitted again later. `screened`: how many samples the last
+    search had that began again at screened points in vain.
     """
     search = _Search(samples, options, last)
     search.descend(samples.reached)
@@ -145,7 +202,7 @@ class _Search:
         one, gate = self.best, self.samples.work.options.gate.beyond
         if one is None:
             return self.used
-        H, _ = self._model(one)
+        H, _ = one.model(self.used)
         J, r = one.slopes, one.residuals
         shown = np.einsum("skr,skr->sk", J @ np.linalg.inv(H), J)
         # Residuals of readings in use vary less than the noise, those of others more.
@@ -191,14 +248,9 @@ class _Search:
         if self.best is None or end.cost(self.used) < self.best.cost(self.used):
             self.best, self.settled = end, settled
 
-    def _model(self, one: Passed) -> tuple[Array, Array]:
-        """Return Hessian and direction of descent of the cost."""
-        J, r = one.slopes[self.used], one.residuals[self.used]
-        return np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
-
     def _decrease(self, one: Passed) -> float:
         """Return by how much the quadratic model of the cost falls to its minimum."""
-        H, g = self._model(one)
+        H, g = one.model(self.used)
         free = self._free(one, g)
         sizes, axes = np.linalg.eigh(free.T @ H @ free)
         along = axes.T @ (free.T @ g)
@@ -222,7 +274,7 @@ class _Search:
 
     def _stepped(self, one: Passed, delta: float, budget: float) -> tuple[Passed | None, float]:
         """Return the pass after an accepted step, None if there is none, and the trust region."""
-        H, g = self._model(one)
+        H, g = one.model(self.used)
         free, cost = self._free(one, g), one.cost(self.used)
         sizes, axes = np.linalg.eigh(free.T @ H @ free)
         axes = free @ axes
@@ -284,7 +336,7 @@ class _Search:
             return True
         if self._square <= DOUBTFUL:
             return False
-        H, _ = self._model(self.best)
+        H, _ = self.best.model(self.used)
         # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
         C = self.samples.state.start.C[0]
         before, after = C.T @ C, C.T @ np.linalg.solve(H, C)
@@ -294,7 +346,6 @@ class _Search:
 
     @property
     def _square(self) -> float:
-        """Misfit of the best trajectory."""
         if self.best is None:
             return math.inf
         return _misfit(self.best.residuals, self.samples.readings, self.used)
@@ -325,7 +376,7 @@ class _Search:
         """True if a point is at the best trajectory, within a posterior standard deviation."""
         if self.best is None:
             return False
-        H, _ = self._model(self.best)
+        H, _ = self.best.model(self.used)
         away = xi - self.best.xi
         return float(away @ H @ away) < 1.0
 
@@ -339,15 +390,7 @@ class _Search:
 
 
 def _shift(sizes: Array, g: Array, delta: float) -> float:
-    """Return the shift of the Hessian with which the minimum of the model is within a ball.
-
-    Parameters
-    ----------
-    sizes, g
-        Eigenvalues of the Hessian, at least 1, and the descent direction in its axes, shapes (r,).
-    delta
-        Radius of the ball.
-    """
+    """Return the shift of the Hessian with which the minimum of the model is within a ball."""
     if np.linalg.norm(g / sizes) <= delta:
         return 0.0
     # The length falls with the shift; the bracket holds since |g|/(shift + 1) bounds the length.
@@ -380,3 +423,175 @@ def _misfit(residuals: Array, readings: Array, used: Mask) -> float:
             if len(block):
                 squares.append(float((block**2).mean()) / noise)
     return float(np.quantile(squares, QUANTILE)) if squares else 0.0
+
+
+def refit_due(
+    work: SensitivityWork, state: SensitivityState, due: Mask
+) -> tuple[SensitivityState, Diagnostics[Array] | None]:
+    """Return all members after the refits that are due, and diagnostics if there was one."""
+    if not work.fits:
+        return iterate_starts(work, state, due)
+    if (options := work.refit) is None:
+        return state, None
+    each: dict[int, SensitivityState] = {}
+    for k in np.flatnonzero(due).tolist():
+        one = take(state, k)
+        count = int(one.assimilated[0])
+        if max(count, one.log.shape[1] - 1 - int(one.window[0])) >= options.window:
+            one = new_window(work, one.now, one)
+        else:
+            # A window but the first begins with what is known: it has nothing to search for.
+            if count <= options.start and options.apart and len(state) == 1 and count > AT_ONCE:
+                one = changed(one, fork=Fork.of(one))
+            elif count <= options.start:
+                one = refitted_now(work, options, one)
+            later = 2 * count if 2 * count <= options.start else options.window
+            one = changed(one, due=np.array([later]))
+        each[k] = one
+    return put_each(state, each), None
+
+
+@nonfinite_allowed()  # such a trajectory is refused
+def settle(
+    work: SensitivityWork, state: SensitivityState
+) -> tuple[SensitivityState, list[Mask | None]]:
+    """Return all members after a last refit, and the readings it has used or None, of each."""
+    used: list[Mask | None] = [None] * len(state)
+    each: dict[int, SensitivityState] = {}
+    options = work.refit
+    if options is None or not work.fits:
+        return state, used
+    for k in range(len(state)):
+        one = take(state, k)
+        if one.log.shape[1] and (one.assimilated[0] or one.opening[0]):
+            samples = StoredSamples.of(work, one)
+            found = refitted(samples, options, last=True, screened=int(one.fit.screened[0]))
+            used[k] = None if found is None else found.used
+            one = changed(one, fork=Fork.none(one.now))  # this is a refit of more samples
+            each[k] = _after(work, one, samples, found, last=True)
+    return put_each(state, each), used
+
+
+def refitted_now(
+    work: SensitivityWork, options: Refit, state: SensitivityState
+) -> SensitivityState:
+    """Return one member after a refit that another one follows."""
+    samples = StoredSamples.of(work, state)
+    found = refitted(samples, options, last=False, screened=int(state.fit.screened[0]))
+    return _after(work, state, samples, found, last=False)
+
+
+def _after(
+    work: SensitivityWork,
+    state: SensitivityState,
+    samples: StoredSamples,
+    found: Found | None,
+    *,
+    last: bool,
+) -> SensitivityState:
+    count, spent = state.assimilated, state.fit.work
+    x = None if found is None else _filter(samples, found, last=last)
+    if found is None or x is None:
+        fit = changed(state.fit, samples=count, converged=np.zeros(1))
+        return changed(state, fit=fit)
+    there = np.isfinite(samples.readings)
+    fit = FitState(
+        samples=count,
+        cost=np.array([found.best.cost(found.used)]),
+        readings=np.array([float(there.sum())]),
+        refused=np.array([float((there & ~found.used).sum())]),
+        work=spent + found.passes * len(samples.spans),
+        converged=np.array([float(found.converged)]),
+        screened=np.array([len(samples.spans)]) if found.screened else state.fit.screened,
+    )
+    now = work.filter.relinearised(x)
+    # A filter to go back to that was set with this sample is that after the fit.
+    newer = now if state.since_newer[0] == state.log.shape[1] - 1 else state.newer
+    return changed(state, now=now, newer=newer, fit=fit)
+
+
+def _filter(samples: StoredSamples, found: Found, *, last: bool) -> FilterState | None:
+    """Return the filter that continues from the end of a search; None if a step fails."""
+    now = samples.state.now
+    evidence = samples.state.start.evidence + samples.log_evidence(found.best, found.used)
+    best = changed(samples.updated(found.best, found.used), evidence=evidence)
+    away = apart(samples.filter, best, now)
+    # Sums of the verdict and errors of the discretisation stay with the filter until then: a later
+    # refit of the same samples may compute them again.
+    if (away <= HOLDS and usual(now)) or (away <= NEAR and not last):
+        return best
+    x = samples.judged(found.best, found.used)
+    return None if x is None else changed(x, evidence=evidence)
+
+
+def go_on(work: SensitivityWork, state: SensitivityState) -> SensitivityState:
+    """Return one member after a sample, with the refit under way taken a step further."""
+    fork, options = state.fork, work.refit
+    if options is None:
+        return state
+    if not fork.fitted[0]:
+        refit = _under_way(work, options, state)
+        count = int(fork.samples[0])
+        if state.assimilated[0] < count + max(count // LATER, 1):
+            return state
+        try:
+            found = refit.result()
+        except Exception as error:
+            if numerical(error) is None:
+                raise
+            # Of the same samples it would fail again: the filter goes on, and the fit is none.
+            failed = changed(state.fit, samples=fork.samples, converged=np.zeros(1))
+            return _without(changed(state, fit=failed), fork.filter)
+        state = changed(state, fit=found.fit)
+        if found.now is fork.filter:  # no better trajectory was found
+            return _without(state, fork.filter)
+        fork = changed(fork, filter=found.now, fitted=np.ones(1, dtype=bool))
+    return _caught_up(work, state, fork)
+
+
+def _under_way(
+    work: SensitivityWork, options: Refit, state: SensitivityState
+) -> Future[SensitivityState]:
+    fork = state.fork
+    with LOCK:
+        if fork.filter in UNDER_WAY:
+            return UNDER_WAY[fork.filter]
+        future = UNDER_WAY[fork.filter] = Future()
+    log = state.log[:, : int(fork.row[0]) + 1]
+    begun = changed(state, now=fork.filter, log=log, assimilated=fork.samples)
+    begun = _without(begun, fork.filter)
+    # A daemon: a program that ends does not wait for it.
+    threading.Thread(target=_run, args=(future, work, options, begun), daemon=True).start()
+    return future
+
+
+@nonfinite_allowed()  # such a trajectory is refused
+def _run(
+    future: Future[SensitivityState],
+    work: SensitivityWork,
+    options: Refit,
+    state: SensitivityState,
+) -> None:
+    try:
+        future.set_result(refitted_now(work, options, state))
+    except Exception as error:  # noqa: BLE001, raised where the result is asked for
+        future.set_exception(error)
+
+
+def _caught_up(work: SensitivityWork, state: SensitivityState, fork: Fork) -> SensitivityState:
+    """Return one member after the next samples since a refit, which has ended."""
+    row, last, x = int(fork.row[0]), state.log.shape[1] - 1, fork.filter
+    rows = state.log[:, row : row + 1 + AT_A_TIME]
+    for interval in intervals_since(rows, work.filter.problem.channels):
+        x, told = assimilate(work.filter, x, work.filter.span(interval), work.options)
+        if not (told.status.ok and told.finite[0]):
+            return _without(state, x)
+        x, row = work.filter.relinearised(x), row + 1
+    if row < last:
+        return changed(state, fork=changed(fork, filter=x, row=np.array([row])))
+    newer = x if state.since_newer[0] == last else state.newer
+    return _without(changed(state, now=x, newer=newer), x)
+
+
+def _without(state: SensitivityState, x: FilterState) -> SensitivityState:
+    return changed(state, fork=Fork.none(x))

@@ -19,25 +19,20 @@ from livepde.laws.assimilation import (
     no_readings,
 )
 from livepde.laws.columns import Columns
-from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter
-from livepde.laws.filter_state import NO_LEDGER, FilterState
+from livepde.laws.filter import Filter, reported_factors
+from livepde.laws.filter_state import NO_LEDGER, FilterState, InputHistory, ShadowState
 from livepde.laws.gate import Gate, Screened
-from livepde.laws.gauss_newton import CONVERGED, Window, distance, next_reference, placed
-from livepde.laws.guards import Guards
 from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
-from livepde.laws.input_noise import PAUSE_ROWS, input_rank, with_initial_rows
-from livepde.laws.jumps import Jumps
+from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, join, put_each, take, where
+from livepde.laws.member_arrays import changed, put_each, take, where
 from livepde.laws.member_sensors import MemberSensors
+from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
-from livepde.laws.pauses import InputHistory
+from livepde.laws.policies import Guards, Jumps, Refit
 from livepde.laws.reduction import Reduction
-from livepde.laws.refit_apart import go_on
-from livepde.laws.refit_options import Refit
-from livepde.laws.refits import refit_due, settle
+from livepde.laws.refit import go_on, refit_due, settle
 from livepde.laws.sensitivity_state import (
     NEVER,
     FitState,
@@ -50,7 +45,6 @@ from livepde.laws.sensitivity_state import (
     shortened,
     stored,
 )
-from livepde.laws.shadow_state import ShadowState
 from livepde.laws.shadows import Shadows, ShadowSet
 from livepde.laws.smoother import smoothed
 from livepde.laws.step_diagnostics import Diagnostics
@@ -72,6 +66,7 @@ from livepde.stepping import (
     Span,
     member_stage,
 )
+from livepde.verdict import Verdict
 
 GATE = 6.0  # expected standard deviations: one value of a thousand million lies beyond by chance
 FIRST = 20  # Gauss-Newton steps of a first sample that a nonlinear initial state takes at most
@@ -353,7 +348,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 moment=interval.end,
                 length=0.0,
             )
-            if not iterates or distance(filter_, begun) <= CONVERGED:
+            if not iterates or distance(filter_, begun) <= AGREED:
                 break
             x = placed(filter_, begun, next_reference(filter_, begun))
             # The noise level is that before the sample, which would count in each iteration else.
@@ -372,13 +367,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
         if not work.filter.sensors.fixed:
             return "the sensors do not see a fixed linear part of the state alone"
         return stage.refusal
-
-    def begin_members(
-        self, work: SensitivityWork, state: SensitivityState, span: Span
-    ) -> SensitivityState:
-        """Return all members after a sample at the initial time."""
-        each = (self.begin(work, take(state, k), span.member(k)) for k in range(len(state)))
-        return join(*each)
 
     def step(
         self, work: SensitivityWork, state: SensitivityState, interval: Interval
@@ -519,24 +507,32 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     def deferred(self, work: SensitivityWork, state: SensitivityState) -> Deferred:
         # Kept estimates must not hold ledgers and warm-start data, which are larger than a belief.
         now, fit = kept_for_estimates(state.now), state.fit.member(0)
-        judge = with_fit(judged(work.filter, state.now, now), fit)
-        if self.verdict:
-            judge = with_discretisation(judge, work.filter.shadows, state.now.shadows)
-        return Deferred(lambda: self.member_belief(work, now, 0), judge)
+        judge = judged(work.filter, state.now, now)
+
+        def verdict() -> Verdict:
+            found = with_fit(judge(), fit)
+            if not self.verdict:
+                return found
+            return with_discretisation(found, work.filter.shadows, now.shadows)
+
+        return Deferred(lambda: self.member_belief(work, now, 0), verdict)
 
     def final(
         self, work: SensitivityWork, state: SensitivityState, *, columns: bool = True
     ) -> Deferred:
-        found = self.deferred(work, state)
+        belief, before = self.deferred(work, state)
         # Of a later window the fit knows nothing of the readings before.
         whole = state.fit.member(0) if not state.window[0] else None
-        found = found._replace(verdict=after_fit(found.verdict, whole))
         if not self.verdict:
-            return found
-        if columns:
-            wrong = with_columns(found.verdict, Columns.of(work, state))
-            found = found._replace(verdict=wrong)
-        return found._replace(verdict=with_errors(found.verdict, work, state))
+            return Deferred(belief, lambda: after_fit(before(), whole))
+        tried = Columns.of(work, state) if columns else None
+
+        def verdict() -> Verdict:
+            found = after_fit(before(), whole)
+            found = found if tried is None else with_columns(found, tried)
+            return with_errors(found, work, state)
+
+        return Deferred(belief, verdict)
 
     def factors(self, work: SensitivityWork, x: FilterState) -> tuple[Array, Array]:
         """Return the square root [U C] of the covariance that is reported, of all members."""
@@ -559,6 +555,5 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
-    """Return one member at the start with another filter."""
     start = work.kept_start(x)
     return changed(state, start=start, now=x, older=x, newer=x)

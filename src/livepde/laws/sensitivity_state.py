@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from livepde.laws.assimilation import OK, Assimilation, MemberReports, UpdateOptions
-from livepde.laws.covariance import robust_factors
-from livepde.laws.filter import Filter
+from livepde.laws.filter import Filter, robust_factors
 from livepde.laws.filter_state import NO_LEDGER, FilterState, unaccompanied
-from livepde.laws.guards import Guards
 from livepde.laws.history import added, trimmed, withdrawn
-from livepde.laws.jumps import Jumps, Watch
 from livepde.laws.law import Fit, InitialReading
 from livepde.laws.member_arrays import changed, take, where, zeros
-from livepde.laws.refit_options import Refit
+from livepde.laws.policies import Guards, Jumps, Refit, Watch
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.records import refusal
@@ -31,18 +28,12 @@ NEVER = np.iinfo(np.int64).max  # number of samples at which nothing is due any 
 
 @dataclass(frozen=True, eq=False)
 class SensitivityWork:
-    """Parts that the law computes once, and its options.
+    """Parts that the law computes once, and its options."""
 
-    Attributes
-    ----------
-    filter, options
-        The filter, and how it takes a sample.
-    refit, guards, jumps, fades, relinearises
-        Those of the law.
-    """
-
+    # The filter, and how it takes a sample.
     filter: Filter
     options: UpdateOptions
+    # Those of the law.
     refit: Refit | None
     guards: Guards | None
     jumps: Jumps | None
@@ -112,48 +103,30 @@ class SensitivityWork:
 
 @dataclass(frozen=True, eq=False)
 class SensitivityState:
-    """State of the law for each member; the leading axis of every array is the members.
+    """State of the law for each member; the leading axis of every array is the members."""
 
-    Attributes
-    ----------
-    now
-        The filter now.
-    start, window, opening, initial
-        Where the window of a refit, or of an iterated start, begins: the filter, the row of the
-        log, whether that row holds a sample that the filter has not seen, and whether it is the
-        initial state of the model (`Model.initial`).
-    assimilated, due
-        Samples used since, and at how many they are taken again; `NEVER`: they never are.
-    fit
-        The last refit.
-    fork
-        A refit under way while samples continue.
-    older, newer, since_older, since_newer
-        Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
-    log
-        Samples since the earliest of them, see `livepde.laws.history`.
-    watch
-        Innovations of the last samples, for `Jumps`.
-    scale
-        Ranges of the readings of each sensor so far, for `Guards`.
-    """
-
-    now: FilterState
+    now: FilterState  # the filter now
+    # Where the window of a refit, or of an iterated start, begins: the filter, the row of the log,
+    # whether that row holds a sample that the filter has not seen, and whether it is the initial
+    # state of the model (`Model.initial`).
     start: FilterState
     window: IntArray
     opening: Mask
     initial: Mask
+    # Samples used since, and at how many they are taken again; `NEVER`: they never are.
     assimilated: IntArray
     due: IntArray
-    fit: FitState
-    fork: Fork
+    fit: FitState  # the last refit
+    fork: Fork  # a refit under way while samples continue
+    # Two filters of before, to which `Guards` and `Jumps` go back, and their rows of the log.
     older: FilterState
     newer: FilterState
     since_older: IntArray
     since_newer: IntArray
+    # Samples since the earliest of them, see `livepde.laws.history`.
     log: Array = field(metadata={"grows": 1})
-    watch: Watch
-    scale: Scale
+    watch: Watch  # innovations of the last samples, for `Jumps`
+    scale: Scale  # ranges of the readings of each sensor so far, for `Guards`
 
     def __len__(self) -> int:
         return len(self.now)
@@ -171,31 +144,19 @@ class SensitivityState:
 
 @dataclass(frozen=True, eq=False)
 class FitState:
-    """The last refit of each member.
+    """The last refit of each member."""
 
-    Attributes
-    ----------
-    samples
-        How many samples it took, 0 before the first one, shape (members,).
-    cost
-        Half the sum of squares of residuals in use and of the unknowns, in standard deviations,
-        shape (members,).
-    readings, refused
-        Readings of these samples, and those of them that were not used, shape (members,).
-    work
-        Samples that all refits of the window have taken, one with derivatives counting 1.
-    converged
-        1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
-    screened
-        How many samples the last search had that began again in vain, 0 before, shape (members,).
-    """
-
-    samples: IntArray
+    samples: IntArray  # how many samples it took, 0 before the first one, shape (members,)
+    # Half the sum of squares of residuals in use and of the unknowns, in standard deviations, shape
+    # (members,).
     cost: Array
+    # Readings of these samples, and those of them that were not used, shape (members,).
     readings: Array
     refused: Array
-    work: Array
+    work: Array  # samples that all refits of the window have taken, one with derivatives counting 1
+    # 1 if the search ended in a minimum that explains the samples, else 0, shape (members,).
     converged: Array
+    # How many samples the last search had that began again in vain, 0 before, shape (members,).
     screened: IntArray
 
     @classmethod
@@ -228,24 +189,13 @@ class FitState:
 
 @dataclass(frozen=True, eq=False)
 class Fork:
-    """A refit under way while samples continue; arrays without members where there is none.
+    """A refit under way while samples continue; arrays without members where there is none."""
 
-    Attributes
-    ----------
-    filter
-        The filter where the refit began; once the refit has ended, the filter of its result.
-    samples
-        How many samples are fitted, shape (1,).
-    row
-        Row of the log that the filter has assimilated last, shape (1,).
-    fitted
-        True once the refit has ended, shape (1,).
-    """
-
+    # The filter where the refit began; once the refit has ended, the filter of its result.
     filter: FilterState
-    samples: IntArray
-    row: IntArray
-    fitted: Mask
+    samples: IntArray  # how many samples are fitted, shape (1,)
+    row: IntArray  # row of the log that the filter has assimilated last, shape (1,)
+    fitted: Mask  # True once the refit has ended, shape (1,)
 
     @classmethod
     def none(cls, x: FilterState) -> Fork:
@@ -266,15 +216,10 @@ class Fork:
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """Range of the values of each sensor so far, and its first innovation.
+    """Range of the values of each sensor so far, and its first innovation."""
 
-    Attributes
-    ----------
-    low, high, first
-        Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
-        before.
-    """
-
+    # Least and largest value, and size of the first innovation, shapes (members, sensors); NaN
+    # before.
     low: Array
     high: Array
     first: Array
@@ -297,13 +242,6 @@ class Scale:
         """Return the value after a sample, that before it for sensors whose reading was refused.
 
         A wild reading would let any later prediction pass for one within the range.
-
-        Parameters
-        ----------
-        before
-            The value before the sample.
-        refused
-            How many readings in a row the gate has refused, (members, sensors).
         """
         if not np.count_nonzero(refused):
             return self
@@ -335,15 +273,7 @@ def stored(
     anchored: Mask | None = None,
     **parts: Any,
 ) -> SensitivityState:
-    """Return a state with the filter after a sample, which the members `taken` took.
-
-    Parameters
-    ----------
-    anchored
-        Members whose state was corrected alone, shape (members,).
-    parts
-        Other fields to exchange.
-    """
+    """Return a state with the filter after a sample, which the members `taken` took."""
     if not work.keeps_log:
         return changed(state, now=now, **parts)
     log = added(state.log, span, taken, now.parts)
@@ -477,10 +407,7 @@ def new_window(
 ) -> SensitivityState:
     """Return one member whose window begins at a filter, with no samples yet.
 
-    Parameters
-    ----------
-    row
-        Of the log, to which the filter belongs; later ones are forgotten. Default the last.
+    `row`: of the log, to which the filter belongs; later ones are forgotten. Default the last.
     """
     log = state.log if row is None else state.log[:, : row + 1]
     zero = np.zeros(1, dtype=np.int64)

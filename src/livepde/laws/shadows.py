@@ -16,35 +16,38 @@ readings.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from livepde.errors import LawError, LivepdeError
 from livepde.fem import Moment
-from livepde.laws.filter_state import FilterState, along
-from livepde.laws.halved_mesh import HalvedMesh, refusal
+from livepde.laws.filter_state import FilterState, ShadowState, along
 from livepde.laws.law import Problem
-from livepde.laws.member_arrays import changed, product, put, take, where
-from livepde.laws.process_noise import grades, pieces
+from livepde.laws.member_arrays import changed, product, put, take
 from livepde.laws.reduction import Reduction
-from livepde.laws.shadow_state import ShadowState
+from livepde.laws.shadow_kinds import (
+    HELD,
+    HeldInputShadow,
+    InputShadow,
+    MeanProcess,
+    MeshShadow,
+    Shadow,
+    ShadowedSteps,
+    StepShadow,
+    StepTolerance,
+    refusal,
+)
 from livepde.laws.step_diagnostics import Diagnostics, stacked
-from livepde.laws.step_tolerance import StepTolerance
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.stepping import (
     TINY,
-    Advance,
-    KeptFactors,
     MemberStage,
     Moments,
     Span,
-    StageOfMembers,
-    advance,
 )
 from livepde.verdict import Shifts
 
@@ -54,16 +57,10 @@ JUMP = 4.0  # times the usual difference of two changes of the state: something 
 USUAL = 16  # steps over which that is averaged
 # Weight of a step in that average, by the number of steps so far; later ones have the last one.
 WEIGHTS = 1.0 / np.array([1, 1, 1, *range(3, USUAL + 1)])
-ALIKE = 3.0  # ratio of the errors of two steps that others between them have, too
 # Steps between those that are shadowed later. They differ, so that no cycle of inputs is met at one
 # phase alone; on average 8, of which each stands for those before it.
 LATER = np.array([5, 11, 7, 9])
-MESH = 4.0 / 3.0  # error of elements of first order over its difference to the halved mesh
-KINDS = ("step", "mesh", "input")
-HELD = "hold"  # kind of the shift by inputs that are held: no error if they are what is stated
-SHORT = 1.0 / 16.0  # of the interval before: a shorter one shows no curvature
 AT_ONCE = 3  # halvings of a step, as powers of two, before its error is estimated again
-SMOOTH = 0.5  # differences of changes over changes, squared: below, an input changes smoothly
 
 
 @dataclass(frozen=True)
@@ -116,437 +113,19 @@ class Shadows:
             )
 
 
-class ShadowedSteps(NamedTuple):
-    """Steps of some members whose error a shadow estimates: all since the previous estimate.
-
-    Attributes
-    ----------
-    x, end
-        The filter before and after the last of them.
-    step, span
-        The last step, and all steps as one.
-    waited, next
-        Number of steps in it, and from now to the next estimate, (members,).
-    jumps
-        Members of which the rate of the state jumped in the last step, shape (members,).
-    """
-
-    x: FilterState
-    end: FilterState
-    step: Span
-    span: Span
-    waited: IntArray
-    next: IntArray
-    jumps: Mask
-
-
-class ErrorIncrement(NamedTuple):
-    """Discretisation error of a block of steps.
-
-    Attributes
-    ----------
-    failed
-        Members whose shadow could not be stepped, shape (members,); nothing is added for them.
-    parts
-        Fields of `ShadowState` to exchange.
-    u, a
-        Additional error of the state and of the reduced unknowns, shapes (members, n) and (members,
-        k); None for zero.
-    """
-
-    failed: Mask
-    parts: dict[str, Any]
-    u: Array | None = None
-    a: Array | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class MeanProcess:
-    """The process of a filter without covariance: members with the unknowns of the filter.
-
-    Attributes
-    ----------
-    control, stage
-        Step control, and implicit stage of all members.
-    reduction
-        The reduced coordinates of the unknowns.
-    moves
-        True if an unknown moves.
-    """
-
-    control: Advance
-    stage: MemberStage
-    reduction: Reduction
-    moves: bool
-
-    def propagate(
-        self, x: FilterState, u: Array, kept: KeptFactors, span: Span
-    ) -> tuple[Array, KeptFactors, Mask]:
-        """Return states after a span, warm-start data of the last stage, and which members failed.
-
-        Parameters
-        ----------
-        x, u
-            The filter at the start, and the states that are propagated in the place of its own.
-        kept
-            Warm-start data of the previous stage.
-        """
-        if not self.moves:
-            return self._through(x, u, kept, span, [span.t1])
-        # The filter takes the steps of some members in parts (`process_noise`): so does this.
-        parts = grades(x.rate, span.t1 - span.start)
-        new, now, failed = u.copy(), kept, np.zeros(len(u), dtype=bool)
-        for count in sorted(set(parts.tolist())):
-            times = [span.t1]
-            if count > 1:
-                times = pieces(self.control, span.start, span.t1, count)
-            if (parts == count).all():
-                return self._through(x, u, kept, span, times)
-            group = np.flatnonzero(parts == count)
-            some = take(x, group), u[group], take(kept, group), span.part(group)
-            new[group], after, failed[group] = self._through(*some, times)
-            now = put(now, group, after)
-        return new, now, failed
-
-    def _through(
-        self, x: FilterState, u: Array, kept: KeptFactors, span: Span, times: list[float]
-    ) -> tuple[Array, KeptFactors, Mask]:
-        """Return the same as `propagate`, through the parts of a span that end at some times."""
-        members, no = len(u), np.zeros(len(u), dtype=bool)
-        tangents = self.reduction.directions(x.q, np.zeros((members, 0, x.C.shape[2])))
-        factors: dict[float, Any] = {}  # of all stages of a step that have the same q
-        now = kept
-
-        def stage(columns: Array, t: float, h: float) -> Array:
-            nonlocal now
-            q, same = x.q, factors
-            if self.moves:
-                q, same = self.reduction.predict(q, t - span.start), {}
-            work = StageOfMembers(x.member, q, tangents, h, span.at(t), now, no, same)
-            y, now = self.stage.advance(columns, work)
-            return y
-
-        first, columns = span.start, u[None]
-        for stop in times:
-            control = self.control.divided(span.division)
-            columns, _, failure = advance(control, stage, columns, first, stop)
-            if failure is not None:
-                return u, kept, ~no
-            first = stop
-        # Warm-start data of a state that is not finite would spoil all later ones.
-        good: Mask = np.isfinite(columns[0]).all(axis=1)
-        return columns[0], where(good, now, kept), ~good
-
-
-class Shadow(ABC):
-    """Abstract source of a discretisation error."""
-
-    kind: ClassVar[str]
-
-    @abstractmethod
-    def start(
-        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
-    ) -> ShadowState:
-        """Return the state before the first step, of one member.
-
-        Parameters
-        ----------
-        moment, given
-            Time and inputs, None before any; and the initial state as it was given.
-        """
-
-    @abstractmethod
-    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
-        """Return the discretisation error of a block of steps."""
-
-    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
-        """Return fields of the state after one more interval was read, before any estimate."""
-        return {}
-
-    def restarted(self, s: ShadowState, which: Mask) -> dict[str, Any]:
-        """Return fields of the state in which members have no error except `ShadowState.u`."""
-        return {}
-
-    def in_readings(self, s: ShadowState) -> Array | None:
-        """Return the error of the readings except that due to `ShadowState.u`; None if zero."""
-        return None
-
-    def in_state(self, s: ShadowState) -> Array | None:
-        """Return the error of the state except that in `ShadowState.u`, shape (members, n)."""
-        return None
-
-
-@dataclass(frozen=True, eq=False)
-class StepShadow(Shadow):
-    """The error of the time step: one step less two halved ones, from the same state.
-
-    One step stands for half of those since the estimate before and half of those until the next,
-    unless its error is much larger than the one estimated before.
-
-    Attributes
-    ----------
-    halves
-        The process by halved steps.
-    factor
-        2^p/(2^p - 1) for a scheme of order p.
-    tolerance
-        What is allowed of an error.
-    """
-
-    halves: MeanProcess
-    factor: float
-    tolerance: StepTolerance
-
-    kind = "step"
-
-    @classmethod
-    def of(cls, process: MeanProcess, tolerance: StepTolerance) -> StepShadow:
-        """Return the shadow of a process."""
-        control = process.control.divided(2)
-        # Richardson: e(h) = c h^p, so that e(h) - e(h/2) = (1 - 2^-p) e(h).
-        ratio = 2.0**control.scheme.order
-        # Halved steps have matrices of their own: in a common cache both would factorise anew.
-        halves = replace(process, control=control, stage=process.stage.twin())
-        return cls(halves, ratio / (ratio - 1.0), tolerance)
-
-    def start(
-        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
-    ) -> ShadowState:
-        return changed(s, halves=self.halves.stage.kept(1))
-
-    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
-        u, kept, failed = self.halves.propagate(block.x, block.x.u, s.halves, block.step)
-        error = self.factor * (block.end.u - u)
-        size = np.sqrt((error * error).sum(axis=1))
-        # An error much larger than the one before is that of this step alone.
-        alike = np.where(size <= ALIKE * s.size, 1.0, s.size / np.maximum(size, TINY))
-        weight = 1.0 + (0.5 * (block.waited + block.next) - 1.0) * alike
-        # The error of a step with a jump is exceptional and no measure for the next ones.
-        parts = {"halves": kept, "size": np.where(block.jumps | failed, s.size, size)}
-        excess = self.tolerance.excess(error, block.end, block.step)
-        parts["excess"] = np.where(failed, 0.0, excess)
-        return ErrorIncrement(failed, parts, u=weight[:, None] * error)
-
-
-@dataclass(frozen=True, eq=False)
-class InputShadow(Shadow):
-    """The error of the straight line between two readings of a channel.
-
-    The mean of a line misses that of a curve by h^2/12 times its second derivative, which the last
-    three readings tell. Second differences of noise add up to nothing. A step that is written as
-    two rows a moment apart is no curve.
-
-    Attributes
-    ----------
-    process
-        The process itself.
-    signs
-        Sign of the error of each channel, shape (channels,): 1 for a line, 0 for none.
-    """
-
-    process: MeanProcess
-    signs: Array
-
-    kind = "input"
-
-    def start(
-        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
-    ) -> ShadowState:
-        nothing = np.zeros((1, len(self.signs)))
-        return changed(s, slope=nothing, bend=nothing, missed=nothing)
-
-    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
-        """Return the error of inputs by straight lines, and by values held in a gap."""
-        length, change = span.t1 - span.t0, span.inputs1 - span.inputs0
-        if len(length) < len(s):  # members that have their samples in common
-            length = np.repeat(length, len(s))
-        if len(change) < len(s):
-            change = np.repeat(change, len(s), axis=0)
-        h = length[:, None]
-        if span.gaps is not None:
-            return self._read_gaps(s, h, change, span.gaps)
-        slope = change / h
-        # The second derivative is 2 (slope - s.slope)/(h + s.length), and the line lies above the
-        # curve by h^3/12 of it in the integral; the infinite first length makes this zero.
-        bend = (slope - s.slope) * (h * h * h / (6.0 * (h + s.length[:, None])))
-        # Across a moment the slope is a step, or noise: the next interval must not be compared.
-        short = length < SHORT * s.length
-        if np.count_nonzero(short):
-            short &= np.isfinite(s.length)  # infinite if no interval is known
-            length, bend = np.where(short, np.inf, length), np.where(short[:, None], 0.0, bend)
-        return {"slope": slope, "length": length, "bend": bend, "missed": s.missed + bend}
-
-    @staticmethod
-    def _read_gaps(s: ShadowState, h: Array, change: Array, gaps: Array) -> dict[str, Any]:
-        """Return the same where channels are held.
-
-        In a gap a channel is expected to go on as before; once it has a value again the line across
-        the gap is known.
-        """
-        held, missing = gaps[:, 0], gaps[:, 1] > 0.0
-        whole = held + h
-        slope = np.where(missing, s.slope, change / whole)
-        bend = (slope - s.slope) * whole**3 / (6.0 * (whole + s.length[:, None]))
-        expected = s.slope * (held + 0.5 * h) * h
-        line = 0.5 * held * (change - s.slope * held)
-        missed = s.missed + np.where(missing, -expected, bend - line)
-        # Of the next steps nothing is expected, where there is a gap.
-        some: Mask = np.asarray((gaps > 0.0).any(axis=(1, 2)))
-        bend = np.where(some[:, None], 0.0, bend)
-        length = np.where(missing.all(axis=1), s.length, whole.max(axis=1))
-        return {"slope": slope, "length": length, "bend": bend, "missed": missed}
-
-    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
-        ahead = (0.5 * (block.next - 1))[:, None] * s.bend  # of half of the steps until the next
-        # Steps ahead are counted in advance, so that the shift does not lag behind: `left` takes
-        # this off again when they have been read.
-        missed = self.signs * np.where(np.isfinite(s.missed + ahead), s.missed + ahead, 0.0)
-        left = {"missed": np.where(np.isfinite(ahead), -ahead, 0.0)}
-        if not missed.any():
-            return ErrorIncrement(np.zeros(len(missed), dtype=bool), left)
-        # Only their sum counts, wherever in the block the inputs were missed.
-        span = block.step
-        # The response is linear in the input for small errors: one interval takes the sum of all.
-        off = missed / (span.t1 - span.t0)[:, None]
-        first, last = span.inputs0 + off, span.inputs1 + off
-        moved = replace(span, inputs0=first, inputs1=last, interval=None)
-        u, _, failed = self.process.propagate(block.x, block.x.u, block.x.kept, moved)
-        return ErrorIncrement(failed, left, u=u - block.end.u)
-
-
-class HeldInputShadow(InputShadow):
-    """Shift of the estimates by straight lines instead of inputs that are held between readings.
-
-    Only inputs that change smoothly count: successive changes of measured inputs are alike, those
-    of set points are not. The sign of a channel is that of its error if it were a line: 1 if it is
-    held at the next reading, -1 at the last one, 0 for lines.
-    """
-
-    kind = HELD
-
-    def start(
-        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
-    ) -> ShadowState:
-        s = super().start(s, x, moment, given)
-        return changed(s, held=np.full((1, 4, len(self.signs)), np.nan))
-
-    def read(self, s: ShadowState, span: Span) -> dict[str, Any]:
-        """Return the errors of lines, and the difference of held inputs to straight lines."""
-        parts = super().read(s, span)
-        # Sums of squares of successive changes, and of differences of them: the ratio tells smooth
-        # inputs from set points.
-        last, before, changes, differences = s.held.transpose(1, 0, 2)
-        change = np.where(np.isfinite(last), span.stated - last, 0.0)
-        changes = np.nan_to_num(changes) + change**2
-        differences = np.nan_to_num(differences) + (change - np.nan_to_num(before)) ** 2
-        smooth = (differences < SMOOTH * changes) & (self.signs != 0.0)
-        # The held later value exceeds the straight line by half of the change on average.
-        missed = 0.5 * (span.t1 - span.t0)[:, None] * np.where(smooth, change, 0.0)
-        values = np.broadcast_to(span.stated, change.shape)
-        held = np.stack([values, change, changes, differences], axis=1)
-        # `InputShadow` reads its lines from the same fields: what it adds to them must stay.
-        both = {name: parts[name] + missed for name in ("bend", "missed")}
-        return parts | both | {"held": held}
-
-
-@dataclass(frozen=True, eq=False)
-class MeshShadow(Shadow):
-    """The error of the mesh: a trajectory on the halved mesh against one on the mesh.
-
-    The fine trajectory has the unknowns of the filter, and follows where samples move the state:
-    only its difference to the state of the filter is kept. Several steps are taken at once on both
-    meshes. Up to the next block the difference in the readings is held constant; then its change is
-    known, is taken as linear in between, and the effect of this change on the unknowns is added.
-
-    Attributes
-    ----------
-    coarse, fine
-        The process on the mesh, and on the halved mesh.
-    mesh
-        The halved mesh.
-    """
-
-    coarse: MeanProcess
-    fine: MeanProcess
-    mesh: HalvedMesh
-
-    kind = "mesh"
-
-    @classmethod
-    def of(cls, process: MeanProcess, problem: Problem) -> MeshShadow:
-        """Return the shadow of a process; raises `LivepdeError`."""
-        mesh, coarse = HalvedMesh.of(problem), replace(process, stage=process.stage.twin())
-        return cls(coarse, replace(process, stage=mesh.stage), mesh)
-
-    def start(
-        self, s: ShadowState, x: FilterState, moment: Moment | None, given: Any
-    ) -> ShadowState:
-        if moment is None:
-            difference = np.zeros((1, self.mesh.model.X.dim))
-            seen = np.zeros((1, self.mesh.observed.size))
-        else:
-            difference = self.mesh.initial_difference(given, x.q[0], x.u[0], moment)[None]
-            seen = self.mesh.in_readings(x.u, x.q, difference, lambda k: moment)
-        kept = {"blocks": self.coarse.stage.kept(1), "fine_stage": self.fine.stage.kept(1)}
-        gains = np.zeros((1, seen.shape[1], x.C.shape[2]))
-        return changed(s, u0=x.u, fine=difference, seen=seen, gains=gains, **kept)
-
-    def error(self, s: ShadowState, block: ShadowedSteps) -> ErrorIncrement:
-        x, end, mesh, span = block.x, block.end, self.mesh, block.span
-        coarse, blocks, failed = end.u, s.blocks, np.zeros(len(x), dtype=bool)
-        # A long step for the whole block has a time error of its own, which cancels only in the
-        # difference to a step of the same length on the coarse mesh.
-        if (block.waited > 1).any():
-            coarse, blocks, failed = self.coarse.propagate(x, s.u0, blocks, span)
-        # The fine trajectory begins at the filter's state, prolonged, and the difference so far.
-        start = mesh.prolong(s.u0) + s.fine
-        u, kept, wrong = self.fine.propagate(x, start, s.fine_stage, span)
-        failed = failed | wrong
-        fine = np.where(failed[:, None], s.fine, u - mesh.prolong(coarse))
-        seen = mesh.in_readings(end.u, end.q, fine, span.end.member)
-        slope = (seen - s.seen) / (span.t1 - span.t0)[:, None]
-        # `gains` weighs the gain of each sample by the time since the block began: times the slope
-        # that is the effect of a difference which has grown linearly.
-        a = MESH * (slope[:, None] @ s.gains)[:, 0]
-        parts = {"blocks": blocks, "fine": fine, "fine_stage": kept, "seen": seen}
-        return ErrorIncrement(failed, parts | {"gains": np.zeros_like(s.gains)}, a=a)
-
-    def restarted(self, s: ShadowState, which: Mask) -> dict[str, Any]:
-        rows = which[:, None]
-        return {"fine": np.where(rows, 0.0, s.fine), "seen": np.where(rows, 0.0, s.seen)}
-
-    def in_readings(self, s: ShadowState) -> Array | None:
-        return -MESH * s.seen
-
-    def in_state(self, s: ShadowState) -> Array | None:
-        return -MESH * s.fine[:, self.mesh.at]
-
-
 @dataclass(frozen=True, eq=False)
 class ShadowSet:
-    """The discretisation errors that are estimated online with a filter.
+    """The discretisation errors that are estimated online with a filter."""
 
-    Attributes
-    ----------
-    problem, reduction
-        Those of the filter.
-    rows
-        Function that returns the readings of rows of state and reduced unknowns, (members, rows,
-        sensors): `MemberSensors.rows`.
-    shadows
-        One for each row of `ShadowState.u`.
-    refused
-        Why the mesh has no shadow; empty if it has one.
-    most
-        Parts of a substep at most.
-    """
-
+    # Those of the filter.
     problem: Problem
     reduction: Reduction
+    # Function that returns the readings of rows of state and reduced unknowns, (members, rows,
+    # sensors): `MemberSensors.rows`.
     rows: Callable[[FilterState, Array, Array, Moments], Array]
-    shadows: tuple[Shadow, ...]
-    refused: str
-    most: int
+    shadows: tuple[Shadow, ...]  # one for each row of `ShadowState.u`
+    refused: str  # why the mesh has no shadow; empty if it has one
+    most: int  # parts of a substep at most
 
     @classmethod
     def of(
@@ -560,15 +139,7 @@ class ShadowSet:
         *,
         moves: bool,
     ) -> ShadowSet:
-        """Return the shadows of a filter.
-
-        Parameters
-        ----------
-        noise, stage
-            Standard deviation of each sensor, shape (sensors,), and the implicit stage.
-        moves
-            Whether unknowns move.
-        """
+        """Return the shadows of a filter."""
         process = MeanProcess(problem.control, stage, reduction, moves)
         refused = refusal(problem, options.largest) if options.mesh else "mesh = false"
         found: list[Shadow] = []
@@ -631,13 +202,7 @@ class ShadowSet:
         return s
 
     def predict(self, x: FilterState, end: FilterState, span: Span) -> FilterState:
-        """Return the state after a span with the errors that have come about in it.
-
-        Parameters
-        ----------
-        x, end
-            Before and after the span; `end` with the errors of before, propagated.
-        """
+        """Return the state after a span with the errors that have come about in it."""
         s = end.shadows
         parts, jumps = _watch_rate(s, x, end, span)
         fresh = s.count == s.last  # members that begin a block
@@ -717,15 +282,7 @@ class ShadowSet:
         return np.where(spare, np.maximum(x.parts // 2, 1), x.parts)
 
     def finer_parts(self, end: FilterState, parts: IntArray) -> IntArray:
-        """Return in how many parts the substeps of a span have to be divided, (members,).
-
-        Parameters
-        ----------
-        end
-            The state after the span, with its error where that has been estimated.
-        parts
-            In how many parts its substeps are divided there.
-        """
+        """Return in how many parts the substeps of a span have to be divided, (members,)."""
         s = end.shadows
         coarse = (s.last == s.count) & (s.excess > 1.0) & (parts < self.most)
         if not np.count_nonzero(coarse):
@@ -777,19 +334,10 @@ class ShadowSet:
     ) -> ShadowState:
         """Return the shadows after a sample.
 
-        Parameters
-        ----------
-        x
-            The filter before it.
-        U, C
-            The square root after it.
-        left
-            `Update.left`.
-        weights
-            One over the noise of each value that was used, zero for others, (members, sensors).
-        off, t
-            By how much predictions of such values were off (`in_readings`), zero for others; and
-            the time.
+        `x`: the filter before it. `U`, `C`: the square root after it. `left`: `Update.left`.
+        `weights`: one over the noise of each value that was used, zero for others, (members,
+        sensors). `off`, `t`: by how much predictions of such values were off (`in_readings`), zero
+        for others; and the time.
         """
         s = x.shadows
         # K^T = `gain` [U C], with the rows of the new square root.
@@ -816,13 +364,7 @@ class ShadowSet:
         return u, s.a
 
     def diagnostics(self, x: FilterState, C: Array) -> Diagnostics[Array]:
-        """Return the shifts of the unknowns, numbers of shape (members,).
-
-        Parameters
-        ----------
-        C
-            Square root of their covariance without the shifts, (members, r, k).
-        """
+        """Return the shifts of the unknowns, numbers of shape (members,)."""
         reduction, latent = self.reduction, self.problem.model.latent
         found = []
         for k, a in enumerate(x.shadows.a):

@@ -28,9 +28,8 @@ import numpy as np
 
 from livepde.errors import LawError
 from livepde.laws.assimilation import GateDecision, absorb
-from livepde.laws.filter_state import FilterState, unaccompanied, unjudged
-from livepde.laws.gauss_newton import Window, placed
-from livepde.laws.iterated_smoother import expecting, missed, moved
+from livepde.laws.filter_state import FilterState, coordinates, unaccompanied, unjudged
+from livepde.laws.iterated_smoother import Window, expecting, missed, moved, placed
 from livepde.laws.law import FixedInterval
 from livepde.laws.member_arrays import changed
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
@@ -81,13 +80,9 @@ def smoothed(
 
     States that are not asked for have no coefficients.
 
-    Parameters
-    ----------
-    before, after
-        The member before the first sample, and its filter after the last one in the run: its noise
-        level and the statistics of its innovations are those of all samples.
-    used
-        Readings of the last samples that a refit has used, (samples, sensors); None: there is none.
+    `before`, `after`: the member before the first sample, and its filter after the last one in the
+    run: its noise level and the statistics of its innovations are those of all samples. `used`:
+    readings of the last samples that a refit has used, (samples, sensors); None: there is none.
     """
     with nonfinite_allowed():  # not finite: not used
         best = _descended(*_begun(work, before, after, data, used))
@@ -140,7 +135,6 @@ def _fitted(decisions: list[GateDecision], used: Mask, data: FixedInterval) -> l
 
 
 def _descended(samples: _FixedInterval, best: _SmootherPass | None) -> _SmootherPass:
-    """Return the pass about a most probable trajectory."""
     if best is None:
         raise LawError(
             "smoothed: the samples cannot be followed about any trajectory of the unknowns; take a "
@@ -300,7 +294,7 @@ class _FixedInterval:
             q = q + filter_.reduction.Phi @ shift
         x = placed(filter_, self.window, filter_.reduction.bounded(q))
         # Coordinates xi of the shift: its probability at the start goes with exp(-|xi|^2/2).
-        weights = np.linalg.lstsq(start.C[0].T, shift, rcond=None)[0]
+        weights = coordinates(start.C[0], shift)
         misfit = float(weights @ weights)
         span = filter_.span(filter_.problem.unread(opening))
         predicted, Y = filter_.sensors.observe(x, span.end)

@@ -16,7 +16,7 @@ import numpy as np
 
 from livepde.laws.assimilation import HALF_LOG, absorb, assimilate
 from livepde.laws.filter import Filter, contraction
-from livepde.laws.filter_state import FilterState, extended
+from livepde.laws.filter_state import FilterState, coordinates, extended
 from livepde.laws.gate import Gate
 from livepde.laws.history import first_interval, intervals_since
 from livepde.laws.member_arrays import changed
@@ -31,44 +31,33 @@ AT_ONCE = 32  # trajectories that are followed as one array
 
 @dataclass(frozen=True, eq=False)
 class Passed:
-    """The samples about one trajectory.
+    """The samples about one trajectory."""
 
-    Attributes
-    ----------
-    xi
-        Coordinates of the trajectory, shape (r,).
-    residuals
-        Readings less predictions, in units of the noise, shape (samples, sensors); NaN: missing.
-    slopes
-        Derivatives of the predictions in xi, in units of the noise, (samples, sensors, r).
-    end
-        State, unknowns, and their derivatives in xi as rows, after the last sample.
-    """
-
-    xi: Array
+    xi: Array  # coordinates of the trajectory, shape (r,)
+    # Readings less predictions, in units of the noise, shape (samples, sensors); NaN: missing.
     residuals: Array
+    # Derivatives of the predictions in xi, in units of the noise, (samples, sensors, r).
     slopes: Array
-    end: FilterState
+    end: FilterState  # state, unknowns, and their derivatives in xi as rows, after the last sample
 
     def cost(self, used: Mask) -> float:
         """Return half the sum of squares of residuals in use and of xi."""
         return 0.5 * float((self.residuals[used] ** 2).sum() + self.xi @ self.xi)
 
+    def model(self, used: Mask) -> tuple[Array, Array]:
+        """Return Hessian and direction of descent of the cost, (r, r) and (r,)."""
+        J, r = self.slopes[used], self.residuals[used]
+        return np.eye(len(self.xi)) + J.T @ J, J.T @ r - self.xi
+
 
 @dataclass(frozen=True, eq=False)
 class StoredSamples:
-    """The samples of one member since the start of its window.
+    """The samples of one member since the start of its window."""
 
-    Attributes
-    ----------
-    work, state
-        Parts of the law, and the member as it is now.
-    spans
-        Intervals that lead to each sample; the first is without length if it is at the start.
-    """
-
+    # Parts of the law, and the member as it is now.
     work: SensitivityWork
     state: SensitivityState
+    # Intervals that lead to each sample; the first is without length if it is at the start.
     spans: Sequence[Span]
 
     @classmethod
@@ -135,12 +124,7 @@ class StoredSamples:
         """Coordinates xi of the present estimate, shape (r,)."""
         now, start, reduction = self.state.now, self.state.start, self.filter.reduction
         shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
-        return self.coordinates(shift)
-
-    def coordinates(self, shift: Array) -> Array:
-        """Return the least xi that moves the reduced unknowns by a shift, (k,)."""
-        found: Array = np.linalg.lstsq(self.state.start.C[0].T, shift, rcond=None)[0]
-        return found
+        return coordinates(start.C[0], shift)
 
     def within_bounds(self, xi: Array) -> Array:
         """Return xi, moved the least so that the unknowns are within their bounds."""
@@ -150,7 +134,7 @@ class StoredSamples:
         inside = reduction.bounded(q)
         if inside is q:
             return xi
-        return xi + self.coordinates(reduction.reduced(inside - start.q[0]) - shift)
+        return xi + coordinates(start.C[0], reduction.reduced(inside - start.q[0]) - shift)
 
     def placed(self, points: Array, rows: bool) -> FilterState:
         """Return the start of trajectories, shape (points, r), with or without derivatives."""
@@ -302,8 +286,7 @@ class StoredSamples:
         The unknowns are integrated out. A reading that is not in use counts as one at the limit of
         the gate, which is wider where the residuals in use are larger than their noise.
         """
-        J, r, there = one.slopes[used], one.residuals[used], np.isfinite(self.readings)
-        H, g = np.eye(len(one.xi)) + J.T @ J, J.T @ r - one.xi
+        (H, g), there = one.model(used), np.isfinite(self.readings)
         lowest = one.cost(used) - 0.5 * float(g @ np.linalg.solve(H, g))
         found = -lowest - 0.5 * float(np.linalg.slogdet(H)[1])
         found -= float((np.log(self.noise) + HALF_LOG)[there].sum())

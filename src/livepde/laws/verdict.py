@@ -1,26 +1,27 @@
-"""Which causes the verdict on a filter looks for, and by how much they have moved its estimate."""
+"""Which causes the verdict on a filter looks for, what has moved it, and how steps ended."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from livepde.laws.columns import Columns, likely_columns
-from livepde.laws.covariance import reported_factors
-from livepde.laws.filter import Filter
-from livepde.laws.filter_state import FilterState
-from livepde.laws.input_noise import input_rank
-from livepde.laws.law import Fit, Problem
+from livepde.laws.filter import Filter, reported_factors
+from livepde.laws.filter_state import FilterState, ShadowState
+from livepde.laws.law import Fit, Problem, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import model_errors
+from livepde.laws.noise_rows import input_rank
 from livepde.laws.reduction import Reduction
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.shadow_state import ShadowState
+from livepde.laws.shadow_kinds import ALLOWED
 from livepde.laws.shadows import ShadowSet
-from livepde.laws.step_tolerance import ALLOWED
 from livepde.laws.stored_samples import StoredSamples
-from livepde.linalg import Array, nonfinite_allowed
+from livepde.linalg import Array, IntArray, nonfinite_allowed
+from livepde.records import STATUS_CODES
+from livepde.stepping import MOST_SUBSTEPS
 from livepde.verdict import (
     NOT_JUDGED,
     REFUSED,
@@ -39,6 +40,12 @@ from livepde.verdict.sentences import FINDINGS, percent
 
 COARSE = 10.0  # times the error of a step that is allowed, from which the verdict is a caution
 LARGE = 1.0  # misfit over noise that is looked into though no test has found it
+COUNTS = len(STATUS_CODES) + 1  # of a `StepLedger`
+
+SOME = 0.02  # share of the samples from which failed steps are more than a mishap
+MOST = 0.5  # share from which little is left of the data
+PLACES = {code: place for place, code in enumerate(STATUS_CODES)}
+FAILURES = ("departed", "not_converged", "not_finite", "singular")  # codes with a finding each
 
 
 def judge_of(
@@ -50,17 +57,7 @@ def judge_of(
     *,
     kept: bool,
 ) -> Judge | None:
-    """Return the judge of a filter; None if there is to be none.
-
-    Parameters
-    ----------
-    verdict
-        As for `SensitivityLaw`.
-    rank
-        Rows of the square root at most.
-    kept
-        Whether the filter forgets nothing, so that a record of unknowns that stay makes sense.
-    """
+    """Return the judge of a filter; None if there is to be none."""
     if not verdict:
         return None
     still = kept and not (reduction.moves or problem.input_noise)
@@ -102,13 +99,13 @@ def judged(filter_: Filter, x: FilterState, kept: FilterState) -> Callable[[], V
     return found
 
 
-def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+def with_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict with findings on the last fit of the samples.
 
     That it has not converged, or has left out more than 2 % of the readings.
     """
     if fit is None:
-        return judge
+        return verdict
     found = []
     if not fit.converged:
         text, remedy = FINDINGS["fit, not converged"].filled(samples=fit.samples)
@@ -119,57 +116,33 @@ def with_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verd
             samples=fit.samples, share=percent(share, 1), count=fit.refused
         )
         found.append(Finding("fit", "caution", text, evidence=share, remedy=remedy))
-    return (lambda: judge().with_findings(found)) if found else judge
+    return verdict.with_findings(found) if found else verdict
 
 
-def after_fit(judge: Callable[[], Verdict], fit: Fit | None) -> Callable[[], Verdict]:
+def after_fit(verdict: Verdict, fit: Fit | None) -> Verdict:
     """Return a verdict at the end of a run, where a fit of all its samples has converged.
 
     The fit decides on all readings again: what the gate refused before it counts no longer.
     """
     if fit is None or not fit.converged:
-        return judge
-
-    def found() -> Verdict:
-        verdict = judge()
-        kept = [one for one in verdict.findings if one.what != "refused"]
-        return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
-
-    return found
+        return verdict
+    kept = [one for one in verdict.findings if one.what != "refused"]
+    return Verdict.of(kept, verdict.untested, verdict.unseen, judged=verdict.judged)
 
 
-def with_discretisation(
-    judge: Callable[[], Verdict], shadows: ShadowSet | None, s: ShadowState
-) -> Callable[[], Verdict]:
-    """Return a verdict that names the errors of the discretisation which are not held.
-
-    Parameters
-    ----------
-    shadows
-        Those of the filter; None: it follows no such error.
-    s
-        Their state.
-    """
+def with_discretisation(verdict: Verdict, shadows: ShadowSet | None, s: ShadowState) -> Verdict:
+    """Return a verdict that names the errors of the discretisation which are not held."""
     missing = "the discretisation: shadows = None" if shadows is None else shadows.unfollowed
-    coarse = 0 if shadows is None else int(s.coarse[0])
-    if not missing and not coarse:
-        return judge
-
-    def found() -> Verdict:
-        verdict = judge()
-        if coarse and shadows is not None:
-            verdict = verdict.with_findings([_coarse(s, shadows.most)])
-        if not missing or not verdict.judged:
-            return verdict
-        text, _ = FINDINGS["untested"].filled(what=missing)
-        more = Finding("untested", "note", text, "discretisation")
-        return verdict.with_untested(missing).with_findings([more])
-
-    return found
+    if shadows is not None and s.coarse[0]:
+        verdict = verdict.with_findings([_coarse(s, shadows.most)])
+    if not missing or not verdict.judged:
+        return verdict
+    text, _ = FINDINGS["untested"].filled(what=missing)
+    more = Finding("untested", "note", text, "discretisation")
+    return verdict.with_untested(missing).with_findings([more])
 
 
 def _coarse(s: ShadowState, most: int) -> Finding:
-    """Return the finding of steps that would have to be shorter than is allowed."""
     coarse, worst = int(s.coarse[0]), float(s.coarsest[0])
     text, remedy = FINDINGS["step"].filled(
         count=coarse,
@@ -183,49 +156,26 @@ def _coarse(s: ShadowState, most: int) -> Finding:
     return Finding("step", severity, text, "time step", worst, remedy=remedy)
 
 
-def with_columns(judge: Callable[[], Verdict], columns: Columns | str) -> Callable[[], Verdict]:
-    """Return a verdict that names the columns of the data which explain a misfit.
-
-    They are looked for only where something speaks against the estimates.
-
-    Parameters
-    ----------
-    columns
-        The columns, or why they cannot be looked at.
-    """
-
-    def found() -> Verdict:
-        verdict = judge()
-        if verdict.level in ("trusted", NOT_JUDGED):
-            return verdict
-        if isinstance(columns, str):
-            return verdict.with_untested(f"errors of single columns: {columns}")
-        causes, misfit = likely_columns(columns)
-        # Slow noise is a misfit, too, of which a column may explain a part by chance.
-        known = any(finding.what == "misfit" for finding in verdict.findings)
-        return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
-
-    return found
+def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
+    """Return a verdict that names the columns of the data which explain a misfit."""
+    if verdict.level in ("trusted", NOT_JUDGED):
+        return verdict
+    if isinstance(columns, str):
+        return verdict.with_untested(f"errors of single columns: {columns}")
+    causes, misfit = likely_columns(columns)
+    # Slow noise is a misfit, too, of which a column may explain a part by chance.
+    known = any(finding.what == "misfit" for finding in verdict.findings)
+    return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
 
 
-def with_errors(
-    judge: Callable[[], Verdict], work: SensitivityWork, state: SensitivityState
-) -> Callable[[], Verdict]:
-    """Return a verdict whose level follows from fit and effect, where these can be computed.
-
-    It holds the stored samples until then.
-    """
-
-    def found() -> Verdict:
-        verdict = judge()
-        if verdict.level == NOT_JUDGED:
-            return verdict
-        errors = _errors(work, state)
-        if isinstance(errors, str):
-            return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
-        return verdict.with_errors(errors)
-
-    return found
+def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:
+    """Return a verdict whose level follows from fit and effect, where these can be computed."""
+    if verdict.level == NOT_JUDGED:
+        return verdict
+    errors = _errors(work, state)
+    if isinstance(errors, str):
+        return verdict.with_untested(f"intervals that allow for errors of the model: {errors}")
+    return verdict.with_errors(errors)
 
 
 def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str:
@@ -245,7 +195,6 @@ def _errors(work: SensitivityWork, state: SensitivityState) -> ModelErrors | str
 
 
 def _position(filter_: Filter, x: FilterState) -> Position:
-    """Return the data on the estimates of one member, for its verdict."""
     problem, reduction = filter_.problem, filter_.reduction
     latent = problem.model.latent
     _, C = reported_factors(filter_, x)
@@ -298,3 +247,58 @@ def _distance(reduction: Reduction, x: FilterState, a: Array) -> tuple[float, in
     along = axes.T @ a
     squared = float((along[told] ** 2 / (1.0 - left[told])).sum())
     return squared, int(told.sum())
+
+
+class StepLedger(NamedTuple):
+    """Numbers of samples by the status of their step, in the order of `STATUS_CODES`.
+
+    The last number counts the intervals whose substeps were longer than `dt_max`.
+    """
+
+    counts: IntArray
+
+    @classmethod
+    def start(cls) -> StepLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros(COUNTS, dtype=np.int64))
+
+    def add(self, code: str, stretched: bool) -> StepLedger:
+        """Return the value after a sample whose step ended with a status."""
+        counts = self.counts.copy()
+        counts[PLACES[code]] += 1
+        counts[-1] += stretched
+        return StepLedger(counts)
+
+    @property
+    def irregular(self) -> bool:
+        """Whether any step was not ok, or had substeps longer than `dt_max`."""
+        counts = self.counts.tolist()
+        return bool(sum(counts) > counts[PLACES["ok"]])
+
+    def findings(self) -> Iterator[Finding]:
+        """Return a finding for each way in which steps have failed, and one on long intervals."""
+        *counts, stretched = self.counts.tolist()
+        yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        if stretched:
+            text, remedy = FINDINGS["steps, long"].filled(count=stretched, most=MOST_SUBSTEPS)
+            yield Finding("steps", "note", text, "dt_max", float(stretched), remedy=remedy)
+
+
+def step_findings(counts: Mapping[str, int]) -> Iterator[Finding]:
+    """Return a finding for each way in which steps have failed."""
+    samples = sum(counts.values())
+    for code in FAILURES:
+        count = counts.get(code, 0)
+        if not count:
+            continue
+        text, _ = FINDINGS[code].filled(count=count, samples=samples)
+        severity = _severity(code, count / samples)
+        remedy = Status(code).remedy
+        yield Finding("steps", severity, text, code, float(count), remedy=remedy)
+
+
+def _severity(code: str, share: float) -> Severity:
+    # A right model departs in one of a million cases: there is no mishap of that sort.
+    if share > (SOME if code == "departed" else MOST):
+        return "do not trust"
+    return "caution" if code == "departed" or share > SOME else "note"

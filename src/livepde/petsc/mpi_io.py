@@ -17,7 +17,7 @@ import numpy as np
 
 from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
-from livepde.laws.excitation_gate import ExcitationLevel
+from livepde.laws.equation_tests import ExcitationLevel
 from livepde.linalg import IntArray
 from livepde.petsc.observer import ObserverState
 from livepde.petsc.petsc_filter import PetscFilterState

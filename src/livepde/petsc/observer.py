@@ -31,7 +31,7 @@ from livepde.errors import LawError
 from livepde.laws.coupled.coupled_stage import nearest_root
 from livepde.laws.coupled.equation import STIFFEST
 from livepde.laws.damping import Damping, Residual, ResidualDamping
-from livepde.laws.excitation_gate import PROBES, ExcitationGate, ExcitationLevel
+from livepde.laws.equation_tests import PROBES, ExcitationGate, ExcitationLevel
 from livepde.laws.law import Status
 from livepde.petsc.petsc_model import PetscModel, petsc_module
 from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order

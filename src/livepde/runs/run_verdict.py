@@ -13,8 +13,8 @@ import numpy as np
 from livepde.dates import when
 from livepde.diagnostics.check_report import Table
 from livepde.laws.equation_tests import rested
-from livepde.laws.pauses import pauses
-from livepde.laws.step_ledger import step_findings
+from livepde.laws.filter_state import pauses
+from livepde.laws.verdict import step_findings
 from livepde.linalg import Array
 from livepde.plots.dataset import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars

@@ -68,7 +68,7 @@ def clock_leaps(t: Array, values: Array, rows: list[int]) -> list[ClockLeap]:
     t, values
         Times, and values of the channels, shapes (samples,) and (samples, channels).
     rows
-        Samples that end a pause: `livepde.laws.pauses.pauses`.
+        Samples that end a pause: `livepde.laws.filter_state.pauses`.
     """
     found = []
     for k in rows:

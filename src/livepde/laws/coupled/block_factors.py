@@ -46,11 +46,7 @@ from livepde.linalg import (
 LARGE = 4000  # unknowns u and q together, from which a matrix that is not banded goes by blocks
 TOLERANCE = 1e-4  # of GMRES, relative to the first approximation: Newton goes on from there
 ITERATIONS = 60  # each keeps a vector
-CEILING = 5e-3  # of a predicted stage: one more update costs as much as a forward step
-CARRIED = 3e-2  # relative accuracy of r in one, for the same reason
 RESOLVED = 1e-10  # of u and q: smaller updates by GMRES are as good as none
-REFRESH = 0.5  # of the residual: an update costs a twentieth of new factors
-SPENT = 12  # updates and iterations: about what new factors cost
 ONE_SIGN = 1.1  # sum of sizes over size of sums, of entries that have one sign nearly everywhere
 ROUNDING = 1e-12  # asymmetry of a symmetric matrix, relative to its largest entry
 REMEDY = "take a smaller gain or a smaller time step."
@@ -59,8 +55,14 @@ REMEDY = "take a smaller gain or a smaller time step."
 class BlockSolver(StageSolver):
     """Solves the coupled systems of a stage by blocks."""
 
+    refresh = 0.5  # an update costs a twentieth of new factors
+    ceiling = 5e-3  # one more update costs as much as a forward step
+    carried = 3e-2  # for the same reason
+    patience = 12  # updates and iterations: about what new factors cost
+
     def __init__(self, terms: StageTerms) -> None:
         super().__init__(terms)
+        self.keeps = terms.forms.model.constant
         self._solvers: dict[str, tuple[Solver, bool]] = {}
 
     @classmethod
@@ -70,26 +72,6 @@ class BlockSolver(StageSolver):
             return None
         pattern = Pattern.of(terms.forms.model.mass + terms.forms.pull)
         return None if isinstance(analyse(pattern), BandedSolver) else cls(terms)
-
-    @property
-    def keeps(self) -> bool:
-        return self.terms.forms.model.constant
-
-    @property
-    def patience(self) -> int:
-        return SPENT
-
-    @property
-    def refresh(self) -> float:
-        return REFRESH
-
-    @property
-    def ceiling(self) -> float:
-        return CEILING
-
-    @property
-    def carried(self) -> float:
-        return CARRIED
 
     def kept(self, factor: Factor) -> Factor:
         return factor.approximate if isinstance(factor, BlockJacobian) else factor
@@ -192,33 +174,21 @@ class BlockSolver(StageSolver):
 
 @dataclass(frozen=True, eq=False)
 class BlockJacobian:
-    """K at a point, as a `Factor`: GMRES, preconditioned by its approximate inverse.
-
-    Attributes
-    ----------
-    S, forward, A, H
-        Its blocks on free coefficients: `forward` is A(w) over omega and elsewhere, `A` over omega
-        only; H with its auxiliary unknowns behind.
-    rates
-        Lumped mass times the rate of each equation of the state, shape (n,).
-    least
-        Sizes of updates of u and q that are not resolved further.
-    back, curved
-        Derivatives of A(w)^T r in u and in q; None if they are held or zero.
-    border
-        (b, a): b a^T is added to S.
-    """
+    """K at a point, as a `Factor`: GMRES, preconditioned by its approximate inverse."""
 
     solver: BlockSolver
+    # Its blocks on free coefficients: `forward` is A(w) over omega and elsewhere, `A` over omega
+    # only; H with its auxiliary unknowns behind.
     S: sp.csr_array
     forward: sp.csr_array
     A: sp.csr_array
     H: sp.csr_array
-    rates: Array
-    least: tuple[float, ...]
+    rates: Array  # lumped mass times the rate of each equation of the state, shape (n,)
+    least: tuple[float, ...]  # sizes of updates of u and q that are not resolved further
+    # Derivatives of A(w)^T r in u and in q; None if they are held or zero.
     back: sp.csr_array | None
     curved: sp.csr_array | None
-    border: tuple[Array, Array] | None = None
+    border: tuple[Array, Array] | None = None  # (b, a): b a^T is added to S
 
     def apply(self, x: Array) -> Array:
         """Return K x, auxiliary unknowns behind (u, q)."""
@@ -324,7 +294,6 @@ def masked(matrix: sp.csr_array, rows: Array, cols: Array) -> sp.csr_array:
 
 
 def _widened(matrix: sp.csr_array, more: int) -> sp.csr_array:
-    """Return a square matrix with zero rows and columns behind."""
     if not more:
         return matrix
     return sp.csr_array(sp.block_diag([matrix, sp.csr_array((more, more))]))

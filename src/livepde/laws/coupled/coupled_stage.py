@@ -11,17 +11,16 @@ import numpy as np
 import scipy  # scipy.optimize is slow to load, and rarely needed
 
 from livepde.fem import Moment
-from livepde.laws.coupled.bilinear import BilinearSolver
 from livepde.laws.coupled.block_factors import BlockSolver
 from livepde.laws.coupled.equation import (
+    Metric,
     StageData,
     StageIterate,
     StageProblem,
     StageSolver,
     StageTerms,
 )
-from livepde.laws.coupled.metric import Metric
-from livepde.laws.coupled.monolithic import MonolithicSolver
+from livepde.laws.coupled.monolithic import BilinearSolver, MonolithicSolver
 from livepde.linalg import Array, Factor
 from livepde.stepping import Near, Newton, Solution, StepFailed
 
@@ -36,25 +35,18 @@ class KeptFactor:
 
     The factor itself is made again from this where it is gone, after a restart say: the numbers
     that follow are the same.
-
-    Attributes
-    ----------
-    y, u_alpha, h
-        Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
-    weight, sigma, information, theta
-        Of its metric; `information` is empty and `theta` NaN without one.
-    spent
-        Updates that stages took since then, beyond one each.
     """
 
+    # Point, data and step of its Jacobian, shapes (n + m,) and (n,); empty if none is kept.
     y: Array
     u_alpha: Array
     h: float
+    # Of its metric; `information` is empty and `theta` NaN without one.
     weight: float
     sigma: float
     information: Array
     theta: float
-    spent: int
+    spent: int  # updates that stages took since then, beyond one each
 
     @classmethod
     def none(cls) -> KeptFactor:
@@ -91,10 +83,7 @@ class _CoupledEquation:
 def nearest_root(
     function: Callable[[float], float], start: float, least: float, most: float
 ) -> float | None:
-    """Return a root of a function of a positive number, the nearest one to both sides of a start.
-
-    None: there is none between the two ends.
-    """
+    """Return the root of a function of a positive number that is nearest to a start, or None."""
     # Each value is asked for once: that of a stage depends on where its iteration began.
     values = cache(function)
     start = min(max(start, least), most)
@@ -118,10 +107,7 @@ def nearest_root(
 class CoupledStage:
     """Solves coupled stages for one set of sensors; see `livepde.laws.coupled.equation`.
 
-    Attributes
-    ----------
-    carries
-        True if each stage makes up for the remaining residual of the one before.
+    `carries`: True if each stage makes up for the remaining residual of the one before.
     """
 
     def __init__(self, terms: StageTerms, newton: Newton) -> None:
@@ -144,17 +130,7 @@ class CoupledStage:
         predicted: Array | None = None,
         kept: KeptFactor | None = None,
     ) -> tuple[StageIterate, KeptFactor]:
-        """Return the solution of one stage, and the factor to keep; raises `StepFailed`.
-
-        Parameters
-        ----------
-        start
-            Returns where the iteration begins without a prediction, shape (n + m,).
-        predicted
-            A prediction of the solution, shape (n + m,).
-        kept
-            The factor that the stage before has kept.
-        """
+        """Return the solution of one stage, and the factor to keep; raises `StepFailed`."""
         solver, kept = self.solver, kept or KeptFactor.none()
         data = solver.data(problem)
         near = None
@@ -200,7 +176,6 @@ class CoupledStage:
         return newton.solve(equation, y, Near(y))
 
     def _imposed(self, y: Array, moment: Moment) -> Array:
-        """Return y with the Dirichlet values of a moment."""
         n, model = self.terms.n, self.terms.forms.model
         imposed = y.copy()
         imposed[:n] = model.impose(y[:n], moment)

@@ -15,6 +15,16 @@ from both right-hand sides: so the residuals of a run of stages do not add up.
 
 theta depends on all of r; its derivative is a rank-one term of the Jacobian. Where A is nonlinear
 in q, A(w) in the second line is its derivative.
+
+*Forms.* The paper splits u into R u = chi_omega u and P u = chi_(Omega without omega) u. Both have
+a jump at the boundary of omega, which no function of a finite-element space has. So the integrals
+are split, and not the coefficients: over omega the forms see w = u_alpha + P u, outside of it the
+estimate u. Selecting coefficients instead would let P u fall to zero over one element, with a
+gradient of size u over the size of the element: M and N of (MN1), (MN2) would see that and diverge
+with the mesh.
+
+Averages, points and matrices have no omega: R = G^+ G and P = I - R split the state in all of
+Omega.
 """
 
 from __future__ import annotations
@@ -24,18 +34,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.fem import Moment
-from livepde.laws.coupled.metric import Metric
-from livepde.laws.coupled.split_forms import StageForms
+from livepde.fem import Composed, Form, Moment
 from livepde.laws.damping import Damping, Residual
-from livepde.linalg import Array, Factor, Pattern, compact
+from livepde.linalg import Array, Factor, IntArray, Pattern, compact
+from livepde.model import Model
+from livepde.observation import Split
+from livepde.spaces import HilbertSpace
 from livepde.stepping import TINY
 
+AnyForm: TypeAlias = Form | Composed
 FLOOR = 1e-6  # of ||u_alpha||: what is smaller of r counts as zero
 RESOLVED = 1e-3  # relative accuracy of r, as far as it is above the floor
 CARRIED = 1e-2  # the same where the next stage makes up for the remaining residual
@@ -43,6 +55,132 @@ STIFFEST = 1e12  # times 1/h, of theta: then a step takes all but this part of r
 RESTING = 1e-6  # of u and q: residuals of smaller changes in a step are relative to it
 OWED = 0.1  # weight of the second line's residual, where a later step makes up for it
 ROUNDING = 4e-16  # times the sizes of all terms of a row: what their sum is exact to
+
+
+@dataclass(frozen=True, eq=False)
+class StageForms:
+    """Forms and matrices of a stage for one set of sensors; fixed, whatever the step."""
+
+    # The process, and the split of its state into an observed and a hidden part.
+    model: Model
+    split: Split
+    # Integrands (u, v, x) of M and N, integrated as in (MN1), (MN2); M_op None: that of M.
+    M_op: Any
+    N_op: Any
+    nu: float  # weight of N
+
+    @cached_property
+    def _outside(self) -> IntArray | None:
+        """The elements outside omega; None where there are none."""
+        omega = self.split.omega
+        if omega is None:
+            return None
+        return np.setdiff1d(np.arange(self.model.mesh.nelements), omega)
+
+    def _inside(self, form: AnyForm) -> AnyForm:
+        return form if self.split.omega is None else form.on(self.split.omega)
+
+    @cached_property
+    def A_in(self) -> AnyForm:
+        """A over omega."""
+        return self._inside(self.model.form_A)
+
+    @cached_property
+    def B_in(self) -> AnyForm:
+        """B over omega."""
+        return self._inside(self.model.form_B)
+
+    @cached_property
+    def A_out(self) -> AnyForm | None:
+        """A outside omega; None where there is nothing."""
+        return None if self._outside is None else self.model.form_A.on(self._outside)
+
+    @cached_property
+    def B_out(self) -> AnyForm | None:
+        """B outside omega; None where there is nothing."""
+        return None if self._outside is None else self.model.form_B.on(self._outside)
+
+    def argument(self, u: Array, r: Array) -> Array:
+        """Return w = u_alpha + P u, which A and B see over omega: u - r, since P = I - R."""
+        return u - r
+
+    @cached_property
+    def W(self) -> sp.csr_array | None:
+        """dw/du over omega, shape (n, n); None where w is known there: the data give all of it."""
+        n = self.model.X.dim
+        estimated = sp.csr_array(self.split.P @ sp.diags_array(self.model.X.free))
+        if self.split.omega is not None:
+            # Only coefficients that the forms over omega read can make w unknown.
+            touched = np.zeros(n)
+            touched[self.B_in.pattern("v", "u").indices] = 1.0
+            touched[self.A_in.pattern("v", "u").indices] = 1.0
+            estimated = sp.csr_array(sp.diags_array(touched) @ estimated)
+        estimated.eliminate_zeros()
+        return self.split.P if estimated.nnz else None
+
+    @cached_property
+    def mass(self) -> sp.csr_array:
+        """Matrix of ||r||_X^2 = r^T mass r: R^T M R, integrated over omega."""
+        form = self._inside(self.model.form_M)
+        return self._observed(form.matrix("v", "u"))
+
+    @cached_property
+    def pull(self) -> sp.csr_array:
+        """R^T M_op R, integrated over omega (MN1)."""
+        if self.M_op is None:
+            return self.mass
+        return self._observed(self.model.bilinear(self.M_op, self.split.omega))
+
+    @cached_property
+    def hidden(self) -> sp.csr_array:
+        """Matrix nu P^T N_op P over omega, and nu N_op outside it (MN2), shape (n, n)."""
+        n, P = self.model.X.dim, self.split.P
+        if not self.nu:
+            return sp.csr_array((n, n))
+        inside = P.T @ self.model.bilinear(self.N_op, self.split.omega) @ P
+        if self._outside is not None:
+            inside = inside + self.model.bilinear(self.N_op, self._outside)
+        return sp.csr_array(self.nu * inside)
+
+    def _observed(self, matrix: sp.csr_array) -> sp.csr_array:
+        return sp.csr_array(self.split.R.T @ matrix @ self.split.R)
+
+    @cached_property
+    def tests(self) -> HilbertSpace:
+        """X without the functions that reach out of omega: the test functions of ||r||_V~."""
+        if self._outside is None:
+            return self.model.X
+        reach = np.zeros(self.model.X.dim, dtype=bool)
+        for name, block in self.model.state_space.fields.items():
+            start = self.model.state_space.part(name).start
+            reach[start + block.element_dofs[:, self._outside]] = True
+        reach[self.model.X.fixed] = True
+        return HilbertSpace(self.model.mass, "V~", np.flatnonzero(reach))
+
+
+@dataclass(frozen=True, eq=False)
+class Metric:
+    """Weights of the second line of a stage, an equation of dual vectors of Q.
+
+        weight G_Q (q_t + sigma q - K (q - prior)) + J (q - c_q) = A(w)^T r + load
+
+    with q_t = (q - c_q)/h, the Gram matrix G_Q, and the generator K of unknowns that move by
+    themselves. With J = 0 and without load it is (noisy_q), and with sigma = 0 (est_exact_q), for
+    weight = 1/gain.
+    """
+
+    weight: float  # 1/gain, >= 0
+    sigma: float = 0.0  # stabilising term of (noisy_q), >= 0
+    # Terms of the right-hand side besides A(w)^T r, shape (m,); None: zero.
+    load: Array | None = None
+    # Data of J, in the pattern that the stage was made with; None: zero.
+    information: Array | None = None
+    # Weight of R^T M_op r in the stage, where the metric sets it; None: by the damping rule.
+    theta: float | None = None
+
+    def scale(self, h: float) -> float:
+        """Return the weight of G_Q q in a stage with step h."""
+        return self.weight * (1.0 / h + self.sigma)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,188 +194,102 @@ class Inside:
 
 @dataclass(frozen=True, eq=False)
 class StageProblem:
-    """One stage to be solved.
+    """One stage to be solved."""
 
-    Attributes
-    ----------
-    c
-        (c_u, c_q), shape (n + m,).
-    h, moment
-        Step, and time and inputs at its end.
-    u_alpha
-        Observed part of the state, shape (n,).
-    metric
-        Weights of the second line.
-    left
-        Remaining residual of the stage before, for which this one makes up, a dual vector, shape
-        (n + m,); None: residuals are not carried from stage to stage.
-    """
-
-    c: Array
+    c: Array  # (c_u, c_q), shape (n + m,)
+    # Step, and time and inputs at its end.
     h: float
     moment: Moment
-    u_alpha: Array
-    metric: Metric
+    u_alpha: Array  # observed part of the state, shape (n,)
+    metric: Metric  # weights of the second line
+    # Remaining residual of the stage before, for which this one makes up, a dual vector, shape (n +
+    # m,); None: residuals are not carried from stage to stage.
     left: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class StageData:
-    """A stage with the data that are computed once for it.
+    """A stage with the data that are computed once for it."""
 
-    Attributes
-    ----------
-    problem
-        The stage.
-    source, load
-        F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
-    rest
-        Left side of the second line for a q that does not change, shape (m,).
-    inside
-        A and B over omega, where the data give all of w there.
-    sizes
-        Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of
-        F and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
-    observed
-        Function that returns the squared norms of u_alpha, computed once.
-    J
-        Information in the metric, a matrix of shape (m, m); None: zero.
-    """
-
-    problem: StageProblem
+    problem: StageProblem  # the stage
+    # F and the load, less the remaining residual of the stage before, shapes (n,) and (m,).
     source: Array
     load: Array
-    rest: Array
-    inside: Inside | None
+    rest: Array  # left side of the second line for a q that does not change, shape (m,)
+    inside: Inside | None  # A and B over omega, where the data give all of w there
+    # Least scales of the residuals of both lines, and ||u_alpha||_X. Scales are the dual norms of F
+    # and of the load less `rest`, or of changes by `RESTING` of c if these are larger.
     sizes: tuple[float, float, float]
+    # Function that returns the squared norms of u_alpha, computed once.
     observed: Callable[[], Residual]
-    J: Any = None
+    J: Any = None  # information in the metric, a matrix of shape (m, m); None: zero
 
 
 @dataclass(frozen=True, eq=False)
 class StageIterate:
-    """The stage at a point y = (u, q).
+    """The stage at a point y = (u, q)."""
 
-    Attributes
-    ----------
-    y, residual
-        Shape (n + m,).
-    size, resolved
-        See `livepde.stepping.newton.StagePoint`.
-    scales
-        Dual norms of the largest terms of the two lines.
-    w, r
-        Argument of A and B over omega, and the observed residual, shape (n,).
-    A_in
-        A(w) over omega, shape (n, m).
-    theta
-        Weight of R^T M_op r.
-    norms
-        Squared norms of r.
-    Mr, mass_r
-        R^T M_op r and R^T M r over omega, shape (n,).
-    """
-
+    # Shape (n + m,).
     y: Array
     residual: Array
+    # See `livepde.stepping.newton.StagePoint`.
     size: float
     resolved: bool
-    scales: tuple[float, float]
+    scales: tuple[float, float]  # dual norms of the largest terms of the two lines
+    # Argument of A and B over omega, and the observed residual, shape (n,).
     w: Array
     r: Array
-    A_in: Any
-    theta: float
-    norms: Residual
+    A_in: Any  # A(w) over omega, shape (n, m)
+    theta: float  # weight of R^T M_op r
+    norms: Residual  # squared norms of r
+    # R^T M_op r and R^T M r over omega, shape (n,).
     Mr: Array
     mass_r: Array
 
 
-@dataclass(frozen=True, eq=False)
 class StageTerms:
     """Terms of a stage that all solvers share: its forms, gains and norms.
 
-    Parameters
-    ----------
-    forms
-        Forms over omega and elsewhere.
-    damping
-        Rule for theta.
-    memory
-        Pattern of `Metric.information`; None: there is none.
+    `memory` is the pattern of `Metric.information`; None: there is none.
     """
 
-    forms: StageForms
-    damping: Damping
-    memory: Pattern | None = None
+    def __init__(self, forms: StageForms, damping: Damping, memory: Pattern | None = None) -> None:
+        model = forms.model
+        self.forms, self.damping, self.memory = forms, damping, memory
+        self.n, self.size = model.X.dim, model.X.dim + model.Q.dim
+        self.parts = slice(0, self.n), slice(self.n, self.size)  # of u and q in y
+        # One for each free coefficient of the state, (n,), and of the parameter, (m,).
+        self.free, self.free_q = model.X.free, model.Q.free
+        # G_Q, or where that is dense a sparse matrix of which it is the Schur complement, with
+        # auxiliary unknowns behind q.
+        self.gram: sp.csr_array = model.Q.augmented
+        self.auxiliary = self.gram.shape[0] - model.Q.dim
+        self.linear = model.form_A.linear_in_parameter  # in q
+        self.moves = bool(model.latent.generator.nnz)  # whether an unknown moves by itself
+        self.observes = bool(forms.split.present.any())  # whether a sensor is present
+        # M, R^T M_op R and R^T M R over omega; dense if small.
+        self.mass, self.pull = compact(model.mass), compact(forms.pull)
+        self.observed_mass = compact(forms.mass)
+        # Diagonal of the mass: the norm by it is equivalent to that of X.
+        self.lumped: Array = np.abs(model.mass.diagonal())
+        self.dual_weights = self._dual_weights()
+        weights = self.dual_weights
+        # Diagonals of M and G_Q on the free coefficients, shape (n + m,).
+        self.diagonal = np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0.0)
 
-    @cached_property
-    def n(self) -> int:
-        """Number of coefficients of the state."""
-        return self.forms.model.X.dim
-
-    @cached_property
-    def size(self) -> int:
-        """Number of unknowns n + m."""
-        return self.n + self.forms.model.Q.dim
-
-    @cached_property
-    def free(self) -> Array:
-        """One for each free coefficient of the state, shape (n,)."""
-        return self.forms.model.X.free
-
-    @cached_property
-    def free_q(self) -> Array:
-        """One for each free coefficient of the parameter, shape (m,)."""
-        return self.forms.model.Q.free
-
-    @cached_property
-    def gram(self) -> sp.csr_array:
-        """G_Q, or where that is dense a sparse matrix of which it is the Schur complement."""
-        return self.forms.model.Q.augmented
-
-    @cached_property
-    def auxiliary(self) -> int:
-        """Number of unknowns behind q that such a matrix has."""
-        return self.gram.shape[0] - self.forms.model.Q.dim
-
-    @cached_property
-    def linear(self) -> bool:
-        """True if A is linear in q."""
-        return self.forms.model.form_A.linear_in_parameter
-
-    @cached_property
-    def dual_weights(self) -> Array:
-        """Weights of the squared dual norms, shape (n + m,): the inverse diagonals of M and G_Q.
+    def _dual_weights(self) -> Array:
+        """Return weights of squared dual norms, (n + m,): the inverse diagonals of M and G_Q.
 
         For functionals of the same kind, as a residual and the terms that it is the sum of, the
         ratio of these norms is that of the dual norms, and larger where a residual is rough.
         """
-        parts = []
-        for gram, free in (
-            (self.forms.model.mass, self.free),
-            (self.forms.model.Q.gram if not self.auxiliary else self.gram, self.free_q),
-        ):
+        parts, Q = [], self.forms.model.Q
+        grams = self.forms.model.mass, self.gram if self.auxiliary else Q.gram
+        for gram, free in zip(grams, (self.free, self.free_q), strict=True):
             diagonal = np.abs(gram.diagonal())[: len(free)]
             floor = diagonal.max(initial=0.0) or 1.0
             parts.append(free / np.where(diagonal > 0.0, diagonal, floor))
         return np.concatenate(parts)
-
-    @cached_property
-    def diagonal(self) -> Array:
-        """Diagonals of M and G_Q on the free coefficients, shape (n + m,)."""
-        weights = self.dual_weights
-        return np.divide(1.0, weights, out=np.zeros_like(weights), where=weights > 0.0)
-
-    @cached_property
-    def parts(self) -> tuple[slice, slice]:
-        """Places of u and q in y."""
-        return slice(0, self.n), slice(self.n, self.size)
-
-    @cached_property
-    def lumped(self) -> Array:
-        """Diagonal of the mass, shape (n,): the norm by it is equivalent to that of X."""
-        diagonal: Array = np.abs(self.forms.model.mass.diagonal())
-        return diagonal
 
     def duals(self, functionals: Sequence[Array], part: slice) -> list[float]:
         """Return the dual norms of functionals on u or q."""
@@ -254,17 +306,7 @@ class StageTerms:
         theta: float,
         accuracy: float,
     ) -> tuple[float, bool, tuple[float, float]]:
-        """Return the relative size of a residual, whether it resolves r, and the scales of both.
-
-        Parameters
-        ----------
-        first, second
-            Residual and changing terms of the two lines.
-        X
-            ||r||_X^2.
-        accuracy
-            Of r, relative, as far as it is above the floor.
-        """
+        """Return the relative size of a residual, whether it resolves r, and the scales of both."""
         state, *terms = self.duals(first, self.parts[0])
         other, *terms_q = self.duals(second, self.parts[1])
         scales = max(data.sizes[0], *terms), max(data.sizes[1], *terms_q)
@@ -278,10 +320,7 @@ class StageTerms:
         return max(own, own_q), state <= accuracy * r * least or not self.observes, scales
 
     def given(self, problem: StageProblem, source: Array, inside: Inside | None) -> StageData:
-        """Return a stage, from its F on the free coefficients and the terms of the data on omega.
-
-        The remaining residual of the stage before is subtracted here.
-        """
+        """Return a stage, from its F and the terms of the data on omega."""
         metric, left, c_q = problem.metric, problem.left, problem.c[self.n :]
         load = np.zeros_like(c_q) if metric.load is None else metric.load
         if left is not None:
@@ -317,26 +356,6 @@ class StageTerms:
     def _small_gram(self) -> Any:
         return compact(self.gram)
 
-    @cached_property
-    def moves(self) -> bool:
-        """True if an unknown moves by itself."""
-        return bool(self.forms.model.latent.generator.nnz)
-
-    @cached_property
-    def mass(self) -> Any:
-        """M, dense if small, shape (n, n)."""
-        return compact(self.forms.model.mass)
-
-    @cached_property
-    def pull(self) -> Any:
-        """R^T M_op R over omega, dense if small, shape (n, n)."""
-        return compact(self.forms.pull)
-
-    @cached_property
-    def observed_mass(self) -> Any:
-        """R^T M R over omega, dense if small, shape (n, n)."""
-        return compact(self.forms.mass)
-
     def sizes(
         self, problem: StageProblem, source: Array, load: Array
     ) -> tuple[float, float, float]:
@@ -349,11 +368,6 @@ class StageTerms:
         (other,) = self.duals([load], self.parts[1])
         known = math.sqrt(float(self.lumped @ np.square(problem.u_alpha)))
         return max(own, RESTING * least), max(other, RESTING * least_q), known
-
-    @cached_property
-    def observes(self) -> bool:
-        """True if a sensor is present."""
-        return bool(self.forms.split.present.any())
 
     def observed(self, u_alpha: Array) -> Callable[[], Residual]:
         """Return a function that computes the norms of u_alpha when it is called first."""
@@ -371,10 +385,7 @@ class StageTerms:
         mass_r: Array,
         observed: Callable[[], Residual] | None = None,
     ) -> Residual:
-        """Return the norms of r that a damping rule may use.
-
-        ||r||_V~ is the dual norm of M_op r over the test functions that stay within omega.
-        """
+        """Return the norms of r that a damping rule may use."""
         tests = self.forms.tests
 
         def V() -> float:
@@ -391,10 +402,7 @@ class StageTerms:
         return min(self.damping.theta(norms), STIFFEST / data.problem.h)
 
     def bracket(self, data: StageData) -> tuple[float, float]:
-        """Return two ends between which the theta of a solved stage lies.
-
-        Below the first the pull is rounding. The second is the bound of the rule.
-        """
+        """Return two ends between which the theta of a solved stage lies."""
         h = data.problem.h
         return 1.0 / (STIFFEST * h), min(self.damping.most(data.observed()), STIFFEST / h)
 
@@ -451,33 +459,18 @@ class StageTerms:
 class StageSolver(ABC):
     """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
 
+    keeps: bool  # whether a factor is worth keeping from stage to stage
+    refresh = 0.2  # share of the residual that an update by a kept factor may leave
+    ceiling = 0.0  # relative residual up to which a predicted stage is not solved further
+    carried = CARRIED  # relative accuracy of r where the next stage makes up for the residual
+
     def __init__(self, terms: StageTerms) -> None:
         self.terms = terms
 
     @property
     @abstractmethod
-    def keeps(self) -> bool:
-        """True if a factor is worth keeping from stage to stage."""
-
-    @property
-    @abstractmethod
     def patience(self) -> int:
         """Updates, beyond one for each stage, after which a kept factor is made again."""
-
-    @property
-    def refresh(self) -> float:
-        """Share of the residual that an update by a kept factor may leave before a new one pays."""
-        return 0.2
-
-    @property
-    def ceiling(self) -> float:
-        """Relative residual up to which a predicted stage is not solved further (`Newton`)."""
-        return 0.0
-
-    @property
-    def carried(self) -> float:
-        """Relative accuracy of r where the next stage makes up for the remaining residual."""
-        return CARRIED
 
     def accuracy(self, data: StageData) -> float:
         """Return the relative accuracy of r in a solved stage."""
@@ -496,13 +489,7 @@ class StageSolver(ABC):
         """Compute the parts that do not depend on the samples."""
 
     def data(self, problem: StageProblem, w: Array | None = None) -> StageData:
-        """Return a stage, with the terms that do not depend on its solution.
-
-        Parameters
-        ----------
-        w
-            u_alpha with the Dirichlet values, shape (n,); default those of the moment.
-        """
+        """Return a stage, with the terms that do not depend on its solution."""
         forms, moment, inside = self.terms.forms, problem.moment, None
         if forms.W is None and self.terms.linear:
             w = forms.model.impose(problem.u_alpha, moment) if w is None else w

@@ -1,9 +1,9 @@
-"""Has the process changed? A test on the innovations, with a stated rate of false alarms."""
+"""When a filter goes back to earlier samples: to fit them again, to recover, or after a jump."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,42 +17,134 @@ from livepde.linalg import Array, IntArray, Mask
 LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
 
 
-@dataclass(frozen=True, eq=False)
-class Watch:
-    """Innovations of the last samples of each member.
+@dataclass(frozen=True)
+class Refit:
+    """Fit the stored samples again: at the start of a run, at its end, and on demand.
 
-    Attributes
+    An update leaves a second-order error that a state with long memory never forgets, and far from
+    the truth it may end anywhere. The refit is a search for the most probable constant unknowns
+    given all stored samples: Levenberg-Marquardt steps in a trust region, new starts where the end
+    does not explain the samples, and a second look at refused readings. See `livepde.laws.refit`.
+
+    The samples are fitted each time their number has doubled, so that most of the search is over
+    while they are few. Such a call of `step` takes longer than others. Where it must not, as in a
+    control loop or a live run, `apart` fits them in a thread of its own.
+
+    Unknowns that move, noisy inputs and a fading memory have no such fit: there the samples of the
+    start are smoothed again, as `livepde.laws.iterated_smoother` does.
+
+    Parameters
     ----------
-    squares, counts
-        Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
-        (members, samples).
-    seen, resting
-        Samples since the start, and samples that are not looked at yet, shape (members,).
-    usual
-        Statistics of the innovations, with which new ones are compared: none counts for more than
-        `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
-    scatters
-        Usual scatter before each of the last samples, newest first, shape (members, samples).
+    start
+        Up to this many samples are taken again at each doubling; 64 at most of unknowns that move.
+    window
+        At most this many samples are stored. When it is full, the estimate of that moment becomes
+        the prior of the next window.
+    passes
+        A search that takes more passes over the samples has not converged.
+    apart
+        True: a fit of more than 64 samples runs in a thread, while samples continue. An eighth more
+        samples later the filter goes over to it; then each call of `step` takes three of the
+        samples in between, until all are taken. The numbers do not depend on the time that the fit
+        takes: a call waits for it where it is due and not there yet. Members of a fleet are fitted
+        at once. None: in runs of a case that wait for their source.
     """
 
+    start: int = 4096
+    window: int = 4096
+    passes: int = 40
+    # It moves when a fit is used, not what the run is of.
+    apart: bool | None = field(default=None, metadata={"begins_anew": True})
+
+    def __post_init__(self) -> None:
+        for name, least in (("start", 0), ("window", 2), ("passes", 1)):
+            value = getattr(self, name)
+            if value < least:
+                raise LawError(f"Refit: {name} must be at least {least}; got {value}.")
+
+
+@dataclass(frozen=True)
+class Guards:
+    """Safeguards of `SensitivityLaw` against failure of its assumptions; inert while they hold.
+
+    *Overconfident linearisation.* A sample that moves an unknown by more than `reach` prior
+    standard deviations, and by more than half a posterior standard deviation, is assimilated by
+    Gauss-Newton steps over its interval, each at most one prior standard deviation long, until
+    reference and estimate agree within half a posterior standard deviation. Where the steps do not
+    converge, the sample is taken again with ten times its noise, and so on; after `temperings` such
+    attempts it is not used. Notes: "iterated", "tempered", "held".
+
+    *Runaway.* A step fails, or a prediction misses the data by more than `runaway` times the
+    largest range that any sensor has ever shown (each in units of its noise). The law then goes
+    back to before the last samples, inflates the covariance there by one prior standard deviation,
+    and propagates the state without those samples; if that fails as well, it starts again from the
+    prior. Note: "restarted". If nothing helps, a failed step is reported as such and changes
+    nothing; "runaway" notes a prediction that still misses the data.
+
+    Parameters
+    ----------
+    reach
+        Largest move of an unknown by one sample without iteration, in prior standard deviations.
+    iterations
+        At most this many Gauss-Newton steps for a sample.
+    temperings
+        How often a sample whose steps do not converge is taken again with ten times its noise.
+    runaway
+        Smallest innovation of a runaway, as a multiple of the largest range of the sensors.
+    past
+        A restart goes back by this many samples at least, if there are so many, and by less than
+        twice as many.
+    """
+
+    reach: float = 1.0
+    iterations: int = 10
+    temperings: int = 2
+    runaway: float = 10.0
+    past: int = 32
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "runaway"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise LawError(f"Guards: {name} must be a positive number; got {value}.")
+        for name, least in (("iterations", 1), ("temperings", 0), ("past", 1)):
+            value = getattr(self, name)
+            if value < least:
+                raise LawError(f"Guards: {name} must be at least {least}; got {value}.")
+
+    def within_reach(self, change: Array) -> Mask:
+        """Return which members a sample moves by at most `reach`, shape (members,).
+
+        `change` is that of the reduced unknowns, in prior standard deviations, (members, k).
+        """
+        near: Mask = np.abs(change).max(axis=1, initial=0.0) <= self.reach
+        return near
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """Innovations of the last samples of each member."""
+
+    # Sum of e^2 and number of innovations e of each of the last samples, newest first, shapes
+    # (members, samples).
     squares: Array
     counts: Array
+    # Samples since the start, and samples that are not looked at yet, shape (members,).
     seen: IntArray
     resting: IntArray
+    # Statistics of the innovations, with which new ones are compared: none counts for more than
+    # `LARGEST` times the usual size, so that a jump hardly changes its own yardstick.
     usual: Innovations
+    # Usual scatter before each of the last samples, newest first, shape (members, samples).
     scatters: Array
 
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
 
-        Parameters
-        ----------
-        opening
-            Members that still have to find the usual size, shape (members,): there any innovation
-            counts, while those after an alarm, which learn anew, are left out.
-        refused
-            How many values in a row of each sensor a gate has refused, (members, sensors); None: it
-            refuses none. They may be wild, and do not count for the usual size before it is found.
+        `opening`: members that still have to find the usual size, shape (members,): there any
+        innovation counts, while those after an alarm, which learn anew, are left out. `refused`:
+        how many values in a row of each sensor a gate has refused, (members, sensors); None: it
+        refuses none. They may be wild, and do not count for the usual size before it is found.
         """
         seen = np.isfinite(e)
         square = (np.where(seen, e, 0.0) ** 2).sum(axis=1)
