@@ -27,6 +27,7 @@ from livepde.stepping import ForwardStage
 from livepde.verdict.missing_terms import boundary_lifts, flux_loads, force, scaled_channel
 
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute
+MOST_STEPS = 500  # in which answers go on: errors of unknown size are smooth enough
 MOST_UNKNOWNS = 4  # that may jump or drift
 STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
@@ -222,7 +223,8 @@ class ErrorColumns:
         stage, free = ForwardStage(model), model.X.free
         spans = samples.spans
         steps = max(len(spans), 1)
-        stride = math.ceil(steps * self.count * model.X.dim / MOST_WORK)
+        work = steps * self.count * model.X.dim
+        stride = max(math.ceil(work / MOST_WORK), math.ceil(steps / MOST_STEPS))
         begin, end = float(spans[0].start), float(spans[-1].t1)
         p = self._start()
         found = np.full((len(spans), self.observed.size, self.count), np.nan)

@@ -40,6 +40,7 @@ TIMES = (1.0 / 30.0, 1.0 / 6.0, 2.0, math.inf)  # correlation times over the len
 MOST_GAIN = 0.3  # standard deviation of the scale of a sensor that is plausible
 FARTHEST = 0.1  # the same of its place, over the length of the domain
 FEWEST = 20  # readings
+NEAR = 0.03  # posterior standard deviations within which a trajectory is that of the best fit
 QUANTILE = 1.96  # standard deviations to the end of a 95 % interval
 SHRINK = 10.0  # pairs of readings that the stated noise counts
 LEAST_LEVEL = 0.01  # least variance of the noise over the stated one that is believed
@@ -132,10 +133,10 @@ def model_errors(
     `std`, `shift`: reported standard deviations of the latent unknowns, and their shifts by the
     discretisation, (m,).
     """
-    one = _best(samples)
-    if one is None:
+    found = _best(samples, options)
+    if found is None:
         return "a step of the model fails at the best fit"
-    used = plausible(samples, options, one) & np.isfinite(one.residuals)
+    one, used = found
     if used.sum() < FEWEST:
         return f"fewer than {FEWEST} readings are in use"
     start, reduction = samples.state.start, samples.filter.reduction
@@ -160,16 +161,21 @@ def model_errors(
     )
 
 
-def _best(samples: StoredSamples) -> Passed | None:
-    """Return the samples about the best fit; None if a step fails."""
+def _best(samples: StoredSamples, options: Refit) -> tuple[Passed, Mask] | None:
+    """Return the samples about the best fit, and the readings in use; None if a step fails."""
     one = samples.about(samples.reached)
-    if one is None or not samples.state.start.U.any():
-        return one
+    if one is None:
+        return None
+    used = plausible(samples, options, one) & np.isfinite(one.residuals)
     # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
-    there = np.isfinite(one.residuals)
-    step = np.linalg.solve(*one.model(there))
+    H, g = one.model(used)
+    step = np.linalg.solve(H, g)
+    if not samples.state.start.U.any() or step @ H @ step < NEAR**2:
+        return one, used
     better = samples.about(samples.within_bounds(one.xi + step))
-    return one if better is None or better.cost(there) > one.cost(there) else better
+    if better is None or better.cost(used) > one.cost(used):
+        return one, used
+    return better, plausible(samples, options, better) & np.isfinite(better.residuals)
 
 
 def _rms(values: Array) -> float:

@@ -50,6 +50,7 @@ ACCEPTED = 1e-4  # least ratio of actual and predicted decrease of the cost
 POOR, GOOD = 0.25, 0.75  # ratios below and above which the trust region changes
 SHORTER = 0.5  # radius of the next trial over that of the one before
 CLOSE = 0.1  # part of a step over which its second derivative is taken
+SHORT = 0.1  # prior standard deviations of a step whose second-order part is left out
 CURVED = 0.75  # largest second-order part of a step over its first-order part (Transtrum 2012)
 SHORTEST, LEAST = 1e-7, 1e-9  # step, and predicted decrease relative to the cost, that are none
 LARGE, DOUBTFUL = 30.0, 2.5  # mean squares of residuals that need a new search, the second one
@@ -288,6 +289,10 @@ class _Search:
                 gain = float(g @ step - 0.5 * step @ H @ step)
                 if np.linalg.norm(step) < SHORTEST or gain < LEAST * cost:
                     break
+                if several == 1 and np.linalg.norm(step) < SHORT:
+                    better = self._about(self.samples.within_bounds(one.xi + step))
+                    if better is not None and cost - better.cost(self.used) > ACCEPTED * gain:
+                        return better, delta
                 if bend is None:
                     bend = self._bend(one, step)
                 curved = axes @ ((axes.T @ (bend * (step @ step))) / (sizes + shift))
@@ -503,6 +508,7 @@ def _after(
         work=spent + found.passes * len(samples.spans),
         converged=np.array([float(found.converged)]),
         screened=np.array([len(samples.spans)]) if found.screened else state.fit.screened,
+        xi=found.best.xi[None],
     )
     now = work.filter.relinearised(x)
     # A filter to go back to that was set with this sample is that after the fit.

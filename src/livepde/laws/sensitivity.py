@@ -290,7 +290,7 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             initial=no,
             assimilated=zero,
             due=np.array([1 if work.window else NEVER]),
-            fit=FitState.none(),
+            fit=FitState.none(x),
             fork=Fork.none(x),
             older=x,
             newer=x,
@@ -556,4 +556,4 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
     start = work.kept_start(x)
-    return changed(state, start=start, now=x, older=x, newer=x)
+    return changed(state, start=start, fit=FitState.none(start), now=x, older=x, newer=x)

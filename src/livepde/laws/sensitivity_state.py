@@ -158,10 +158,12 @@ class FitState:
     converged: Array
     # How many samples the last search had that began again in vain, 0 before, shape (members,).
     screened: IntArray
+    xi: Array  # coordinates where it ended, on the rows of the start, shape (members, r)
 
     @classmethod
-    def none(cls, members: int = 1) -> FitState:
-        """Return the value before any refit."""
+    def none(cls, start: FilterState) -> FitState:
+        """Return the value before any refit of windows with a start."""
+        members, rows = start.C.shape[:2]
         zero, nothing = np.zeros(members), np.zeros(members, dtype=np.int64)
         return cls(
             samples=nothing,
@@ -171,6 +173,7 @@ class FitState:
             work=zero,
             converged=zero,
             screened=nothing,
+            xi=np.zeros((members, rows)),
         )
 
     def member(self, k: int) -> Fit | None:
@@ -329,7 +332,7 @@ def _windows_from(
         "initial": state.initial & ~begun,
         "assimilated": np.where(begun, zero, state.assimilated),
         "due": np.where(begun, zero + 1, state.due),
-        "fit": where(begun, FitState.none(len(begun)), state.fit),
+        "fit": where(begun, FitState.none(state.start), state.fit),
         "fork": Fork.none(now),
     }
 
@@ -410,19 +413,20 @@ def new_window(
     `row`: of the log, to which the filter belongs; later ones are forgotten. Default the last.
     """
     log = state.log if row is None else state.log[:, : row + 1]
+    kept = work.kept_start(start)
     zero = np.zeros(1, dtype=np.int64)
     no = np.zeros(1, dtype=bool)
     return changed(
         state,
         now=start,
-        start=work.kept_start(start),
+        start=kept,
         log=log,
         window=zero + log.shape[1] - 1,
         opening=no,
         initial=no,
         assimilated=zero,
         due=zero + (1 if work.window else NEVER),
-        fit=FitState.none(),
+        fit=FitState.none(kept),
         fork=Fork.none(start),
     )
 

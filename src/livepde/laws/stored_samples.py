@@ -121,10 +121,14 @@ class StoredSamples:
 
     @property
     def reached(self) -> Array:
-        """Coordinates xi of the present estimate, shape (r,)."""
+        """Coordinates xi of the present estimate, shape (r,).
+
+        Those of an uncertain start, which no unknown has, are where the last refit ended.
+        """
         now, start, reduction = self.state.now, self.state.start, self.filter.reduction
         shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
-        return coordinates(start.C[0], shift)
+        last: Array = self.state.fit.xi[0]
+        return last + coordinates(start.C[0], shift - start.C[0].T @ last)
 
     def within_bounds(self, xi: Array) -> Array:
         """Return xi, moved the least so that the unknowns are within their bounds."""

@@ -119,7 +119,7 @@ def not_late(
         known = np.isfinite(values)
         t, own = table.t[known] - by, values[known, None]
         if name in sensors and t[0] > table.t[0]:
-            t, own = np.append(table.t[0], t), np.append([[np.nan]], own, axis=0)
+            t, own = np.append(table.t[:1], t), np.vstack([np.full((1, 1), np.nan), own])
         found.append(replace(table, t=t, values=own, names=(name,), remarks={}))
     return found
 

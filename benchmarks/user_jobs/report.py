@@ -1,0 +1,135 @@
+"""Processor times and errors of `livepde run` and of the fits, as whole processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import numpy as np
+
+from benchmarks import ROOT
+from benchmarks.user_jobs.data import JOBS, Job, true_field
+from livepde import runs
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs.outcome import Outcome
+
+FEW = 12  # rows of a run that has imports, figure and report, and little else
+APART = 1.0  # standard deviations between the two estimates of an unknown at most
+WORSE = 1.2  # relative error of a field over that of the fit
+
+
+class Timed(NamedTuple):
+    """Processor seconds of a whole process, and without those of a run with few rows."""
+
+    whole: float
+    part: float
+
+
+class Compared(NamedTuple):
+    """Relative errors of livepde and of the fit, and what the estimates are apart."""
+
+    own: float
+    fit: float
+    apart: float  # standard deviations; NaN for a field
+
+
+def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
+    """Run each job and its fit in turn.
+
+    Parameters
+    ----------
+    names
+        Jobs, default all.
+    rounds
+        Runs of each; the ratio is that of one round, and the median over rounds is reported.
+    """
+    rows, checks = [], []
+    for job in JOBS:
+        if names and job.name not in names:
+            continue
+        with TemporaryDirectory() as folder:
+            times, compared = _measured(job, Path(folder), rounds)
+        ratios = np.median([(own.part / fit.part, own.whole / fit.whole) for own, fit in times], 0)
+        own, fit = (np.median(each, axis=0) for each in zip(*times, strict=True))
+        errors = [f"{100.0 * error:.2g} %" for error in (compared.own, compared.fit)]
+        rows.append((job.title, own[0], fit[0], *ratios.tolist(), *errors, compared.apart))
+        checks += [
+            Check(f"{job.name}: without imports and figure", float(ratios[0]), job.part, "<="),
+            Check(f"{job.name}: whole processes", float(ratios[1]), job.whole, "<="),
+            _agreed(job, compared),
+        ]
+    head = ("job", "livepde, s", "fit, s", "ratio", "whole", "error", "of the fit", "apart")
+    notes = [
+        f"Processor times with one thread, medians of {rounds} rounds. 'ratio' leaves out what a "
+        f"run of {FEW} rows costs. 'whole' is that of whole processes, with verdict, intervals, "
+        "journal, report and figure, which the fit has not; the fit of the field has no standard "
+        "deviations. 'apart' is the largest difference of the estimates, in standard deviations."
+    ]
+    return Outcome(tables=[Table("Jobs of users", head, rows)], checks=checks, notes=notes)
+
+
+def _measured(job: Job, folder: Path, rounds: int) -> tuple[list[tuple[Timed, Timed]], Compared]:
+    """Return the times of livepde and of the fit in each round, and their estimates compared."""
+    job.write(folder / "all")
+    job.write(folder / "few", FEW)
+    times = []
+    for number in range(rounds):
+        each = []
+        for part in ("all", "few"):
+            case, out = folder / part / "case.toml", folder / f"{part}{number}"
+            each.append(_run(["livepde", "run", str(case), "--out", str(out)])[0])
+            seconds, printed = _run(["benchmarks.user_jobs.fits", job.name, str(folder / part)])
+            each.append(seconds)
+            if part == "all":
+                estimates = json.loads(printed)
+        own, fit, own_few, fit_few = each
+        times.append((Timed(own, own - own_few), Timed(fit, fit - fit_few)))
+    return times, _compared(job, folder / "all0", estimates)
+
+
+def _run(command: Sequence[str]) -> tuple[float, str]:
+    """Return the processor seconds of a module that runs as a process, and its output."""
+    given = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    before = os.times()
+    done = subprocess.run(
+        [sys.executable, "-m", *command],
+        cwd=ROOT,
+        env=given,
+        check=True,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    )
+    after = os.times()
+    used = after.children_user - before.children_user
+    return used + after.children_system - before.children_system, done.stdout
+
+
+def _compared(job: Job, folder: Path, estimates: dict[str, float]) -> Compared:
+    found = runs.open(folder).dataset.isel(time=-1)
+    if not job.truth:
+        return _fields(np.asarray(found["alpha"]), estimates)
+    labels = list(job.truth)
+    own = np.array([float(found[label]) for label in labels])
+    std = np.array([float(found[f"{label}_std"]) for label in labels])
+    fit, true = (np.array([each[label] for label in labels]) for each in (estimates, job.truth))
+    errors = [float(np.sqrt(((one / true - 1.0) ** 2).mean())) for one in (own, fit)]
+    return Compared(*errors, float(np.abs((own - fit) / std).max()))
+
+
+def _fields(values: np.ndarray, estimates: dict[str, float]) -> Compared:
+    """Compare fields at the points of the fit's grid, as relative root mean squares."""
+    raise NotImplementedError
+
+
+def _agreed(job: Job, compared: Compared) -> Check:
+    if job.truth:
+        return Check(f"{job.name}: standard deviations apart", compared.apart, APART, "<=")
+    worse = compared.own / compared.fit
+    return Check(f"{job.name}: error over that of the fit", worse, WORSE, "<=")
