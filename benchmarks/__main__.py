@@ -72,6 +72,21 @@ def step(
     return _both(_both(laws, filters), usual)
 
 
+@program.command(quick="One round of the rod and of the column.")
+def jobs(
+    only: Annotated[list[str] | None, several("Only this job.", "--only")] = None,
+    rounds: Annotated[int, Count(3, 1, "Runs of each job and of its fit.")] = 3,
+    quick: bool = False,
+) -> Outcome:
+    """Time whole runs against fits that a user would write, at equal error.
+
+    Example:  python -m benchmarks jobs --only rod --json
+    """
+    from benchmarks.user_jobs.report import QUICK, user_jobs
+
+    return user_jobs(only or (QUICK if quick else ()), rounds)
+
+
 @program.command(name="import", quick="Fewer processes.")
 def startup(rounds: Annotated[int, Count(15, 3, "Fresh processes of each.")]) -> Outcome:
     """Time the import of livepde, in fresh processes, against that of SciPy and scikit-fem.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def followed(A: Any, B: Any, C: Any, inputs: Any, h: float, u: Any, *, hold: boo
     whole[n : n + m, n + m :] = np.eye(m)
     step = scipy.linalg.expm(whole)[:n]
     rows = [C @ u]
-    for b, after in zip(inputs[:-1], inputs[1:], strict=True):
+    for b, after in pairwise(inputs):
         change = np.zeros(m) if hold else after - b
         u = step @ np.concatenate([u, b, change])
         rows.append(C @ u)
@@ -98,6 +99,7 @@ def at(faces: Any, places: Any) -> Any:
 
 
 def rod(rng: np.random.Generator) -> pd.DataFrame:
+    """A rod with a loss to surroundings at 20 degC."""
     t = 10.0 * np.arange(4000)
     faces, places = np.linspace(0.0, 0.4, 201), [0.08, 0.16, 0.24, 0.32]
     A, B = conduction(faces, np.full(200, 2.0e-5))
@@ -115,6 +117,7 @@ def rod(rng: np.random.Generator) -> pd.DataFrame:
 
 
 def soil(rng: np.random.Generator) -> pd.DataFrame:
+    """Six layers of soil below a day's weather, and offsets of the sensors."""
     hours = np.arange(2928)
     t, days = 3600.0 * hours, hours / 24.0
     weather = np.cumsum(rng.standard_normal(len(t))) * 0.15
@@ -134,6 +137,7 @@ def soil(rng: np.random.Generator) -> pd.DataFrame:
 
 
 def column(rng: np.random.Generator) -> pd.DataFrame:
+    """Three pulses of a tracer through a column."""
     minutes = np.arange(600) / 3.0
     faces = np.linspace(0.0, 20.0, 801)
     width, D, v = faces[1], 16.2, 27.0
@@ -163,7 +167,7 @@ def square(alpha: Any, ends: Any, h: float, sensors: Any, substeps: int = 3) -> 
     number = np.arange(n * n).reshape(n, n)  # first index along x
     pairs = [(number[:-1], number[1:], alpha[:-1], alpha[1:])]
     pairs.append((number[:, :-1], number[:, 1:], alpha[:, :-1], alpha[:, 1:]))
-    A = sp.csr_array((n * n, n * n))
+    A: Any = sp.csr_array((n * n, n * n))
     for one, other, first, second in pairs:
         i, j = one.ravel(), other.ravel()
         flow = (2.0 / (1.0 / first + 1.0 / second)).ravel() / width**2
@@ -177,19 +181,16 @@ def square(alpha: Any, ends: Any, h: float, sensors: Any, substeps: int = 3) -> 
     solve = splu((sp.eye_array(n * n) - 0.5 * dt * A).tocsc()).solve
     explicit = (sp.eye_array(n * n) + 0.5 * dt * A).tocsr()
     centres = (np.arange(n) + 0.5) * width
-    C = np.zeros((len(sensors), n * n))
-    for row, (x, y) in zip(C, sensors, strict=True):
-        along = [np.array([np.interp(p, centres, e) for e in np.eye(n)]) for p in (x, y)]
-        row += np.outer(*along).ravel()
-    C = sp.csr_array(C)
+    each = [[np.array([np.interp(p, centres, e) for e in np.eye(n)]) for p in at] for at in sensors]
+    C = sp.csr_array([np.outer(along, across).ravel() for along, across in each])
     u = np.repeat(np.interp(centres, [0.0, SIDE], ends[0]), n)
-    rows = [C @ u]
-    for before, after in zip(ends[:-1], ends[1:], strict=True):
+    found = [C @ u]
+    for before, after in pairwise(ends):
         for k in range(substeps):
             mean = before + (k + 0.5) / substeps * (after - before)
             u = solve(explicit @ u + dt * (B @ mean))
-        rows.append(C @ u)
-    return np.array(rows)
+        found.append(C @ u)
+    return np.array(found)
 
 
 def _square_table(
@@ -206,6 +207,7 @@ def _square_table(
 
 
 def plate(rng: np.random.Generator) -> pd.DataFrame:
+    """A plate whose four quarters differ."""
     alpha = np.repeat(np.repeat(PLATE.reshape(2, 2), 60, axis=0), 60, axis=1)
     return _square_table(rng, alpha, 300, 200.0, PLATE_SENSORS)
 
@@ -217,6 +219,7 @@ def true_field(x: Any, y: Any) -> Any:
 
 
 def field(rng: np.random.Generator) -> pd.DataFrame:
+    """A square whose diffusivity is a smooth field."""
     centres = (np.arange(90) + 0.5) / 90
     alpha = true_field(centres[:, None], centres[None])
     return _square_table(rng, alpha, 100, 600.0, FIELD_SENSORS)

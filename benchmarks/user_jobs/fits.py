@@ -33,16 +33,21 @@ def fitted(simulate: Any, readings: Any, noise: float, mean: Any, spread: Any) -
 
     def both(xi: Any) -> tuple[Any, Any]:
         if not (last and np.array_equal(last[0], xi)):
-            predicted, slopes = simulate(mean + spread * xi)
+            predicted, derivatives = simulate(mean + spread * xi)
             r = np.concatenate([((predicted - readings)[known]) / noise, xi])
-            J = np.vstack([slopes[known] * spread / noise, np.eye(len(xi))])
+            J = np.vstack([derivatives[known] * spread / noise, np.eye(len(xi))])
             last[:] = xi.copy(), r, J
         return last[1], last[2]
 
     last: list[Any] = []
-    found = least_squares(
-        lambda xi: both(xi)[0], np.zeros(len(mean)), lambda xi: both(xi)[1], method="lm", xtol=1e-6
-    )
+
+    def residuals(xi: Any) -> Any:
+        return both(xi)[0]
+
+    def slopes(xi: Any) -> Any:
+        return both(xi)[1]
+
+    found = least_squares(residuals, np.zeros(len(mean)), slopes, method="lm", xtol=1e-6)
     return mean + spread * found.x
 
 
@@ -75,6 +80,7 @@ def along(K: Any, B: Any, Ks: Any, Bs: Any, C: Any, means: Any, h: float, u: Any
 
 
 def middle(inputs: Any) -> Any:
+    """Return the means of inputs between two rows."""
     return 0.5 * (inputs[1:] + inputs[:-1])
 
 
@@ -95,6 +101,7 @@ def nodes_at(x: Any, places: Any) -> Any:
 
 
 def rod(table: pd.DataFrame) -> dict[str, float]:
+    """Return diffusivity and loss."""
     x = np.linspace(0.0, 0.4, 41)
     ends = table[["left", "right"]].to_numpy()
     means = np.column_stack([middle(ends), np.full(len(ends) - 1, 20.0)])
@@ -121,6 +128,7 @@ def _first(table: pd.DataFrame) -> list[float]:
 
 
 def soil(table: pd.DataFrame) -> dict[str, float]:
+    """Return the diffusivities; offsets are unknown, too."""
     x = np.linspace(0.05, 0.60, 56)
     layer = np.searchsorted([0.10, 0.20, 0.30, 0.40, 0.50], 0.5 * (x[1:] + x[:-1]))
     parts = [conduction(x, (layer == j).astype(float)) for j in range(6)]
@@ -144,6 +152,7 @@ def soil(table: pd.DataFrame) -> dict[str, float]:
 
 
 def column(table: pd.DataFrame) -> dict[str, float]:
+    """Return dispersion and velocity."""
     x = np.linspace(0.0, 20.0, 101)
     KD, BD = conduction(x, np.ones(100))
     KD[-1, -1] -= BD[-1, 1]  # nothing disperses out of the end
@@ -218,6 +227,7 @@ def _bilinear(x: Any, points: Any) -> Any:
 
 
 def plate(table: pd.DataFrame) -> dict[str, float]:
+    """Return the diffusivities of the quarters."""
     square = Square(101, [(0.2, 0.3), (0.3, 0.7), (0.6, 0.2), (0.7, 0.8), (0.8, 0.4)], table)
     half = np.arange(100) >= 50
     quarter = (2 * half[:, None] + half[None]).ravel()
@@ -289,4 +299,4 @@ JOBS = {"rod": rod, "soil": soil, "plate": plate, "column": column, "field": fie
 
 if __name__ == "__main__":
     name, folder = sys.argv[1:]
-    print(json.dumps(JOBS[name](pd.read_csv(Path(folder) / "data.csv"))))
+    sys.stdout.write(json.dumps(JOBS[name](pd.read_csv(Path(folder) / "data.csv"))))

@@ -508,7 +508,7 @@ def _after(
         work=spent + found.passes * len(samples.spans),
         converged=np.array([float(found.converged)]),
         screened=np.array([len(samples.spans)]) if found.screened else state.fit.screened,
-        xi=found.best.xi[None],
+        xi=found.best.xi[None, :, None],
     )
     now = work.filter.relinearised(x)
     # A filter to go back to that was set with this sample is that after the fit.

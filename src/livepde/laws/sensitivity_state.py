@@ -158,7 +158,8 @@ class FitState:
     converged: Array
     # How many samples the last search had that began again in vain, 0 before, shape (members,).
     screened: IntArray
-    xi: Array  # coordinates where it ended, on the rows of the start, shape (members, r)
+    # Coordinates where it ended, on the rows of the start, shape (members, r, 1).
+    xi: Array = field(metadata={"grows": 1})
 
     @classmethod
     def none(cls, start: FilterState) -> FitState:
@@ -173,7 +174,7 @@ class FitState:
             work=zero,
             converged=zero,
             screened=nothing,
-            xi=np.zeros((members, rows)),
+            xi=np.zeros((members, rows, 1)),
         )
 
     def member(self, k: int) -> Fit | None:

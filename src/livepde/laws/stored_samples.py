@@ -127,7 +127,7 @@ class StoredSamples:
         """
         now, start, reduction = self.state.now, self.state.start, self.filter.reduction
         shift = reduction.reduced(reduction.bounded(self.filter.estimate(now)) - start.q)[0]
-        last: Array = self.state.fit.xi[0]
+        last: Array = self.state.fit.xi[0, :, 0]
         return last + coordinates(start.C[0], shift - start.C[0].T @ last)
 
     def within_bounds(self, xi: Array) -> Array:
