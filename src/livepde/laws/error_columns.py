@@ -14,7 +14,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -103,26 +102,18 @@ class ErrorColumns:
         self.low, self.high = vertices.min(axis=1), vertices.max(axis=1)
         self.answers: list[tuple[Answer, Course]] = [*self._sources(), *self._initial()]
         self.answers += [*self._boundaries(), *self._unknowns()]
-        if self._scalar:
+        single = self.model.state_space.single and not len(self.model.algebraic)
+        if single and not next(iter(self.model.state_space.fields.values())).vector:
             self.answers += [*self._operators(), *self._fluxes()]
-
-    @property
-    def _scalar(self) -> bool:
-        model = self.model
-        if not model.state_space.single or len(model.algebraic):
-            return False
-        return not next(iter(model.state_space.fields.values())).vector
+        # Number of the first column of each answer, and of all columns of the process.
+        sizes = (course.size for _, course in self.answers)
+        *self.first, self.count = itertools.accumulate(sizes, initial=0)
 
     @property
     def _resists(self) -> bool:
         """Whether a contact may resist: it stops what is conducted, not what a flow carries."""
         stage = ForwardStage(self.model)
         return stage.symmetric or not stage.keeps
-
-    @property
-    def count(self) -> int:
-        """Number of columns of the process."""
-        return sum(course.size for _, course in self.answers)
 
     def _mode(self, number: int) -> Callable[[Any], Any]:
         """Return a product of cosines over the box of the domain, the smoothest first."""
@@ -254,12 +245,6 @@ class ErrorColumns:
             if answer.start is not None:
                 p[column] = answer.start
         return p
-
-    @cached_property
-    def first(self) -> list[int]:
-        """Number of the first column of each answer."""
-        ends = itertools.accumulate((course.size for _, course in self.answers), initial=0)
-        return list(ends)[:-1]
 
     def _advanced(
         self, stage: ForwardStage, p: Array, now: StatePoint, h: float, share: float, free: Array

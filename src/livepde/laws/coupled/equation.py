@@ -460,17 +460,13 @@ class StageSolver(ABC):
     """Abstract solver of coupled stages: evaluates their equation and factorises its Jacobian."""
 
     keeps: bool  # whether a factor is worth keeping from stage to stage
+    patience: int  # updates, beyond one for each stage, after which a kept factor is made again
     refresh = 0.2  # share of the residual that an update by a kept factor may leave
     ceiling = 0.0  # relative residual up to which a predicted stage is not solved further
     carried = CARRIED  # relative accuracy of r where the next stage makes up for the residual
 
     def __init__(self, terms: StageTerms) -> None:
         self.terms = terms
-
-    @property
-    @abstractmethod
-    def patience(self) -> int:
-        """Updates, beyond one for each stage, after which a kept factor is made again."""
 
     def accuracy(self, data: StageData) -> float:
         """Return the relative accuracy of r in a solved stage."""

@@ -42,11 +42,10 @@ class MonolithicSolver(StageSolver):
 
     def __init__(self, terms: StageTerms) -> None:
         super().__init__(terms)
+        # The engine of the coupled matrix, and for each block the map of its data into that matrix.
+        self.solver, self.maps = self._assembled()
+        self.patience = 2 if isinstance(self.solver, BandedSolver) else 12
         self._constant: tuple[tuple[float, float, float], Array] | None = None
-
-    @property
-    def patience(self) -> int:
-        return 2 if isinstance(self.solver, BandedSolver) else 12
 
     def changing(self, data: StageData, at: StageIterate) -> Array:
         """Return the data of the Jacobian that depend on the iterate."""
@@ -103,7 +102,6 @@ class MonolithicSolver(StageSolver):
             self._constant = known = (key, found)
         return known[1]
 
-    @cached_property
     def _assembled(self) -> tuple[Solver, dict[str, sp.csr_array]]:
         terms, forms = self.terms, self.terms.forms
         model, n, A = forms.model, self.terms.n, forms.A_in
@@ -154,16 +152,6 @@ class MonolithicSolver(StageSolver):
         diagonal[(free == 0.0) | (diagonal == 0.0)] = 1.0
         units: Array = np.exp2(np.round(-0.5 * np.log2(diagonal)))
         return units
-
-    @property
-    def solver(self) -> Solver:
-        """The engine of the coupled matrix."""
-        return self._assembled[0]
-
-    @property
-    def maps(self) -> dict[str, sp.csr_array]:
-        """Block -> map of its data into the data of the coupled matrix."""
-        return self._assembled[1]
 
     @cached_property
     def _pull(self) -> Array:
