@@ -26,7 +26,7 @@ from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import canvas, cards, cuts, field_views, panels, serve
+from livepde.dashboard import canvas, cards, field_views, panels, serve
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
 from livepde.models import heat
@@ -197,7 +197,7 @@ def test_names_from_files_are_text_in_figures():
 @pytest.mark.parametrize("kind", ["triangle", "quad"])
 def test_a_map_is_exact_for_what_is_linear(kind):
     data = dataset(kind, count=1)
-    found = cuts.plane_map(data)
+    found = field_views.plane_map(data)
     values = found.of(2.0 * data["x"].values - 3.0 * data["y"].values)
     assert found.inside.all()
     assert np.allclose(values, 2.0 * found.x - 3.0 * found.y[:, None])
@@ -218,7 +218,7 @@ def test_a_hole_stays_open():
         {"triangle": (("cell", "corner"), mesh.t.T[outside])},
         {axis: ("vertex", mesh.p[k]) for k, axis in enumerate("xy")},
     )
-    found = cuts.plane_map(data)
+    found = field_views.plane_map(data)
     x, y = np.meshgrid(found.x, found.y)
     hole = (abs(x - 1.5) < 0.4) & (abs(y - 1.5) < 0.4)
     values = found.of(np.ones(mesh.nvertices))
@@ -240,9 +240,9 @@ def test_cuts_of_a_cube_are_whole_and_exact(kind, share):
         return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
 
     values = linear(*(data[axis].values for axis in "xyz"))
-    parts = cuts.slices(data, share)
+    parts = field_views.slices(data, share)
     assert [area(part) for part in parts] == pytest.approx([1.0, 1.0, 1.0])
-    assert area(cuts.boundary(data)) == pytest.approx(6.0)
+    assert area(field_views.boundary(data)) == pytest.approx(6.0)
     for axis, part in enumerate(parts):
         assert np.allclose(part.points[:, axis], share)
         assert np.allclose(part.of(values), linear(*part.points.T))
@@ -581,7 +581,7 @@ def several(tmp_path):
 
 @pytest.mark.slow
 def test_many_runs_are_a_table(several):
-    from livepde.dashboard.overview import PerRun, overview_table
+    from livepde.dashboard.page import PerRun, overview_table
 
     views = PerRun(several, "", 10, lambda name: View(several / name))
     for _ in range(2):

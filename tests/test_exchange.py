@@ -31,9 +31,8 @@ from livepde.exchange import (
     export_fmu,
     river_regressor,
 )
-from livepde.exchange.component import Component
-from livepde.exchange.recipe import recipe_of
-from livepde.exchange.unit_process import REFUSED, WAITING, of_code
+from livepde.exchange.fmu_export import recipe_of
+from livepde.exchange.unit_process import REFUSED, WAITING, Component, of_code
 from livepde.models import heat
 from livepde.units import in_si
 

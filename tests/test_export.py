@@ -31,8 +31,7 @@ from livepde.models import heat
 from livepde.plots import interval_95
 from livepde.result import layout_of
 from livepde.runs import Check, RunWriter, drive, tables
-from livepde.runs.conventions import cf, udunits
-from livepde.runs.exported import export
+from livepde.runs.exported import cf, export, udunits
 from livepde.runs.journal import Event, Journal
 
 ORIGIN = "2025-04-01 06:00:00"

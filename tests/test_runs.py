@@ -29,8 +29,7 @@ from livepde.runs import (
     tables,
     verdict,
 )
-from livepde.runs.directory import markdown, plain
-from livepde.runs.outcome import attempted
+from livepde.runs.directory import attempted, markdown, plain
 from livepde.runs.summary import digits
 
 TIMES = range(6)

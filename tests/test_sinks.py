@@ -14,7 +14,7 @@ import pytest
 from live_rod import live, rows
 from patience import PATIENCE
 
-from livepde.runs.standard_streams import JsonLinesSink, configure
+from livepde.runs.monitor import JsonLinesSink, configure
 from livepde.streams.sources import Rows
 
 
@@ -47,7 +47,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from live_rod import live, rows
-from livepde.runs.standard_streams import JsonLinesSink
+from livepde.runs.monitor import JsonLinesSink
 from livepde.streams.sources import Rows
 run = live(Path(sys.argv[1]), Rows(rows(30)), sinks=[JsonLinesSink(sys.stdout)])
 run.run()

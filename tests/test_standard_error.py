@@ -12,7 +12,7 @@ PROGRAM = """
 import logging, sys, warnings
 import numpy as np, typer
 from livepde.cli.program import main
-from livepde.runs.standard_streams import configure
+from livepde.runs.monitor import configure
 
 program = typer.Typer()
 

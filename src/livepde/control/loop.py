@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
-from livepde.control.estimators import Estimator, Learned, Trust
+from livepde.control.estimators import Estimator, Kalman, Learned, Trust
 from livepde.control.goal import Controller, Decision, Known, Plan
-from livepde.control.kalman import Kalman
 from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from livepde.control.basis import basis
-from livepde.control.galerkin import GalerkinReduction
+from livepde.control.galerkin import GalerkinReduction, basis
 from livepde.control.linear import Discrete, Output
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment

@@ -15,7 +15,7 @@ import numpy as np
 from livepde import runs
 from livepde.dashboard.view import with_readings
 from livepde.errors import RunError, optional
-from livepde.plots.dataset import sensor_names
+from livepde.plots.style import sensor_names
 from livepde.runs import Check, Journal, Run, Table
 from livepde.runs.directory import CASE, JOURNAL
 from livepde.runs.exported import into_place

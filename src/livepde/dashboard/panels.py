@@ -31,7 +31,7 @@ from livepde.dashboard.field_views import drawn_by, field_profile
 from livepde.dashboard.view import READINGS
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
-from livepde.plots.dataset import (
+from livepde.plots.style import (
     MOST_LINES,
     groups,
     labelled,

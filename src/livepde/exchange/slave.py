@@ -14,13 +14,9 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from livepde import __version__
-from livepde.exchange.component import Component
-from livepde.exchange.recipe import opened
-from livepde.exchange.unit_process import PERIOD, STATUS, OutputVariable, UnitProcess
+from livepde.exchange.fmu_export import FOLDER, opened
+from livepde.exchange.unit_process import PERIOD, STATUS, Component, OutputVariable, UnitProcess
 from livepde.units import in_si
-
-# Name of the folder within the resources of the unit.
-FOLDER = "process"
 
 if not sys.orig_argv:
     # In a host program other than Python the exporters finalise the interpreter from a thread of

@@ -12,19 +12,25 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 from livepde.plots.curves import profiles
-from livepde.plots.dataset import (
+from livepde.plots.style import (
+    GREY,
     MOST_LINES,
+    PALETTE,
+    empty,
+    figure_class,
+    finish,
     groups,
     labelled,
     note,
+    panel,
     scored_from,
     sensor_names,
     sensor_places,
     sensor_units,
+    time_axis,
     time_text,
     time_values,
 )
-from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, panel, time_axis
 from livepde.records import field_names, interval_95, refused_readings, used_errors
 
 if TYPE_CHECKING:

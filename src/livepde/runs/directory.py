@@ -22,12 +22,13 @@ import os
 import re
 import tomllib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.dates import with_epoch, without_epoch
@@ -35,12 +36,69 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.outcome import FigureFactory, attempted
 from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
     import xarray as xr
+
+T = TypeVar("T")
+
+FigureFactory: TypeAlias = Callable[[], Any]
+"""Returns a matplotlib Figure; called only when somebody wants to see it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Tables, checks, notes, dataset and figures of an experiment.
+
+    Attributes
+    ----------
+    tables, checks, notes
+        Printed parts, in this order.
+    dataset
+        The run, as `Result.to_xarray()` gives it.
+    figures
+        File name without suffix -> function that draws a matplotlib figure.
+    """
+
+    tables: Sequence[Table] = ()
+    checks: Sequence[Check] = ()
+    notes: Sequence[str] = ()
+    dataset: xr.Dataset | None = None
+    figures: Mapping[str, FigureFactory] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """True if every check is."""
+        return all(check.ok for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object: checks, tables, notes."""
+        return {
+            "checks": [check.to_dict() for check in self.checks],
+            "tables": [table.to_dict() for table in self.tables],
+            "notes": list(self.notes),
+        }
+
+
+def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str]) -> T:
+    """Return the value of a computation, or `otherwise` and a note with the reason if it fails.
+
+    A run keeps its data even if one of its diagnostics fails. `OSError`, and so `RunError`
+    (a directory that cannot be written), is raised.
+    """
+    try:
+        return compute()
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001  whatever it is, it is told
+        reason = str(error).split("\n", 1)[0].rstrip(".") or "no reason given"
+        notes.append(
+            f"{what} failed ({type(error).__name__}: {reason[:200]}); everything else is complete."
+        )
+        return otherwise
+
 
 FORMAT = 2
 RUNS = "runs"  # where the command line puts them

@@ -16,7 +16,7 @@ from livepde.laws.equation_tests import rested
 from livepde.laws.pauses import pauses
 from livepde.laws.step_ledger import step_findings
 from livepde.linalg import Array
-from livepde.plots.dataset import note, prior_left
+from livepde.plots.style import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars
 from livepde.runs.summary import digits, jumps, shown
 from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor

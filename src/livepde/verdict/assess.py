@@ -10,13 +10,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.linalg import Array
-from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, ScoreDirection
+from livepde.verdict.directions import (
+    DRIFT,
+    FIXED,
+    LAG,
+    LOSS,
+    OFFSET,
+    REACH,
+    SCALED,
+    Dictionary,
+    ScoreDirection,
+)
 from livepde.verdict.evidence import (
     CAUSES,
     RECORD,
     CauseEvidence,
     causes_of,
-    chance,
     constancy,
     disagreement,
     following,
@@ -35,8 +44,7 @@ from livepde.verdict.findings import (
     channel_setting,
     too_few,
 )
-from livepde.verdict.ledger import Ledger
-from livepde.verdict.missing_terms import FIXED, GAIN, LOSS, REACH
+from livepde.verdict.ledger import Ledger, chance
 from livepde.verdict.sentences import (
     ESTIMATED,
     FINDINGS,
@@ -291,7 +299,7 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
         "loss": LOSS / (REACH * interval),
         "boundary": -OFFSET * typical,
         "initial": OFFSET * typical,
-        "channel": -GAIN,
+        "channel": -SCALED,
         "lag": LAG * interval,
     }
     if direction.kind in process:

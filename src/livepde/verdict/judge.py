@@ -33,10 +33,9 @@ import numpy as np
 
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import Moments
-from livepde.verdict.directions import JUMP, Dictionary
+from livepde.verdict.directions import JUMP, Dictionary, Now, stride
 from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
-from livepde.verdict.missing_terms import Now, stride
 
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
