@@ -29,8 +29,8 @@ from livepde import cli, runs
 from livepde.dashboard import canvas, cards, field_views, panels, serve
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
+from livepde.frames import layout_of
 from livepde.models import heat
-from livepde.result import layout_of
 from livepde.runs import JOURNAL, Journal, RunWriter, drive, journal_of
 from livepde.runs.database import checksum
 from livepde.runs.journal import Event

@@ -27,9 +27,9 @@ import livepde as lp
 from livepde import runs
 from livepde.dashboard.html_report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
+from livepde.frames import layout_of
 from livepde.models import heat
 from livepde.plots import interval_95
-from livepde.result import layout_of
 from livepde.runs import Check, RunWriter, drive, tables
 from livepde.runs.exported import cf, export, udunits
 from livepde.runs.journal import Event, Journal
@@ -296,12 +296,6 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
     columns = pd.read_parquet(tmp_path / "rod.parquet")
     assert list(columns) == list(found)
     assert np.array_equal(columns["loss [s-1]"], data["loss"])
-
-
-@pytest.mark.slow
-def test_a_table_without_dates(tmp_path):
-    export(made(tmp_path / "rod"), tmp_path / "rod.csv")
-    assert pd.read_csv(tmp_path / "rod.csv").columns[0] == "time [s]"
 
 
 # --- fields on their mesh --------------------------------------------------------------------
@@ -624,12 +618,6 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
 
 
 # --- the command -----------------------------------------------------------------------------
-
-
-def test_help_teaches():
-    code, output = call("export", "--help")
-    assert code == 0
-    assert "Example:" in output
 
 
 @pytest.mark.slow

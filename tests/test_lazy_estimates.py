@@ -10,12 +10,12 @@ import pytest
 
 import livepde as lp
 from livepde.checkpoint import flatten
+from livepde.frames import interval_ends
 from livepde.laws import Belief
 from livepde.laws.filter_state import FilterState
 from livepde.models import heat
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import Record, RecordArrays, Snapshot
-from livepde.result import interval_ends
 
 
 def rod(unknown=None, law=None, withheld=None, cells=30):

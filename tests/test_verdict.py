@@ -521,15 +521,7 @@ def test_what_was_not_judged_is_never_trusted():
         assert Verdict.of(found).level == ("caution" if caution in found else "trusted")
 
 
-def test_a_verdict_of_an_earlier_version_that_tested_nothing_is_not_judged():
-    for untested in ("innovations: GradientLaw says nothing of their size", "everything: no law"):
-        old = {"level": "trusted", "findings": [], "untested": [untested], "unseen": []}
-        assert Verdict.from_dict(old).level == "not judged"
-    old = {"level": "trusted", "findings": [], "untested": ["lag of single sensors"], "unseen": []}
-    assert Verdict.from_dict(old).level == "trusted"
-
-
-def test_a_run_of_an_earlier_version_names_the_discretisation_once():
+def test_a_run_names_the_discretisation_once():
     old = Finding("discretisation", "note", "The discretisation has shifted them.", evidence=3.0)
     (new,) = discretised(Shifts(3.0, {"mesh": 3.0}))
     assert Verdict.of([old]).with_findings([new]).findings == (new,)

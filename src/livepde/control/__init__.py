@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from livepde.control.controllers import LQ, MPC
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
+from livepde.control.galerkin import Discrete, Output
 from livepde.control.goal import Controller, Decision, Goal, Known, Plan
-from livepde.control.linear import Discrete, Output
 from livepde.control.loop import Action, Loop
 from livepde.control.reduced import ReducedModel, reduce
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.linalg import null_space, solve_discrete_are
 
+from livepde.control.galerkin import Discrete
 from livepde.control.goal import Decision, Goal, Known, Plan, check
-from livepde.control.linear import Discrete
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array

@@ -46,22 +46,14 @@ FACES = {
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """A plane domain on a grid that is as fine as its mesh.
+    """A plane domain on a grid that is as fine as its mesh."""
 
-    Attributes
-    ----------
-    x, y
-        Lines of the grid.
-    weights
-        From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices).
-    inside
-        Points that lie in the domain.
-    """
-
+    # x, y: lines of the grid
     x: Array
     y: Array
+    # From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices)
     weights: sp.csr_array
-    inside: Any
+    inside: Any  # points that lie in the domain
 
     def of(self, values: Array) -> Array:
         """Return a field on the grid, shape (len(y), len(x)); NaN outside the domain."""
@@ -71,21 +63,11 @@ class Map:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Triangles in space.
+    """Triangles in space."""
 
-    Attributes
-    ----------
-    points
-        Shape (points, 3).
-    triangles
-        Shape (triangles, 3).
-    weights
-        From the vertices of the mesh to the points.
-    """
-
-    points: Array
-    triangles: Any
-    weights: sp.csr_array
+    points: Array  # shape (points, 3)
+    triangles: Any  # shape (triangles, 3)
+    weights: sp.csr_array  # from the vertices of the mesh to the points
 
     def of(self, values: Array) -> Array:
         """Return a field at the points."""
@@ -107,10 +89,7 @@ def boundary(data: xr.Dataset) -> Surface:
 def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
     """Return the cuts of a solid domain by three planes, across x, y and z.
 
-    Parameters
-    ----------
-    share
-        Position of each plane, as a share of the range of its coordinate.
+    `share`: position of each plane, as a share of the range of its coordinate.
     """
     return _slices(_solid(data), share)
 

@@ -120,7 +120,6 @@ def _verdict(run: Run) -> list[tuple[str, str]]:
 
 
 def _shown(table: Table) -> Table:
-    """Return a table with its numbers as text."""
     rows = [
         [f"{cell:.5g}" if isinstance(cell, float) else str(cell) for cell in row]
         for row in table.rows
@@ -134,7 +133,6 @@ def _checked(check: Check) -> tuple[str, ...]:
 
 
 def _written(run: Run) -> str:
-    """Return by which version, and when."""
     record = run.record
     times = [f"{key} {record[key]}" for key in ("started", "ended") if key in record]
     return " · ".join([f"livepde {record.get('livepde', '')}".rstrip(), *times])

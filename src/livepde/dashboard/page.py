@@ -150,7 +150,6 @@ def _timebar() -> Any:
 
 
 def _aria(**values: str) -> Any:
-    """Return attributes for screen readers."""
     return {f"aria-{name}": value for name, value in values.items()}
 
 
@@ -269,7 +268,6 @@ def _draw(app: dash.Dash, view: View) -> None:
 
 
 def _framed(panel: Panel) -> Any:
-    """Return a figure with its title and caption."""
     return html.Figure(
         [
             html.H3(panel.title),
@@ -340,10 +338,7 @@ class PerRun(Mapping[str, T]):
 def overview_page(folder: Path) -> WSGIApplication:
     """Return the page of a folder of runs, such as a fleet's: a table, and the page of each run.
 
-    Parameters
-    ----------
-    folder
-        It holds run directories. Runs that begin later appear, too.
+    `folder`: it holds run directories. Runs that begin later appear, too.
     """
     views = PerRun(folder, "", MOST_RUNS, lambda name: View(folder / name))
     app = application(f"{folder.resolve().name} – livepde")
@@ -401,7 +396,6 @@ def _title(data: xr.Dataset, label: str) -> str:
 
 
 def _cells(name: str, one: RunView, level: tuple[cards.Level, str], shown: list[str]) -> list[Any]:
-    """Return the cells of one run."""
     data, newest, values = one.dataset, "–", ["–"] * len(shown)
     if data is not None and data.sizes["time"]:
         newest = when_axis(data).text(float(data["time"][-1]))

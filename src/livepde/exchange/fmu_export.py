@@ -33,18 +33,10 @@ FUNCTION = "() -> livepde.Identifier"
 
 @dataclass(frozen=True, eq=False)
 class Recipe:
-    """Instructions and files to rebuild a process elsewhere.
+    """Instructions and files to rebuild a process elsewhere."""
 
-    Attributes
-    ----------
-    process
-        UnitProcess as built here.
-    files
-        Mapping from file name to content.
-    """
-
-    process: UnitProcess
-    files: Mapping[str, bytes]
+    process: UnitProcess  # unitProcess as built here
+    files: Mapping[str, bytes]  # mapping from file name to content
 
 
 def recipe_of(source: Case | str) -> Recipe:
@@ -248,7 +240,6 @@ def write_unit(
 
 
 def _built(builder: Any, recipe: Recipe, name: str, fmi: int, folder: Path) -> Path:
-    """Return the path of the unit built in a folder."""
     # The name becomes that of a class of the script.
     if not name[0].isalpha():
         name = f"unit_{name}"

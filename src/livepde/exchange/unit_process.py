@@ -13,6 +13,7 @@ import numpy as np
 from livepde import checkpoint
 from livepde.cases import Case
 from livepde.errors import ConfigurationError, LivepdeError
+from livepde.frames import snapshot_of, vertex_order
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
 from livepde.linalg import Array
@@ -20,7 +21,7 @@ from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES
-from livepde.result import Estimate, Result, vertex_order
+from livepde.result import Estimate
 from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value
@@ -40,18 +41,12 @@ STATUS = "How the last step went: {}, {} waits for a first sample, {} sample ref
 
 @dataclass(frozen=True)
 class Port:
-    """Input or output channel of a unit, in the unit of its data.
-
-    Attributes
-    ----------
-    column
-        Conversion of values to the unit of the model.
-    """
+    """Input or output channel of a unit, in the unit of its data."""
 
     name: str
     unit: str
     text: str
-    column: Column
+    column: Column  # conversion of values to the unit of the model
 
     def taken(self, value: float, missing: frozenset[float]) -> float:
         """Return a value in the unit of the model; NaN if it is missing or invalid."""
@@ -85,38 +80,22 @@ class DataTimes:
 
 @dataclass(frozen=True, eq=False)
 class UnitProcess:
-    """An identifier with the inputs and outputs of a co-simulation unit.
+    """An identifier with the inputs and outputs of a co-simulation unit."""
 
-    Attributes
-    ----------
-    name, title
-        A short name, and one line about it.
-    inputs
-        Input channels, read at each communication point.
-    sensors
-        Sensor channels whose model values are outputs, including withheld ones.
-    begin
-        Function that returns the identifier started by a first sample; it may raise `LivepdeError`.
-    second
-        One second in the model's unit of time.
-    missing
-        Numbers that denote a missing sample, in addition to NaN.
-    covariance
-        True if the law provides standard deviations.
-    experiment
-        Times of the case's own data, if it has any.
-    """
-
+    # name, title: a short name, and one line about it
     name: str
     title: str
     model: Model
-    inputs: tuple[Port, ...]
+    inputs: tuple[Port, ...]  # input channels, read at each communication point
+    # Sensor channels whose model values are outputs, including withheld ones
     sensors: tuple[Port, ...]
+    # Function that returns the identifier started by a first sample; it may raise `LivepdeError`
     begin: Callable[[Sample], Identifier]
-    second: float = 1.0
+    second: float = 1.0  # one second in the model's unit of time
+    # Numbers that denote a missing sample, in addition to NaN
     missing: frozenset[float] = frozenset()
-    covariance: bool = True
-    experiment: DataTimes | None = None
+    covariance: bool = True  # true if the law provides standard deviations
+    experiment: DataTimes | None = None  # times of the case's own data, if it has any
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -137,10 +116,7 @@ class UnitProcess:
     def outputs(self) -> list[OutputVariable]:
         """Return descriptions of the outputs except the status, in the order of `shown`.
 
-        Raises
-        ------
-        ConfigurationError
-            Two outputs have the same name.
+        Raises `ConfigurationError`: two outputs have the same name.
         """
         found = [OutputVariable("estimate_time", "s", "Time of the last sample that was used.")]
         space = self.model.parameter_space
@@ -189,8 +165,7 @@ class UnitProcess:
         for value, std in estimate.parameters.values():
             found += self._pair(value, std)
         if self.fields:
-            result = Result(identifier.model, identifier.observed, identifier.withheld)
-            profiles = result.snapshot(estimate).profiles
+            profiles = snapshot_of(identifier.model, estimate.belief).profiles
             for name in self.fields:
                 values = profiles[name]
                 deviations = profiles.get(f"{name}_std", np.full_like(values, math.nan))
@@ -207,10 +182,7 @@ class UnitProcess:
 def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
     """Return the process of a case.
 
-    Parameters
-    ----------
-    origin
-        The date of t = 0, if the times of the case's data are dates.
+    `origin`: the date of t = 0, if the times of the case's data are dates.
     """
     ports = {}
     for name, channel in case.spec.channels.items():
@@ -236,10 +208,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
 def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
     """Return the process of a function that returns an identifier before its first sample.
 
-    Raises
-    ------
-    ConfigurationError
-        The function fails, or returns another type.
+    Raises `ConfigurationError`: the function fails, or returns another type.
     """
     try:
         identifier = build()

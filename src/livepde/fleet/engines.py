@@ -33,14 +33,9 @@ State: TypeAlias = Any
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Square roots of the covariances of all members; see `livepde.laws.Belief`.
+    """Square roots of the covariances of all members; see `livepde.laws.Belief`."""
 
-    Attributes
-    ----------
-    q, u, prior
-        Shapes (members, m, r), (members, n, r) and (members, m, k).
-    """
-
+    # q, u, prior: shapes (members, m, r), (members, n, r) and (members, m, k)
     q: Array
     u: Array
     prior: Array
@@ -48,21 +43,13 @@ class Factors:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`.
+    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`."""
 
-    Attributes
-    ----------
-    q, u
-        Shapes (members, m) and (members, n).
-    q_std
-        Standard deviations of q, or None if the law has no covariance.
-    factors
-        Covariances; None where members step separately, each with its own.
-    """
-
+    # q, u: shapes (members, m) and (members, n)
     q: Array
     u: Array
-    q_std: Array | None
+    q_std: Array | None  # standard deviations of q, or None if the law has no covariance
+    # Covariances; None where members step separately, each with its own
     factors: Factors | None = None
 
 

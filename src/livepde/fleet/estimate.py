@@ -13,13 +13,14 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
 from livepde.fleet.engines import Beliefs, Factors
+from livepde.frames import correlation_of, interval_ends, vertex_order
 from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.readout import unknown_of
 from livepde.records import NOTE, STATUS_CODES, Layout, Record, Snapshot
-from livepde.result import Estimate, interval_ends, kept, vertex_order
+from livepde.result import Estimate, kept
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -283,12 +284,8 @@ class _MemberRow:
 class FleetRecords:
     """Estimates of members that step together, as `Result` keeps those of one.
 
-    Parameters
-    ----------
-    model
-        Whose unknowns are numbers.
-    fields_every
-        Fields of every so many samples are kept.
+    `model`: whose unknowns are numbers.
+    `fields_every`: fields of every so many samples are kept.
     """
 
     def __init__(self, model: Model, fields_every: int = 1) -> None:
@@ -301,17 +298,16 @@ class FleetRecords:
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate of all members.
 
-        Raises
-        ------
-        ConfigurationError
-            Members step separately: each has an `Estimate` of its own.
+        Raises `ConfigurationError`: members step separately: each has an `Estimate` of its own.
         """
         beliefs, profiles, correlation = estimate.beliefs, None, None
         factors = beliefs.factors
         if factors is None:
             raise ConfigurationError("what members do that step separately is kept separately.")
         if self._count % self.fields_every == 0:
-            profiles, correlation = self._profiles(beliefs.u, factors), self._correlation(factors)
+            profiles = self._profiles(beliefs.u, factors)
+            labels = list(self.model.parameter_space.labels.values())
+            correlation = correlation_of(factors.q[:, labels]) if len(labels) > 1 else None
         row = _MemberRow(
             t=estimate.t,
             numbers=self._numbers(beliefs, factors),
@@ -366,14 +362,3 @@ class FleetRecords:
                 rows = values.T.reshape(members, len(names), -1)[:, :, order]
                 found |= {f"{key}{end}": rows[:, c] for c, key in enumerate(names)}
         return found
-
-    def _correlation(self, factors: Factors) -> Array | None:
-        """Return how the estimates of numbers are correlated, (members, numbers, numbers)."""
-        labels = list(self.model.parameter_space.labels.values())
-        if len(labels) < 2:
-            return None
-        rows = factors.q[:, labels]
-        size = np.linalg.norm(rows, axis=2)
-        unit = rows / np.where(size > 0.0, size, 1.0)[:, :, None]
-        correlation: Array = unit @ unit.transpose(0, 2, 1)
-        return correlation

@@ -24,6 +24,7 @@ from livepde.fem import Inputs, Moment
 from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
+from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
 from livepde.laws.step_ledger import COUNTS
@@ -31,7 +32,6 @@ from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.records import STATUS_CODES
-from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
@@ -264,7 +264,11 @@ class Fleet:
         self._one.check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
-        self._check_order(t, last)
+        if t < last or (t == last and self._samples):
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
+                "sort the stream, and drop repeated samples."
+            )
         values, held = self._filled(named)
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
@@ -339,15 +343,7 @@ class Fleet:
                 found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
         return found
 
-    def _check_order(self, t: float, last: float) -> None:
-        if t < last or (t == last and self._samples):
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
-                "sort the stream, and drop repeated samples."
-            )
-
     def _expected(self, span: Span) -> MemberReports:
-        """Return the predicted readings at the start."""
         members = range(len(self))
         beliefs = [self._believed(self._state, k) for k in members]
         predicted = [
@@ -661,7 +657,6 @@ def _check_positive(name: str, noise: Array) -> None:
 
 
 def _numbers(what: str, values: ArrayLike) -> Array:
-    """Return a new array of floats."""
     try:
         if np.asarray(values).dtype.kind in "USb":
             raise TypeError

@@ -495,7 +495,12 @@ class JoinedStates:
     def put(self, which: IntArray, state: State) -> None:
         """Store states that were stepped: those that were taken last, or begun."""
         leaves = checkpoint.flatten(state)
-        self._put_log(which, leaves.pop(LOG))
+        log = leaves.pop(LOG)
+        rows = log.shape[1]
+        if rows > self._log.shape[1]:
+            self._log = _widened(self._log, rows + ROOM, np.inf)
+        self._log[which, :rows], self._log[which, rows:] = log, np.inf
+        self._rows[which] = rows
         changed = {path: new for path, new in leaves.items() if new is not self._taken.get(path)}
         # An array may be a view of one that is overwritten now, as of a filter that becomes the
         # older one: it is copied first.
@@ -521,14 +526,6 @@ class JoinedStates:
             leaf, new = (_widened(array, room, 0.0) for array in (leaf, new))
         leaf[which] = new
         self._leaves[path] = leaf
-
-    def _put_log(self, which: IntArray, log: Array) -> None:
-        rows = log.shape[1]
-        if rows > self._log.shape[1]:
-            self._log = _widened(self._log, rows + ROOM, np.inf)
-        self._log[which, :rows] = log
-        self._log[which, rows:] = np.inf
-        self._rows[which] = rows
 
     def leaves(self) -> dict[str, Any]:
         """Return all states as arrays by name."""

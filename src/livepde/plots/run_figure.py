@@ -409,7 +409,6 @@ def _limit_values(values: Array, ax: Axes) -> None:
 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
-    """Mark samples with a failed step."""
     failed = time_values(data, data["time"].values[data["status"].values != 0])
     if len(failed):
         ax.plot(
@@ -423,7 +422,6 @@ def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
 
 
 def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
-    """Draw a line at each alarm of the jump test."""
     alarms = note(data, "jump")
     if alarms is None:
         return
@@ -483,7 +481,6 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
-    """Draw smallest, median and largest value of a field in space over time."""
     t, values = time_values(data, data["snapshot"].values), data[name].values
     ax.fill_between(
         t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"

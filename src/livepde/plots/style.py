@@ -173,10 +173,7 @@ def figure_class() -> type[Figure]:
 def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
     """Return an empty figure and its panels, row by row.
 
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
+    Raises `ConfigurationError`: Matplotlib is not installed.
     """
     drawn = empty(rows, columns, title)
     return drawn, list(drawn.subplots(rows, columns, squeeze=False).ravel())

@@ -161,7 +161,6 @@ def run_names(folder: Path) -> list[str]:
 
 
 def _refuse_links(path: Path) -> None:
-    """Raise `RunError` if a file of a run is a link: writing to it would change another file."""
     for item in path.iterdir():
         if item.is_symlink():
             raise RunError(f"{item} is a link: a run is resumed in regular files only.")
@@ -256,10 +255,7 @@ class RunWriter:
 
         The case may have another `intake.shift` than before, which is kept from now on.
 
-        Raises
-        ------
-        RunError
-            There is no such run, or it was of another case.
+        Raises `RunError`: there is no such run, or it was of another case.
         """
         run = open_run(path)
         _refuse_links(path)
@@ -314,7 +310,6 @@ class RunWriter:
         self.record[CONTENT] = [new]
 
     def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
-        """Write the report, and the record."""
         write_text(self.path / REPORT, text)
         self.record |= {"checks": [check.to_dict() for check in checks], "notes": list(notes)}
         self._save_record()
@@ -412,10 +407,7 @@ class Run:
         Data files are named relative to the case, so the copy in the run directory serves only if
         the original is gone or has changed; then the data must be given.
 
-        Raises
-        ------
-        RunError
-            The run was not made from a case (a reproduction), or its case is gone.
+        Raises `RunError`: the run was not made from a case (a reproduction), or its case is gone.
         """
         copy = self.path / CASE
         if not copy.is_file():
@@ -541,7 +533,6 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
 
 
 def _to_netcdf(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset as netCDF 3."""
     # netCDF 3 knows no dimension without members.
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
@@ -551,7 +542,6 @@ def _to_netcdf(data: xr.Dataset, path: Path) -> None:
 
 
 def _digest(record: Mapping[str, Any]) -> str:
-    """Return the digest of a record, in whatever order and layout it is written."""
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 

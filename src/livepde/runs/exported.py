@@ -63,22 +63,14 @@ NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of mesh cell.
+    """A kind of mesh cell."""
 
-    Attributes
-    ----------
-    dimension, role
-        Dimension of the mesh, and name of such a cell in UGRID.
-    edges
-        Corners to which the edges lead from the first one, in an order that turns right-handed.
-    turned
-        Order of the corners that corrects a cell of the opposite orientation.
-    """
-
+    # dimension, role: dimension of the mesh, and name of such a cell in UGRID
     dimension: int
     role: str
+    # Corners to which the edges lead from the first one, in an order that turns right-handed
     edges: tuple[int, ...]
-    turned: tuple[int, ...]
+    turned: tuple[int, ...]  # order of the corners that corrects a cell of the opposite orientation
 
 
 KINDS = {
@@ -331,7 +323,7 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
             )
 
 
-def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
+def into_place(target: Path, write: Callable[[Path], object], *, force: bool = False) -> None:
     """Write a file or folder next to its target, and move it there when it is complete.
 
     Parameters
@@ -381,25 +373,6 @@ def _conventional(run: Run) -> xr.Dataset:
         source=f"livepde {record.get('livepde', '')}".strip(),
         history=f"{record.get('started', '')} {command}".strip(),
     )
-
-
-def _netcdf(run: Run, path: Path, at: float | None) -> None:
-    write_dataset(_conventional(run), path)
-
-
-def _zarr(run: Run, path: Path, at: float | None) -> None:
-    # The second format has text of fixed length, which the third has not settled yet.
-    _conventional(run).to_zarr(path, zarr_format=2, consolidated=True)
-
-
-def _csv(run: Run, path: Path, at: float | None) -> None:
-    """Write all variables over time as CSV."""
-    _over_time(run).to_csv(path, index=False)
-
-
-def _parquet(run: Run, path: Path, at: float | None) -> None:
-    """Write all variables over time as Parquet."""
-    _over_time(run).to_parquet(path, index=False)
 
 
 def _over_time(run: Run) -> pd.DataFrame:
@@ -478,12 +451,15 @@ def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
     return {free: data[name].values[k] for name, free in names.items()}
 
 
-Writer: TypeAlias = Callable[[Run, Path, float | None], None]
+Writer: TypeAlias = Callable[[Run, Path, float | None], object]
 FORMATS: dict[str, Writer] = {
-    ".nc": _netcdf,
-    ".zarr": _zarr,
-    ".csv": _csv,
-    ".parquet": _parquet,
+    ".nc": lambda run, path, at: write_dataset(_conventional(run), path),
+    # The second format has text of fixed length, which the third has not settled yet.
+    ".zarr": lambda run, path, at: _conventional(run).to_zarr(
+        path, zarr_format=2, consolidated=True
+    ),
+    ".csv": lambda run, path, at: _over_time(run).to_csv(path, index=False),
+    ".parquet": lambda run, path, at: _over_time(run).to_parquet(path, index=False),
     ".xdmf": _series,
     ".vtu": _vtk,
     ".vtk": _vtk,

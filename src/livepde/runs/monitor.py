@@ -69,10 +69,7 @@ class JsonLinesSink(Sink):
     def put(self, estimate: Estimate) -> None:
         """Write one estimate.
 
-        Raises
-        ------
-        OSError
-            Nobody reads the stream any more, or its disk is full.
+        Raises `OSError`: nobody reads the stream any more, or its disk is full.
         """
         line = json.dumps(estimate.to_dict(), allow_nan=False)
         try:
@@ -99,12 +96,8 @@ class Metrics(Sink):
     `livepde_silent`, `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
     `livepde_remarks_total{kind, channel}`.
 
-    Parameters
-    ----------
-    sensors
-        Names of the sensors.
-    second
-        One second in the model's unit of time.
+    `sensors`: names of the sensors.
+    `second`: one second in the model's unit of time.
     """
 
     def __init__(self, sensors: Iterable[str], second: float = 1.0) -> None:

@@ -28,20 +28,11 @@ LAYERS, SURFACES = "wall_layers", "surface_resistance"
 
 @dataclass(frozen=True)
 class Resistance:
-    """R = sum of thickness/k of a wall, without its surfaces.
+    """R = sum of thickness/k of a wall, without its surfaces."""
 
-    Attributes
-    ----------
-    R
-        Value in m^2 K/W.
-    relative
-        Standard deviation of ln R, to first order in those of ln k.
-    surfaces
-        Sum of the surface resistances in m^2 K/W; None if they are not stated.
-    """
-
-    R: float
-    relative: float
+    R: float  # value in m^2 K/W
+    relative: float  # standard deviation of ln R, to first order in those of ln k
+    # Sum of the surface resistances in m^2 K/W; None if they are not stated
     surfaces: float | None = None
 
     @property
@@ -182,18 +173,11 @@ def rmse(errors: np.ndarray[Any, Any]) -> float:
 
 @dataclass(frozen=True)
 class Jump:
-    """An alarm of `Jumps`.
+    """An alarm of `Jumps`."""
 
-    Attributes
-    ----------
-    t
-        Time of the sample that raised it.
-    moved
-        Numbers that have moved by more than three standard deviations between this alarm and the
-        next one, or the end: label -> value before and after, and the standard deviation after.
-    """
-
-    t: float
+    t: float  # time of the sample that raised it
+    # Numbers that have moved by more than three standard deviations between this alarm and the next
+    # one, or the end: label -> value before and after, and the standard deviation after
     moved: Mapping[str, tuple[float, float, float]]
 
 
@@ -219,7 +203,6 @@ def jumps(data: xr.Dataset) -> list[Jump]:
 
 
 def _interval(low: float, high: float, std: float) -> str:
-    """Return an interval as text, to the second digit of the standard deviation; "–" without."""
     if not math.isfinite(std) or math.isnan(low):
         return "–"
     return f"{digits(low, std)[0]} to {digits(high, std)[0]}"
@@ -430,12 +413,8 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
 def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
     """Return how well the data determine a number: a verdict of `InformationGain`, or "moves".
 
-    Parameters
-    ----------
-    attrs
-        Attributes of the number in the dataset.
-    value, left
-        Its value, and the share of its prior standard deviation that is left.
+    `attrs`: attributes of the number in the dataset.
+    `value`, `left`: its value, and the share of its prior standard deviation that is left.
     """
     # Laws clip to the bounds, so a number at its bound has exactly the value of the bound.
     bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
@@ -458,7 +437,6 @@ def _traded(data: xr.Dataset, label: str) -> list[str]:
 
 
 def _jumped(data: xr.Dataset) -> Table:
-    """Return the table of jumps: times, and unknowns that moved."""
     rows: list[tuple[Any, ...]] = []
     for jump in jumps(data):
         at = when(data, jump.t)

@@ -28,20 +28,15 @@ MOST_ENDS = 4  # boundaries of the mesh that are looked at
 
 
 class Now(NamedTuple):
-    """Point of a response: state, latent parameter, inputs, usual interval and rest state.
+    """Point of a response: state, latent parameter, inputs, usual interval and rest state."""
 
-    Attributes
-    ----------
-    u, q, moment, unit
-        The state, the latent parameter, time and inputs, and the usual time between samples.
-    rest
-        Value at which the state has nothing to lose: the mean of the sensors at the start.
-    """
-
+    # u, q, moment, unit: the state, the latent parameter, time and inputs, and the usual time
+    # between samples
     u: Array
     q: Array
     moment: Moment
     unit: float
+    # Value at which the state has nothing to lose: the mean of the sensors at the start
     rest: float
 
 
@@ -49,20 +44,12 @@ Load: TypeAlias = Callable[[Now], Array]
 
 
 class Term(NamedTuple):
-    """A term that a model may lack or have wrong, with an amplitude of one.
+    """A term that a model may lack or have wrong, with an amplitude of one."""
 
-    Attributes
-    ----------
-    kind
-        "boundary", "source", "loss", "flux", "channel" (its gain), or "initial" state.
-    subject
-        Boundary or channel; empty for the whole domain.
-    load, lift
-        Function that returns its load, and boundary values of its response, (n,); None for zero.
-    """
-
-    kind: str
-    subject: str = ""
+    kind: str  # "boundary", "source", "loss", "flux", "channel" (its gain), or "initial" state
+    subject: str = ""  # boundary or channel; empty for the whole domain
+    # load, lift: function that returns its load, and boundary values of its response, (n,); None
+    # for zero
     load: Load | None = None
     lift: Array | None = None
 
@@ -70,10 +57,8 @@ class Term(NamedTuple):
 class Process:
     """Responses of a model of one component to the terms that it may lack.
 
-    Parameters
-    ----------
-    model, observed, level
-        The process, its sensors, and their noise, by which amplitudes are counted.
+    `model`, `observed`, `level`: the process, its sensors, and their noise, by which amplitudes are
+    counted.
     """
 
     def __init__(self, model: Model, observed: Observed, level: float) -> None:
@@ -83,9 +68,13 @@ class Process:
         self.stage = ForwardStage(model)
         self.terms: list[Term] = []
         if not self.refused(model):
-            parts = self._boundary_values(), self._domain(), self._fluxes()
-            self.terms += [term for part in parts for term in part]
-            self.terms += self._gains()
+            lifts = boundary_lifts(model).items()
+            self.terms += [Term("boundary", name, lift=self.level * lift) for name, lift in lifts]
+            self.terms += [*self._domain(), *self._fluxes()]
+            # A gain of each channel that drives the model other than as a boundary value.
+            taken = {term.subject for term in self.terms}
+            others = [name for name in model.channels if name not in taken]
+            self.terms += [Term("channel", name, load=_gain(model, name)) for name in others]
         zero = np.zeros(model.X.dim)
         self._lifts = np.array([zero if term.lift is None else term.lift for term in self.terms])
 
@@ -101,10 +90,6 @@ class Process:
     def _whole(self) -> Array:
         """Load of a source of one in the whole domain."""
         return np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
-
-    def _boundary_values(self) -> Iterator[Term]:
-        for name, lift in boundary_lifts(self.model).items():
-            yield Term("boundary", name, lift=self.level * lift)
 
     def _domain(self) -> Iterator[Term]:
         mass = self.model.mass
@@ -124,12 +109,6 @@ class Process:
             # As much as the source of amplitude one brings into the whole domain.
             shape = load * (self._whole.sum() / load.sum())
             yield Term("flux", name, load=_constant(shape, self.level))
-
-    def _gains(self) -> list[Term]:
-        """Return a gain of each channel that drives the model other than as a boundary value."""
-        taken = {term.subject for term in self.terms}
-        others = [name for name in self.model.channels if name not in taken]
-        return [Term("channel", name, load=_gain(self.model, name)) for name in others]
 
     def start(self) -> Array:
         """Return the responses at the start, (terms, n): that to another initial state."""
@@ -231,50 +210,27 @@ MOST_SUMS = 12_000  # numbers in one kind of sum
 
 @dataclass(frozen=True)
 class ScoreDirection:
-    """A possible cause with an amplitude of one.
+    """A possible cause with an amplitude of one."""
 
-    Attributes
-    ----------
-    kind
-        "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`.
-    subject
-        Name of the sensor, channel, boundary or unknown.
-    size
-        The amplitude in its unit; NaN where that is not known beforehand.
-    unit
-        Of the size.
-    axis
-        Coordinate of a position.
-    least, most
-        Bounds of the amount in its unit: a sensor is inside the body, and not beyond the next one.
-    at
-        Coordinate of the sensor along the axis; NaN if it is not a position.
-    """
-
-    kind: str
-    subject: str = ""
-    size: float = np.nan
-    unit: str = ""
-    axis: int = 0
+    kind: str  # "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`
+    subject: str = ""  # name of the sensor, channel, boundary or unknown
+    size: float = np.nan  # the amplitude in its unit; NaN where that is not known beforehand
+    unit: str = ""  # of the size
+    axis: int = 0  # coordinate of a position
+    # least, most: bounds of the amount in its unit: a sensor is inside the body, and not beyond the
+    # next one
     least: float = -np.inf
     most: float = np.inf
-    at: float = np.nan
+    at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardShifts:
-    """How readings change if sensors are shifted, as a matrix on the coefficients that matter.
+    """How readings change if sensors are shifted, as a matrix on the coefficients that matter."""
 
-    Attributes
-    ----------
-    axes
-        Number of axes.
-    used, product
-        Coefficients of the state, (m,), and the product of the matrix of all axes one after the
-        other, (axes * sensors, m), with rows of them.
-    """
-
-    axes: int
+    axes: int  # number of axes
+    # used, product: coefficients of the state, (m,), and the product of the matrix of all axes one
+    # after the other, (axes * sensors, m), with rows of them
     used: IntArray
     product: RowProduct
 
@@ -296,16 +252,10 @@ class Dictionary:
     Those of the sensors come first, each seen by its own sensor only; then jumps of unknowns, and
     missing terms of the process.
 
-    Parameters
-    ----------
-    noise
-        Standard deviation of each sensor.
-    unknowns
-        Labels of the coordinates that may jump, each with its place.
-    dearer
-        With the directions that cost solves: terms that the process may lack.
-    windows
-        In how many windows sums are kept.
+    `noise`: standard deviation of each sensor.
+    `unknowns`: labels of the coordinates that may jump, each with its place.
+    `dearer`: with the directions that cost solves: terms that the process may lack.
+    `windows`: in how many windows sums are kept.
     """
 
     def __init__(
@@ -388,17 +338,11 @@ class Dictionary:
 
         Shape (members, samples, sensors, directions). That of a drift is its slope.
 
-        Parameters
-        ----------
-        noise
-            Shape (members, samples, sensors).
-        change, late
-            Predictions less the first ones, and predictions a sample earlier less those of now,
-            (members, samples, sensors).
-        moved
-            Changes by shifts of the sensors, (members, samples, axes * sensors).
-        answers
-            Readings due to missing terms, (members, samples, terms, sensors).
+        `noise`: shape (members, samples, sensors).
+        `change`, `late`: predictions less the first ones, and predictions a sample earlier less
+        those of now, (members, samples, sensors).
+        `moved`: changes by shifts of the sensors, (members, samples, axes * sensors).
+        `answers`: readings due to missing terms, (members, samples, terms, sensors).
         """
         found = np.empty((*noise.shape, len(self)))
         found[...] = self._constant

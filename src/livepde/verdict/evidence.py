@@ -29,60 +29,37 @@ LEVEL = 0.95
 
 
 class Family(NamedTuple):
-    """A random error with many amplitudes.
+    """A random error with many amplitudes."""
 
-    Attributes
-    ----------
-    parts
-        Columns, and a square root L of the covariance of their amplitudes, (columns, k); several of
-        them have the same effect on the readings.
-    sizes
-        Prior sizes that are tried: the root mean square of what it does to a reading, in standard
-        deviations of the noise.
-    beside
-        Sizes that are tried with each single cause of the same size beside it.
-    """
-
+    # Columns, and a square root L of the covariance of their amplitudes, (columns, k); several of
+    # them have the same effect on the readings
     parts: tuple[tuple[IntArray, Array], ...]
+    # Prior sizes that are tried: the root mean square of what it does to a reading, in standard
+    # deviations of the noise
     sizes: tuple[float, ...]
+    # Sizes that are tried with each single cause of the same size beside it
     beside: tuple[float, ...] = ()
 
 
 class Causes(NamedTuple):
-    """Single causes, a column each.
+    """Single causes, a column each."""
 
-    Attributes
-    ----------
-    columns
-        Their columns, (causes,).
-    most
-        Largest standard deviation of each amplitude that is plausible, in its own unit, (causes,).
-    sizes
-        As of a family.
-    """
-
-    columns: IntArray
+    columns: IntArray  # their columns, (causes,)
+    # Largest standard deviation of each amplitude that is plausible, in its own unit, (causes,)
     most: Array
-    sizes: tuple[float, ...]
+    sizes: tuple[float, ...]  # as of a family
 
 
 @dataclass(frozen=True, eq=False)
 class LinearModel:
-    """Readings as a linear model of the unknowns and of what may be wrong, in units of the noise.
+    """Readings, in units of the noise, linear in the unknowns and in what may be wrong."""
 
-    Attributes
-    ----------
-    J, Z, z
-        Derivatives by the coordinates xi, effects of the errors, and readings less the prior
-        prediction, (readings, p), (readings, columns), (readings,).
-    T
-        What is asked for, as rows on xi, (numbers, p).
-    """
-
+    # J, Z, z: derivatives by the coordinates xi, effects of the errors, and readings less the prior
+    # prediction, (readings, p), (readings, columns), (readings,)
     J: Array
     Z: Array
     z: Array
-    T: Array
+    T: Array  # what is asked for, as rows on xi, (numbers, p)
 
     @cached_property
     def _known(self) -> tuple[Array, Array]:
@@ -159,22 +136,14 @@ class Mixture(NamedTuple):
 
 
 class _Axes(NamedTuple):
-    """A family in the principal axes of its effect, with a size of one.
+    """A family in the principal axes of its effect, with a size of one."""
 
-    Attributes
-    ----------
-    effect, along
-        Squared effect on the readings, and product with the residuals, of each axis, (k,).
-    moved
-        Shift of each number by each axis, (numbers, k).
-    shared
-        Products of each axis with single causes, (k, causes).
-    """
-
+    # effect, along: squared effect on the readings, and product with the residuals, of each axis,
+    # (k,)
     effect: Array
     along: Array
-    moved: Array
-    shared: Array
+    moved: Array  # shift of each number by each axis, (numbers, k)
+    shared: Array  # products of each axis with single causes, (k, causes)
 
     @classmethod
     def of(cls, model: LinearModel, family: Family, columns: IntArray) -> _Axes:
@@ -286,25 +255,17 @@ LEAST_SHARE = 1e-6  # of the information in the largest direction, below which n
 
 @dataclass(frozen=True, eq=False)
 class CauseEvidence:
-    """Evidence of every direction in every window, shapes (windows, directions).
+    """Evidence of every direction in every window, shapes (windows, directions)."""
 
-    Attributes
-    ----------
-    log_e, size
-        Logarithm of the e-value, and the amplitude that fits best.
-    share
-        Part of the misfit beyond the noise that the direction explains.
-    total, whitened
-        Logarithm of the mean e-value, as it is, and with errors that follow each other taken out.
-    correlation
-        Of successive errors of each sensor, once the largest direction is free, (sensors,).
-    """
-
+    # log_e, size: logarithm of the e-value, and the amplitude that fits best
     log_e: Array
     size: Array
-    share: Array
+    share: Array  # part of the misfit beyond the noise that the direction explains
+    # total, whitened: logarithm of the mean e-value, as it is, and with errors that follow each
+    # other taken out
     total: float
     whitened: float
+    # Of successive errors of each sensor, once the largest direction is free, (sensors,)
     correlation: Array
 
 
@@ -369,10 +330,7 @@ def following(ledger: Ledger, window: int) -> Following | None:
 def quiet(ledger: Ledger, log_e: Array) -> bool:
     """Return whether there is no evidence against the model in the windows that restart.
 
-    Parameters
-    ----------
-    log_e
-        Of all windows and directions.
+    `log_e`: of all windows and directions.
     """
     return unsuspicious(log_e[1:]) and following(ledger, -1) is None
 
@@ -380,10 +338,7 @@ def quiet(ledger: Ledger, log_e: Array) -> bool:
 def unsuspicious(log_e: Array) -> bool:
     """Return whether no window has evidence against the model.
 
-    Parameters
-    ----------
-    log_e
-        Of some windows and all directions.
+    `log_e`: of some windows and all directions.
     """
     if not log_e.size:
         return True
@@ -394,10 +349,7 @@ def unsuspicious(log_e: Array) -> bool:
 def _tested(sums: Array, noise: Array, spread: Array, rho: Array) -> tuple[Array, Array, Array]:
     """Return log e-values, sizes and shares of misfit of all directions.
 
-    Parameters
-    ----------
-    spread, rho
-        Variance and correlation of successive errors, (windows, sensors).
+    `spread`, `rho`: variance and correlation of successive errors, (windows, sensors).
     """
     num, den, cross, lagged = sums
     count, _, squares, products, _ = noise
@@ -455,20 +407,11 @@ def _weights(ledger: Ledger, directions: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Constancy:
-    """Test of whether the unknowns stayed: sup-LM on the cumulated scores (Andrews 1993).
+    """Test of whether the unknowns stayed: sup-LM on the cumulated scores (Andrews 1993)."""
 
-    Attributes
-    ----------
-    p_value
-        At most that, by the union bound over the places of the change.
-    after
-        Share of the samples before the most likely change.
-    change
-        How far the unknowns are apart on both sides of it, in prior standard deviations, (k,).
-    """
-
-    p_value: float
-    after: float
+    p_value: float  # at most that, by the union bound over the places of the change
+    after: float  # share of the samples before the most likely change
+    # How far the unknowns are apart on both sides of it, in prior standard deviations, (k,)
     change: Array
 
 

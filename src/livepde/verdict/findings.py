@@ -81,22 +81,14 @@ class Cause:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Cause:
-        """Return the cause that `to_dict` has written; earlier versions stored no size."""
-        numbers = {name: _number(stored.get(name)) for name in ("share", "size")}
-        return cls(**{**stored, **numbers})
+        """Return the cause that `to_dict` has written."""
+        return cls(**{**stored, **{name: _number(stored[name]) for name in ("share", "size")}})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause as JSON can hold it."""
-        share = None if math.isnan(self.share) else self.share
-        return {
-            "kind": self.kind,
-            "subject": self.subject,
-            "text": self.text,
-            "share": share,
-            "remedy": self.remedy,
-            "setting": self.setting,
-            "size": None if math.isnan(self.size) else self.size,
-        }
+        numbers = {"share": self.share, "size": self.size}
+        plain = {name: None if math.isnan(value) else value for name, value in numbers.items()}
+        return {**vars(self), **plain}
 
 
 @dataclass(frozen=True)
@@ -155,7 +147,9 @@ class Finding:
         if first.share < HALF:
             each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
             return [f"No single cause explains this. Candidates: {'; '.join(each)}."]
-        text = first.text if first.text.startswith(first.subject or " ") else _capital(first.text)
+        text = first.text
+        if not text.startswith(first.subject or " "):
+            text = text[:1].upper() + text[1:]
         found = [f"{text}{_shown(first.share, 'explains {}')}."]
         found += [f"Alternatively, {one.text}{_shown(one.share)}." for one in others[:1]]
         return found
@@ -170,27 +164,15 @@ class Finding:
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as JSON can hold it."""
         evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
-        return {
-            "what": self.what,
-            "severity": self.severity,
-            "subject": self.subject,
-            "text": self.text,
-            "evidence": evidence,
-            "measure": self.measure,
-            "causes": [cause.to_dict() for cause in self.causes],
-            "remedy": self.remedy,
-            "shift": {name: float(size) for name, size in self.shift.items()},
-            "sentence": self.sentence,
-        }
+        shift = {name: float(size) for name, size in self.shift.items()}
+        causes = [cause.to_dict() for cause in self.causes]
+        changed = {"evidence": evidence, "causes": causes, "shift": shift}
+        return {**vars(self), **changed, "sentence": self.sentence}
 
 
 def _shown(share: float, words: str = "{}") -> str:
     """Return a share in parentheses; empty if it is not known."""
     return "" if math.isnan(share) else f" ({words.format(percent(share))})"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _number(value: float | None) -> float:
@@ -306,12 +288,7 @@ class Verdict:
     def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
         """Return the verdict that `to_dict` has written."""
         findings = [Finding.from_dict(item) for item in stored["findings"]]
-        # Earlier versions stored no "judged", but listed in `untested` that nothing was.
-        untested = any(
-            text.startswith(("innovations", "everything")) for text in stored["untested"]
-        )
-        judged = stored.get("judged", not untested)
-        errors = ModelErrors.from_dict(stored.get("errors"))
+        errors, judged = ModelErrors.from_dict(stored.get("errors")), bool(stored["judged"])
         return cls.of(findings, stored["untested"], stored["unseen"], judged=judged, errors=errors)
 
     @classmethod
@@ -322,8 +299,8 @@ class Verdict:
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
         """Return the verdict with more findings, each of them once.
 
-        One on the same unknown or sensor as an earlier one replaces it: it is of later data. So
-        does one on the discretisation, which an earlier version may have put in other words.
+        One on the same unknown or sensor as an earlier one, or on the run as a whole (`ONCE`),
+        replaces it: it is of later data.
         """
         texts = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in texts]
@@ -363,8 +340,8 @@ class Verdict:
         # What frees a cause is known where the run has named it already. A key that corrects a
         # column has the size that was fitted.
         causes = [
-            replace(one, remedy=known.remedy, setting=known.setting)
-            if not one.setting and (known := before.get((one.kind, one.subject)))
+            replace(one, remedy=named.remedy, setting=named.setting)
+            if not one.setting and (named := before.get((one.kind, one.subject)))
             else one
             for one in causes
         ]
@@ -391,12 +368,9 @@ class Verdict:
     @property
     def every_sentence(self) -> list[str]:
         """Whether the run is not judged, and all findings: a sentence each, the worst first."""
-        first = [] if self.judged else [self._not_judged()]
-        return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
-
-    def _not_judged(self) -> str:
         why = f" ({self.untested[0]})" if self.untested else ""
-        return f"Not judged: the model was not tested{why}."
+        first = [] if self.judged else [f"Not judged: the model was not tested{why}."]
+        return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
 
     @property
     def sentences(self) -> list[str]:
@@ -446,19 +420,13 @@ class Shifts(Generic[Number]):
 
     Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
     members.
-
-    Attributes
-    ----------
-    largest
-        Largest shift of an unknown by all kinds together, in standard deviations; NaN: not known.
-    sizes
-        Kind -> shift of that unknown, in standard deviations.
-    unknowns
-        (Label of an unknown, kind) -> its shift, in the unit of the unknown.
     """
 
+    # Largest shift of an unknown by all kinds together, in standard deviations; NaN: not known
     largest: Number = NOT_KNOWN
+    # Kind -> shift of that unknown, in standard deviations
     sizes: Mapping[str, Number] = field(default_factory=dict)
+    # (Label of an unknown, kind) -> its shift, in the unit of the unknown
     unknowns: Mapping[tuple[str, str], Number] = field(default_factory=dict)
 
     def by(self, kind: str) -> dict[str, Number]:

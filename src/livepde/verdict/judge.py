@@ -43,53 +43,36 @@ SAME = 1e-12  # relative difference of readings that are the same
 
 
 class ScoredSample(NamedTuple):
-    """Prior of a filter at a sample, with the sample; in units of the noise.
+    """Prior of a filter at a sample, with the sample; in units of the noise."""
 
-    Attributes
-    ----------
-    C, M
-        Square root of the covariance of the unknowns, (members, r, k), and the product of the
-        matrices that have moved its rows since the last sample, (members, r, rank).
-    a, q
-        Functions that return the estimated reduced and latent unknowns: not every judge asks.
-    u
-        The estimated state.
-    Y, d, used
-        Observed square root, (members, r, sensors), innovations less their shift by the estimated
-        discretisation error, and the mask of the values that are used.
-    z, predicted, noise
-        Readings, their predictions, and the noise, (members or 1, sensors).
-    at
-        Time and inputs.
-    """
-
+    # C, M: square root of the covariance of the unknowns, (members, r, k), and the product of the
+    # matrices that have moved its rows since the last sample, (members, r, rank)
     C: Array
     M: Array
+    # a, q: functions that return the estimated reduced and latent unknowns: not every judge asks
     a: Callable[[], Array]
     q: Callable[[], Array]
-    u: Array
+    u: Array  # the estimated state
+    # Y, d, used: observed square root, (members, r, sensors), innovations less their shift by the
+    # estimated discretisation error, and the mask of the values that are used
     Y: Array
     d: Array
     used: Mask
+    # z, predicted, noise: readings, their predictions, and the noise, (members or 1, sensors)
     z: Array
     predicted: Array
     noise: Array
-    at: Moments
+    at: Moments  # time and inputs
 
 
 class Judge:
     """Configuration of a ledger: it adds samples to it, and sums them.
 
-    Parameters
-    ----------
-    dictionary
-        The directions.
-    sensors, unknowns, n
-        Number of sensors, of reduced unknowns and of coefficients of the state.
-    rank
-        Rows of the square root at most when samples come.
-    still
-        Whether all unknowns stay as they are, so that their record can be kept.
+    `dictionary`: the directions.
+    `sensors`, `unknowns`, `n`: number of sensors, of reduced unknowns and of coefficients of the
+    state.
+    `rank`: rows of the square root at most when samples come.
+    `still`: whether all unknowns stay as they are, so that their record can be kept.
     """
 
     def __init__(

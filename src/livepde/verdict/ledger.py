@@ -35,76 +35,52 @@ CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Hube
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Running sums of each member over the samples so far.
+    """Running sums of each member over the samples so far."""
 
-    Attributes
-    ----------
-    seen, waiting
-        Number of samples, and of those that wait to be summed, shape (members,).
-    rows
-        Samples that wait, (members, batch, numbers); see `livepde.verdict.judge`.
-    w
-        Coordinates of all directions in all windows on the rows of the square root as they were
-        when the first of these came, (members, rank, windows times directions).
-    times
-        Time of the last sample that was summed, and the usual interval, (members, 2).
-    first, last
-        First prediction of each sensor, and the last that was summed, (members, sensors); NaN
-        before.
-    age, epoch
-        Samples in each window, and how often it has begun anew, (members, windows).
-    sums
-        Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) of each window, direction and
-        sensor, shape (members, 4, windows, directions, sensors).
-    noise
-        Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window
-        and sensor, shape (members, 5, windows, sensors).
-    before
-        Whitened innovation and responses of the last sample, (members, 1 + windows times
-        directions, sensors).
-    present
-        1 where the last sample had a value, shape (members, sensors).
-    score, information
-        Of each block and sensor, about the prior mean: sums of Y r, (members, blocks, sensors, k),
-        and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not kept.
-    length
-        Samples in a block, shape (members,).
-    process
-        States by which the process answers a missing term, (members, terms, n).
-    readings, reached
-        Readings due to those states at the first of two times, and their change per unit of time up
-        to the second one, (members, 2, terms, sensors), and these times, (members, 2).
-    sound
-        Whether nothing spoke against the model in the longest window that ended last, (members,).
-    shown
-        How many readings each sensor has shown, and how many of them a gate has refused, (members,
-        2, sensors).
-    stuck, value
-        How often in a row each sensor has shown the same value, and that value, shapes (members,
-        sensors).
-    """
-
+    # seen, waiting: number of samples, and of those that wait to be summed, shape (members,)
     seen: IntArray
     waiting: IntArray
-    rows: Array
+    rows: Array  # samples that wait, (members, batch, numbers); see `livepde.verdict.judge`
+    # Coordinates of all directions in all windows on the rows of the square root as they were when
+    # the first of these came, (members, rank, windows times directions)
     w: Array
-    times: Array
+    times: Array  # time of the last sample that was summed, and the usual interval, (members, 2)
+    # first, last: first prediction of each sensor, and the last that was summed, (members,
+    # sensors); NaN before
     first: Array
     last: Array
+    # age, epoch: samples in each window, and how often it has begun anew, (members, windows)
     age: IntArray
     epoch: IntArray
+    # Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) of each window, direction and
+    # sensor, shape (members, 4, windows, directions, sensors)
     sums: Array
+    # Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window and
+    # sensor, shape (members, 5, windows, sensors)
     noise: Array
+    # Whitened innovation and responses of the last sample, (members, 1 + windows times directions,
+    # sensors)
     before: Array
-    present: Array
+    present: Array  # 1 where the last sample had a value, shape (members, sensors)
+    # score, information: of each block and sensor, about the prior mean: sums of Y r, (members,
+    # blocks, sensors, k), and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not
+    # kept
     score: Array
     information: Array
-    length: IntArray
-    process: Array
+    length: IntArray  # samples in a block, shape (members,)
+    process: Array  # states by which the process answers a missing term, (members, terms, n)
+    # readings, reached: readings due to those states at the first of two times, and their change
+    # per unit of time up to the second one, (members, 2, terms, sensors), and these times,
+    # (members, 2)
     readings: Array
     reached: Array
+    # Whether nothing spoke against the model in the longest window that ended last, (members,)
     sound: Mask
+    # How many readings each sensor has shown, and how many of them a gate has refused, (members, 2,
+    # sensors)
     shown: IntArray
+    # stuck, value: how often in a row each sensor has shown the same value, and that value, shapes
+    # (members, sensors)
     stuck: IntArray
     value: Array
 
@@ -123,14 +99,10 @@ class Ledger:
     ) -> Ledger:
         """Return the value of one member before any sample.
 
-        Parameters
-        ----------
-        followed
-            Number k of unknown coordinates of which the record is kept.
-        terms, n
-            Number of missing terms, and of coefficients of the state.
-        rank, batch, numbers
-            Rows of the square root, samples that are summed together, and numbers of each.
+        `followed`: number k of unknown coordinates of which the record is kept.
+        `terms`, `n`: number of missing terms, and of coefficients of the state.
+        `rank`, `batch`, `numbers`: rows of the square root, samples that are summed together, and
+        numbers of each.
         """
         never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
@@ -197,15 +169,10 @@ def changed(ledger: Ledger, **parts: Any) -> Ledger:
 def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Array]:
     """Return `sums`, `noise`, `before` and `present` after a batch of samples.
 
-    Parameters
-    ----------
-    due
-        Windows that begin with this batch, (members, windows).
-    whitened
-        Innovations r, and responses g of each direction in each window, (members, batch, sensors, 1
-        + windows * directions); zero where no value is.
-    used
-        1 where there is a value, (members, batch, sensors).
+    `due`: windows that begin with this batch, (members, windows).
+    `whitened`: innovations r, and responses g of each direction in each window, (members, batch,
+    sensors, 1 + windows * directions); zero where no value is.
+    `used`: 1 where there is a value, (members, batch, sensors).
     """
     members, _, sensors, _ = whitened.shape
     windows, directions = old.sums.shape[2:4]
@@ -243,11 +210,8 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
 def blocked(old: Ledger, Y: Array, r: Array) -> dict[str, Any]:
     """Return `score`, `information` and `length` after a batch of samples.
 
-    Parameters
-    ----------
-    Y, r
-        Sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at the
-        prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
+    `Y`, `r`: sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at
+    the prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
     """
     score, information, length = old.score, old.information, old.length
     # All blocks are in use: neighbours merge, and each holds twice as many samples from now on.
@@ -286,21 +250,14 @@ UNITS = (
 
 @dataclass(frozen=True, eq=False)
 class InputLedger:
-    """Gaps of the input channels so far.
+    """Gaps of the input channels so far."""
 
-    Attributes
-    ----------
-    counts
-        Number of samples, and of those in which each channel was held, shape (1 + channels,).
-    held
-        Time for which each channel has been held by now, shape (channels,); 0 if it has a value.
-    unstated
-        1 for each channel without a value at the initial time, whose first one was held over the
-        first interval, shape (channels,).
-    """
-
+    # Number of samples, and of those in which each channel was held, shape (1 + channels,)
     counts: IntArray
+    # Time for which each channel has been held by now, shape (channels,); 0 if it has a value
     held: Array
+    # 1 for each channel without a value at the initial time, whose first one was held over the
+    # first interval, shape (channels,)
     unstated: Array
 
     @classmethod
@@ -335,10 +292,7 @@ class InputLedger:
     def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
         """Return which channels were held in more than 2 % of the samples, and which at the start.
 
-        Parameters
-        ----------
-        shifts
-            Of the estimate, with the shift of each unknown by its inputs.
+        `shifts`: of the estimate, with the shift of each unknown by its inputs.
         """
         samples = max(int(self.counts[0]), 1)
         each = shifts.by("input").items()
@@ -357,20 +311,13 @@ class InputLedger:
 
 @dataclass(frozen=True, eq=False)
 class WithheldLedger:
-    """Sums over the values of each withheld sensor, in constant memory.
+    """Sums over the values of each withheld sensor, in constant memory."""
 
-    Attributes
-    ----------
-    sums
-        Shape (9, sensors): number of values and of successive pairs; sums of half the squared
-        difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
-        that is predicted.
-    last
-        Last error of each sensor, shape (sensors,); NaN before.
-    """
-
+    # Shape (9, sensors): number of values and of successive pairs; sums of half the squared
+    # difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
+    # that is predicted
     sums: Array
-    last: Array
+    last: Array  # last error of each sensor, shape (sensors,); NaN before
 
     @classmethod
     def start(cls, sensors: int) -> WithheldLedger:
@@ -380,10 +327,7 @@ class WithheldLedger:
     def add(self, z: Array, predicted: Array, variance: Array) -> WithheldLedger:
         """Return the value after a sample; z is NaN where missing.
 
-        Parameters
-        ----------
-        variance
-            Of the prediction, without noise, shape (sensors,).
+        `variance`: of the prediction, without noise, shape (sensors,).
         """
         error = z - predicted
         seen = np.isfinite(error)
@@ -441,7 +385,6 @@ class WithheldLedger:
             yield Finding("withheld", severity, text, name, p, "p-value", (cause,))
 
     def _scatter(self, k: int) -> float:
-        """Return the standard deviation of the readings of a sensor."""
         count, _, _, squares, errors, p, pp, pz, _ = self.sums[:, k]
         mean = (errors + p) / count
         return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
