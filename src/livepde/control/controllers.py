@@ -20,6 +20,12 @@ from livepde.linalg import Array
 
 # Weight of states that no tracked output sees, relative to the trace of the weight matrix.
 TINY = 1e-10
+QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
+# Largest distance of a scenario from the estimate, as a share of the distance to the bound.
+FARTHEST = 0.9
+# Finite substitute of a limit that is temporarily infinite: Ipopt needs finite parameters.
+FAR = 1e12
+SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,14 +136,6 @@ class LQ:
                 v = np.clip(lsq_linear(effect, rest, (low, high), method="bvls").x, low, high)
             pair = pair + along @ np.linalg.lstsq(along[r:], v - pair[r:], rcond=None)[0]
         return np.asarray(pair[:r]), v
-
-
-QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": 0, "ipopt.max_iter": 200}
-# Largest distance of a scenario from the estimate, as a share of the distance to the bound.
-FARTHEST = 0.9
-# Finite substitute of a limit that is temporarily infinite: Ipopt needs finite parameters.
-FAR = 1e12
-SOLVED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 
 
 @dataclass(frozen=True, eq=False)

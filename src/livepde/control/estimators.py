@@ -1,4 +1,4 @@
-"""Estimators of state and unknown numbers for a controller, and tests whether to trust them."""
+"""Estimators for a controller (a Kalman filter, or an identifier), and when to trust them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Galerkin reduction of a full model: basis, linearisation point, projected systems."""
+"""Galerkin reduction of a model: linearisation, basis of static responses and modes, systems."""
 
 from __future__ import annotations
 
@@ -22,6 +22,16 @@ from livepde.readout import unknown_of
 SAME = 1e-9
 # Arbitrary time at which a model is evaluated to detect an explicit dependence on time.
 LATER = 12345.6789
+# Shift of static responses relative to the fastest rate, for processes without a steady state.
+SHIFT = 1e-9
+# Relative size below which a direction of the snapshots is dropped.
+KEPT = 1e-4
+# Relative asymmetry that is attributed to rounding.
+SYMMETRIC = 1e-10
+# Probability of the interval of an unknown number whose ends define the responses in the basis.
+LIKELY = 0.95
+# Relative nonlinearity in the unknown numbers that is attributed to rounding.
+LINEAR = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +91,6 @@ class Discrete:
         """Return the state at the end of the step."""
         after: Array = self.A @ x + self.B @ c + self.f
         return after
-
-
-# Shift of static responses relative to the fastest rate, for processes without a steady state.
-SHIFT = 1e-9
-# Relative size below which a direction of the snapshots is dropped.
-KEPT = 1e-4
-# Relative asymmetry that is attributed to rounding.
-SYMMETRIC = 1e-10
 
 
 def basis(
@@ -152,12 +154,6 @@ def _orthonormal(columns: Array, M: sp.csc_array) -> Array:
     found = columns @ (axes[:, kept][:, ::-1] / np.sqrt(weights[kept][::-1]))
     root = np.linalg.cholesky(found.T @ (M @ found))  # once more: squares have lost digits
     return np.asarray(np.linalg.solve(root, found.T).T)
-
-
-# Probability of the interval of an unknown number whose ends define the responses in the basis.
-LIKELY = 0.95
-# Relative nonlinearity in the unknown numbers that is attributed to rounding.
-LINEAR = 1e-8
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""Fields of a run in a browser: along an interval, on a plane domain, in a solid."""
+"""Fields of a run in a browser: along an interval, on a plane domain, in a solid.
+
+Matrices that interpolate values at the vertices to the drawn points are cached.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +45,8 @@ FACES = {
         (3, 0, 4, 7),
     ),
 }
+FINE = 0.2  # share of a mesh's lines on each side that may lie far out
+OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,10 +229,6 @@ def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
         shape=(len(ends), len(points)),
     )
     return Surface(weights @ points, triangles_of.reshape(-1, 3), weights)
-
-
-FINE = 0.2  # share of a mesh's lines on each side that may lie far out
-OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
 
 
 def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], str]:

@@ -1,4 +1,4 @@
-"""The live page: a Dash application over the view of a run, served from this machine only."""
+"""The live page: a Dash application over the view of a run, or a table of many runs."""
 
 from __future__ import annotations
 
@@ -32,6 +32,12 @@ if TYPE_CHECKING:
 FAST, CATCHING_UP, SLOW = 2000, 300, 10_000  # milliseconds between two looks
 STOPS = 400  # of the slider
 OPEN = ("waiting", "running", "silent")  # a run in which something may happen soon
+PACE = 5000  # milliseconds between two looks
+MOST_RUNS = 500  # rows
+MOST_UNKNOWNS = 4  # columns
+MOST_PAGES = 16  # applications that are kept
+ORDER = ("bad", "warn", "info", "good")
+T = TypeVar("T")
 
 
 def page(path: Path, prefix: str = "/") -> dash.Dash:
@@ -305,15 +311,6 @@ def harden(app: dash.Dash) -> None:
         answer.headers["X-Content-Type-Options"] = "nosniff"
         answer.headers["Referrer-Policy"] = "no-referrer"
         return answer
-
-
-PACE = 5000  # milliseconds between two looks
-MOST_RUNS = 500  # rows
-MOST_UNKNOWNS = 4  # columns
-MOST_PAGES = 16  # applications that are kept
-ORDER = ("bad", "warn", "info", "good")
-
-T = TypeVar("T")
 
 
 class PerRun(Mapping[str, T]):

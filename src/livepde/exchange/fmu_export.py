@@ -1,4 +1,4 @@
-"""Export of an identifier as a co-simulation unit (FMU), with the exporter's binaries."""
+"""Export of a case, or of a function, as a co-simulation unit (FMU)."""
 
 from __future__ import annotations
 
@@ -29,6 +29,41 @@ from livepde.streams import DataTable
 FOLDER = "process"
 CASE, RECIPE = "case.toml", "recipe.json"
 FUNCTION = "() -> livepde.Identifier"
+EXPORTERS = {2: "pythonfmu", 3: "pythonfmu3"}
+ABLE = (
+    "canHandleVariableCommunicationStepSize",
+    "canGetAndSetFMUstate",  # FMI 2.0
+    "canSerializeFMUstate",
+    "canGetAndSetFMUState",  # FMI 3.0
+    "canSerializeFMUState",
+)
+SCRIPT = '''\
+"""An identifier of livepde as a co-simulation unit."""
+
+from {exporter} import Fmi{fmi}Slave
+
+try:
+    from livepde.exchange.slave import IdentifierSlave
+except ImportError as error:
+    raise ImportError(
+        "this unit needs livepde in the Python that runs it: pip install 'livepde' there, and let "
+        f"PYTHONPATH hold where it is installed ({{error}})"
+    ) from error
+
+
+class {name}(IdentifierSlave, Fmi{fmi}Slave):
+    """What the unit does is in livepde.exchange.slave."""
+
+    fmi = {fmi}
+'''
+# For each instance pythonfmu 0.7 runs the script again and then releases a reference to the
+# module's variables that it does not own; after some instances they would be freed.
+KEPT = """
+
+import ctypes
+
+ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,43 +162,6 @@ def opened(folder: Path) -> UnitProcess:
     given = recipe["experiment"]
     experiment = None if given is None else DataTimes(**given)
     return replace(of_case(case, origin), name=recipe["name"], experiment=experiment)
-
-
-EXPORTERS = {2: "pythonfmu", 3: "pythonfmu3"}
-ABLE = (
-    "canHandleVariableCommunicationStepSize",
-    "canGetAndSetFMUstate",  # FMI 2.0
-    "canSerializeFMUstate",
-    "canGetAndSetFMUState",  # FMI 3.0
-    "canSerializeFMUState",
-)
-SCRIPT = '''\
-"""An identifier of livepde as a co-simulation unit."""
-
-from {exporter} import Fmi{fmi}Slave
-
-try:
-    from livepde.exchange.slave import IdentifierSlave
-except ImportError as error:
-    raise ImportError(
-        "this unit needs livepde in the Python that runs it: pip install 'livepde' there, and let "
-        f"PYTHONPATH hold where it is installed ({{error}})"
-    ) from error
-
-
-class {name}(IdentifierSlave, Fmi{fmi}Slave):
-    """What the unit does is in livepde.exchange.slave."""
-
-    fmi = {fmi}
-'''
-# For each instance pythonfmu 0.7 runs the script again and then releases a reference to the
-# module's variables that it does not own; after some instances they would be freed.
-KEPT = """
-
-import ctypes
-
-ctypes.pythonapi.Py_IncRef(ctypes.py_object(globals()))
-"""
 
 
 def export_fmu(

@@ -1,4 +1,4 @@
-"""Process behind a co-simulation unit: identifier, input and output channels."""
+"""Process behind a co-simulation unit: identifier, channels, present inputs and outputs."""
 
 from __future__ import annotations
 
@@ -37,6 +37,8 @@ STEPS = {"degC": "K", "degF": "degR"}
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )
+# Difference of times that is attributed to rounding, relative to the period.
+SAME = 1e-9
 
 
 @dataclass(frozen=True)
@@ -247,10 +249,6 @@ def _ports(observed: Observed, text: str) -> list[Port]:
 
 def _has_covariance(law: object) -> bool:
     return not isinstance(law, GradientLaw)
-
-
-# Difference of times that is attributed to rounding, relative to the period.
-SAME = 1e-9
 
 
 class Component:

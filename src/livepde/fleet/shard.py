@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 REFUSED = "refused"
+FORMAT = 1  # of `dump`
+BLOCK = 256  # members that step at once: more need more memory and are no faster
+Item: TypeAlias = Sequence[Any]  # (member, t, z) or (member, t, z, inputs)
+LOG = "state.log"  # its second axis has as many rows as a member needs
+ROOM = 8  # rows by which a log grows
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +144,6 @@ class ShardEstimates:
 def _time(value: object) -> float:
     """Return a time, NaN if it is none: the sample is refused."""
     return float(value) if isinstance(value, int | float | np.number) else np.nan
-
-
-FORMAT = 1  # of `dump`
-BLOCK = 256  # members that step at once: more need more memory and are no faster
-
-Item: TypeAlias = Sequence[Any]  # (member, t, z) or (member, t, z, inputs)
 
 
 class Shard:
@@ -419,10 +418,6 @@ def _rows(rows: Sequence[Any]) -> Any:
         return np.array([np.asarray(row) for row in rows])
     except ValueError:
         raise SampleError("the samples have different numbers of values.") from None
-
-
-LOG = "state.log"  # its second axis has as many rows as a member needs
-ROOM = 8  # rows by which a log grows
 
 
 class OwnStates:

@@ -1,4 +1,4 @@
-"""Common style of figures: empty figures, colours, grids and legends."""
+"""What figures show of the dataset of a run, and their common style: colours, axes, legends."""
 
 from __future__ import annotations
 
@@ -23,6 +23,14 @@ if TYPE_CHECKING:
 MOST_LINES = 7
 # Time span from which a unit of the time axis is used, its length in seconds, its name.
 CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
+# Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
+# is omitted, because it is invisible on white.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+GREY = "#7f7f7f"
+# Number of points up to which Matplotlib searches a free place for the legend.
+MOST_POINTS = 20_000
+# Width and height of a panel in inches.
+PANEL = (5.4, 3.4)
 
 
 def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
@@ -151,16 +159,6 @@ def sensor_places(data: xr.Dataset) -> dict[str, SensorPlaces]:
         for kind in ("sensor", "withheld")
         if f"{kind}_y" in data.coords
     }
-
-
-# Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
-# is omitted, because it is invisible on white.
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-GREY = "#7f7f7f"
-# Number of points up to which Matplotlib searches a free place for the legend.
-MOST_POINTS = 20_000
-# Width and height of a panel in inches.
-PANEL = (5.4, 3.4)
 
 
 def figure_class() -> type[Figure]:

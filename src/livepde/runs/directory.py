@@ -1,4 +1,4 @@
-"""The run directory: files of a run, their writer and their reader.
+"""The run directory: the outcome of a run, its files, their writer and their reader.
 
 ::
 
@@ -46,6 +46,17 @@ T = TypeVar("T")
 
 FigureFactory: TypeAlias = Callable[[], Any]
 """Returns a matplotlib Figure; called only when somebody wants to see it."""
+FORMAT = 2
+RUNS = "runs"  # where the command line puts them
+RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
+CHECKPOINT, REPORT = "checkpoint.bin", "report.md"
+JOURNAL = "journal.sqlite"
+LONGEST = 10_000_000  # bytes of a record
+# Digests of what is read back: of the record itself, of the copy of the case, and of the estimates.
+# The last are several while the file is replaced, so that a kill leaves a file with its digest.
+OWN, COPY, CONTENT = "sha256", "case_copy_sha256", "estimates_sha256"
+MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
+WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,19 +109,6 @@ def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str
             f"{what} failed ({type(error).__name__}: {reason[:200]}); everything else is complete."
         )
         return otherwise
-
-
-FORMAT = 2
-RUNS = "runs"  # where the command line puts them
-RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
-CHECKPOINT, REPORT = "checkpoint.bin", "report.md"
-JOURNAL = "journal.sqlite"
-LONGEST = 10_000_000  # bytes of a record
-# Digests of what is read back: of the record itself, of the copy of the case, and of the estimates.
-# The last are several while the file is replaced, so that a kill leaves a file with its digest.
-OWN, COPY, CONTENT = "sha256", "case_copy_sha256", "estimates_sha256"
-MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
-WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
 
 
 def free_path(wanted: Path) -> Path:

@@ -59,6 +59,15 @@ SYMBOLS = {  # of pint -> of UDUNITS, where they differ
 }
 SCALES = ("degC", "degF")  # their zero is not zero
 NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+Writer: TypeAlias = Callable[[Run, Path, float | None], object]
+NEEDS = {
+    ".parquet": ["pyarrow"],
+    ".zarr": ["zarr"],
+    ".xdmf": ["meshio", "h5py"],
+    ".vtu": ["meshio"],
+    ".vtk": ["meshio"],
+}
+AT_ONE_TIME = (".vtu", ".vtk")
 
 
 @dataclass(frozen=True)
@@ -451,7 +460,6 @@ def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
     return {free: data[name].values[k] for name, free in names.items()}
 
 
-Writer: TypeAlias = Callable[[Run, Path, float | None], object]
 FORMATS: dict[str, Writer] = {
     ".nc": lambda run, path, at: write_dataset(_conventional(run), path),
     # The second format has text of fixed length, which the third has not settled yet.
@@ -464,11 +472,3 @@ FORMATS: dict[str, Writer] = {
     ".vtu": _vtk,
     ".vtk": _vtk,
 }
-NEEDS = {
-    ".parquet": ["pyarrow"],
-    ".zarr": ["zarr"],
-    ".xdmf": ["meshio", "h5py"],
-    ".vtu": ["meshio"],
-    ".vtk": ["meshio"],
-}
-AT_ONE_TIME = (".vtu", ".vtk")

@@ -1,4 +1,4 @@
-"""A small HTTP endpoint of a run: probes of the process, /health, /metrics for Prometheus."""
+"""What a live run shows others: /health, /metrics for Prometheus, its log, lines of JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Summary of a run: estimates, errors of each channel, checks."""
+"""Summary of a run: estimates, resistance of a wall, errors of each channel, checks."""
 
 from __future__ import annotations
 
@@ -24,6 +24,22 @@ if TYPE_CHECKING:
 # Attributes of a dataset: layers as JSON, label of a conductivity -> thickness in m; and the sum of
 # the surface resistances in m^2 K/W, if they are stated.
 LAYERS, SURFACES = "wall_layers", "surface_resistance"
+MOST_ROWS = 40
+DIGITS = 15  # of a number
+TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
+ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
+IGNORED = "ignored"  # role of channels that are shown and count in no total
+MOVED = 3.0  # deviations by which an unknown has moved after an alarm
+JUMP = "jump"  # what the law notes of each sample
+STATES = {
+    "pinned": "well determined",
+    "partly": "partly determined",
+    "flat": "not identifiable",
+    "at its bound": "at its bound",
+    "moves": "changes with time",
+}
+"""How well the data determine a number, as `determination` returns it -> words."""
+CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
 
 
 @dataclass(frozen=True)
@@ -65,24 +81,6 @@ def resistance(data: xr.Dataset) -> Resistance | None:
     variance = float(slopes @ correlation @ slopes)
     surfaces = data.attrs.get(SURFACES)
     return Resistance(R, variance**0.5, None if surfaces is None else float(surfaces))
-
-
-MOST_ROWS = 40
-DIGITS = 15  # of a number
-TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
-ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
-IGNORED = "ignored"  # role of channels that are shown and count in no total
-MOVED = 3.0  # deviations by which an unknown has moved after an alarm
-JUMP = "jump"  # what the law notes of each sample
-STATES = {
-    "pinned": "well determined",
-    "partly": "partly determined",
-    "flat": "not identifiable",
-    "at its bound": "at its bound",
-    "moves": "changes with time",
-}
-"""How well the data determine a number, as `determination` returns it -> words."""
-CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
 
 
 def digits(value: float, std: float) -> tuple[str, str]:

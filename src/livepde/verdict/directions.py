@@ -1,4 +1,10 @@
-"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks."""
+"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks.
+
+The free response p of the state to a term that the model lacks (a source, a loss, a boundary
+value), M p' + (B + A q)' p = load, is computed by implicit Euler steps over several samples, and
+its effect on the sensors is interpolated between these steps. The response is needed to a tenth of
+its size, to distinguish causes, and so costs a fraction of a step.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +31,14 @@ SCALED = 0.1  # of a channel of a source or flux
 LOSS = 0.1  # in `REACH` samples
 MOST_STRIDE = 16  # samples of one step
 MOST_ENDS = 4  # boundaries of the mesh that are looked at
+OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
+DRIFT = 64.0  # ... a drift in so many samples
+GAIN = 0.1  # of the change of a sensor since the start
+LAG = 3.0  # samples
+SHIFT = 0.02  # of the length of the domain
+JUMP = 0.3  # prior standard deviations of an unknown
+MOST_JUMPS = 8  # coordinates of unknowns that may jump
+MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
 class Now(NamedTuple):
@@ -196,16 +210,6 @@ def scaled_channel(
 def stride(seen: int) -> int:
     """Return over how many samples a step goes: short ones while the process is young."""
     return min(max(seen // 8, 1), MOST_STRIDE)
-
-
-OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
-DRIFT = 64.0  # ... a drift in so many samples
-GAIN = 0.1  # of the change of a sensor since the start
-LAG = 3.0  # samples
-SHIFT = 0.02  # of the length of the domain
-JUMP = 0.3  # prior standard deviations of an unknown
-MOST_JUMPS = 8  # coordinates of unknowns that may jump
-MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
 @dataclass(frozen=True)

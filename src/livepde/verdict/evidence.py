@@ -6,6 +6,12 @@ The e-value of a direction is the Bayes factor of its amplitude, free with a nor
 one, against zero, with the noise level integrated out. Under white errors of any size it is a
 martingale that begins at one, and so is a mean of several: the probability that it ever exceeds
 1/alpha is at most alpha, for any number of looks (Ville 1939; Robbins 1970; Vovk and Wang 2021).
+
+Intervals that allow for unknown errors average over hypotheses. One adds columns Z with normal
+amplitudes b ~ N(0, L L^T) to the linearised model of the readings, z = J xi + Z b + noise, with
+xi ~ N(0, I) and the noise level integrated out. With strong data one wrong hypothesis would take
+all the weight. So the evidence e is tempered: weights are those of e^eta, with eta such that none
+exceeds that of "nothing is wrong" by more than e^TEMPER (Grünwald 2012; Miller and Dunson 2019).
 """
 
 from __future__ import annotations
@@ -26,6 +32,14 @@ NU = 10.0  # degrees of freedom of the prior of the noise level
 TEMPER = 5.0  # logarithm of the largest ratio of evidences: 3 to 8 do much the same
 NOTHING = 0.5  # prior mass on "nothing is wrong"; the rest on single causes and on families alike
 LEVEL = 0.95
+ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
+CAUSES = 0.5 * ALPHA  # for the e-value of all directions
+RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
+FOLLOWING = 0.2  # correlation of successive errors that is worth a word
+TRUSTED_LEVEL = 20.0  # samples for which the level of all of the run counts in a window
+MOST_CORRELATED = 0.98
+LEAST = 0.05  # share of the information on each side of a change that is looked for
+LEAST_SHARE = 1e-6  # of the information in the largest direction, below which nothing is told
 
 
 class Family(NamedTuple):
@@ -240,17 +254,6 @@ def averaged(model: LinearModel, causes: Causes, families: Sequence[Family]) -> 
     weights = np.exp(tempered - scipy.special.logsumexp(tempered))
     level = np.maximum(1.0, (NU + squares) / (NU + n))
     return Mixture(weights, mean + shift, np.sqrt((variance + more) * level[:, None]))
-
-
-ALPHA = 0.01  # probability of a false alarm in a run, shared by the tests
-CAUSES = 0.5 * ALPHA  # for the e-value of all directions
-RECORD = 0.05 * ALPHA  # for each test of the record of the unknowns, and of following errors
-FOLLOWING = 0.2  # correlation of successive errors that is worth a word
-
-TRUSTED_LEVEL = 20.0  # samples for which the level of all of the run counts in a window
-MOST_CORRELATED = 0.98
-LEAST = 0.05  # share of the information on each side of a change that is looked for
-LEAST_SHARE = 1e-6  # of the information in the largest direction, below which nothing is told
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Verdict: its level, and findings with evidence, causes, remedy and consequence."""
+"""Verdict: its level, and findings with evidence, causes, remedy and consequence; shifts."""
 
 from __future__ import annotations
 
@@ -44,6 +44,25 @@ CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
 ONCE = ("discretisation", "hold")  # findings on the run as a whole of which there is one at most
 LARGEST = 1e99  # evidence beyond is written as that
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+DECIDES = 5.0  # the same, from which the interval is little else
+GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign
+SHARED = 1.0  # the same by one kind of error, from which it is named
+SETTING = 1.0  # the same if inputs are readings: no interval holds that
+HOLD = "hold"
+LISTED = 5  # unknowns in a sentence
+REFINE = {
+    "step": (
+        "the time step",
+        "Reduce `steps.dt_max`, or use a second-order scheme.",
+    ),
+    "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
+    "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
+}
+"""Kind of a discretisation error -> its name, and the remedy."""
+NOT_KNOWN: Any = math.nan
+Number = TypeVar("Number")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True)
@@ -390,28 +409,6 @@ class Verdict:
 
     def __str__(self) -> str:
         return "\n".join([self.level, *(f"- {text}" for text in self.sentences)])
-
-
-SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
-DECIDES = 5.0  # the same, from which the interval is little else
-GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign
-SHARED = 1.0  # the same by one kind of error, from which it is named
-SETTING = 1.0  # the same if inputs are readings: no interval holds that
-HOLD = "hold"
-LISTED = 5  # unknowns in a sentence
-REFINE = {
-    "step": (
-        "the time step",
-        "Reduce `steps.dt_max`, or use a second-order scheme.",
-    ),
-    "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
-    "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
-}
-"""Kind of a discretisation error -> its name, and the remedy."""
-
-NOT_KNOWN: Any = math.nan
-Number = TypeVar("Number")
-Other = TypeVar("Other")
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,16 @@ BATCH = 16  # samples at most that wait until they are summed together
 ROOM = 2**16  # numbers at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
 CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
+HELD = 0.02  # share of the samples in which the last value of an input was held
+CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
+SIMILAR = 0.05  # relative difference of a slope to that of a unit
+UNITS = (
+    ("degF", "degC", 1.8, 32.0),
+    ("degC", "degF", 1.0 / 1.8, -32.0 / 1.8),
+    ("K", "degC", 1.0, 273.15),
+    ("degC", "K", 1.0, -273.15),
+)
+"""Unit that a sensor may have, the one that it is taken for, slope and intercept of that."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,18 +244,6 @@ def _merged(values: Array, full: Mask) -> Array:
     merged[:, : BLOCKS // 2] = values[:, ::2] + values[:, 1::2]
     chosen = full.reshape(-1, *(1,) * (values.ndim - 1))
     return np.where(chosen, merged, values)
-
-
-HELD = 0.02  # share of the samples in which the last value of an input was held
-CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
-SIMILAR = 0.05  # relative difference of a slope to that of a unit
-UNITS = (
-    ("degF", "degC", 1.8, 32.0),
-    ("degC", "degF", 1.0 / 1.8, -32.0 / 1.8),
-    ("K", "degC", 1.0, 273.15),
-    ("degC", "K", 1.0, -273.15),
-)
-"""Unit that a sensor may have, the one that it is taken for, slope and intercept of that."""
 
 
 @dataclass(frozen=True, eq=False)
