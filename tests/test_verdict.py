@@ -237,17 +237,10 @@ def test_each_share_of_a_shift_is_named_with_its_own_remedy():
     assert "steps.dt_max" in found.remedy
     assert "mesh.cells" in found.remedy
     assert "channels" not in found.sentence
+    assert "Refine the mesh" in found.sentence
     small = Shifts(2.2, {"step": 0.9, "mesh": 0.8, "input": 0.5})
     (found,) = discretised(small)
     assert "the time step by 0.9." in found.text
-
-
-def test_a_shift_by_the_discretisation_is_a_finding_of_the_estimate():
-    shifts = Shifts(2.5, {"step": -0.5, "mesh": 3.0}, {("k", "mesh"): 0.2})
-    (found,) = discretised(shifts)
-    assert "2.5 standard deviations" in found.text
-    assert "the mesh by 3.0 (k by +0.2)" in found.text
-    assert "Refine the mesh" in found.sentence
     assert list(discretised(replace(shifts, largest=1.9))) == []
     assert list(discretised(Shifts())) == []
 

@@ -596,9 +596,8 @@ class Fleet:
         header = {**self.header, "begun": self._state is not None}
         leaves = {"samples": self._samples, **self.ends, **self.fingerprint.leaves}
         if self._state is not None:
-            leaves |= {
-                f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
-            }
+            state = checkpoint.flatten(self._state)
+            leaves |= {f"state/{path}": leaf for path, leaf in state.items()}
         return checkpoint.packed(header, leaves)
 
     def load(self, path: str | os.PathLike[str]) -> None:
