@@ -20,8 +20,9 @@ import numpy as np
 import pytest
 import xarray as xr
 from browser import chromium, count, text, wait
+from factories import BODIES
 from patience import PATIENCE
-from skfem import MeshHex, MeshTri
+from skfem import MeshTri
 from typer.testing import CliRunner
 
 import livepde as lp
@@ -39,21 +40,8 @@ from livepde.runs.web import Address
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
 
 
-def sided(mesh):
-    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
-
-
-MESHES = {
-    "line": lambda: lp.interval(0.0, 1.0, 10),
-    "triangle": lambda: sided(MeshTri().refined(2)),
-    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 3)),
-    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
-    "hexahedron": lambda: sided(MeshHex().refined(1)),
-}
-
-
 def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Identifier:
-    mesh = MESHES[kind]()
+    mesh = BODIES[kind]()
     alpha = lp.Scalar(lp.LogNormal(0.1, 0.05), unit="m^2/s")
     if field:
         alpha = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(0.1), unit="m^2/s")
@@ -100,7 +88,7 @@ def dataset(kind: str = "line", count: int = 6, **options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", BODIES)
 @pytest.mark.parametrize("field", [False, True])
 def test_every_kind_of_run_has_its_panels(kind, field):
     data = dataset(kind, field=field)
