@@ -171,11 +171,18 @@ def rmse(errors: np.ndarray[Any, Any]) -> float:
 
 @dataclass(frozen=True)
 class Jump:
-    """An alarm of `Jumps`."""
+    """An alarm of `Jumps`.
 
-    t: float  # time of the sample that raised it
-    # Numbers that have moved by more than three standard deviations between this alarm and the next
-    # one, or the end: label -> value before and after, and the standard deviation after
+    Attributes
+    ----------
+    t
+        Time of the sample that raised it.
+    moved
+        Numbers that have moved by more than three standard deviations between this alarm and the
+        next one, or the end: label -> value before and after, and the standard deviation after.
+    """
+
+    t: float
     moved: Mapping[str, tuple[float, float, float]]
 
 
