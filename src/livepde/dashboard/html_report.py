@@ -32,17 +32,9 @@ MOST_READINGS = 100_000  # samples of a run whose readings are drawn
 def write_report(run: Run, target: Path, *, force: bool = False) -> None:
     """Write the report of a run, also of one that still continues.
 
-    Parameters
-    ----------
-    force
-        Replace an existing file.
-
-    Raises
-    ------
-    RunError
-        The target exists, or cannot be written; the run contains no estimates.
-    ConfigurationError
-        Plotly or Jinja2 is not installed.
+    `force`: replace an existing file.
+    Raises `RunError`: the target exists, or cannot be written; the run contains no estimates.
+    Raises `ConfigurationError`: Plotly or Jinja2 is not installed.
     """
 
     def write(path: Path) -> None:

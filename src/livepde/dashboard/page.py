@@ -43,17 +43,9 @@ T = TypeVar("T")
 def page(path: Path, prefix: str = "/") -> dash.Dash:
     """Return the page of a run.
 
-    Parameters
-    ----------
-    path
-        The run directory, finished or going on.
-    prefix
-        Where browsers find the page, as it ends: it may be mounted below another one.
-
-    Raises
-    ------
-    RunError
-        There is no run.
+    `path`: the run directory, finished or going on.
+    `prefix`: where browsers find the page, as it ends: it may be mounted below another one.
+    Raises `RunError`: there is no run.
     """
     view = View(path)
     app = application(f"{view.look().title} – livepde", prefix)

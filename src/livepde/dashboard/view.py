@@ -131,15 +131,7 @@ class View:
     Memory and the cost of each update are bounded, whatever the length of the run: only new records
     of a journal are read, and those in memory are thinned.
 
-    Parameters
-    ----------
-    path
-        The run directory.
-
-    Raises
-    ------
-    RunError
-        There is no run.
+    Raises `RunError`: there is no run.
     """
 
     def __init__(self, path: Path) -> None:

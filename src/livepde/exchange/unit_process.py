@@ -254,19 +254,11 @@ def _has_covariance(law: object) -> bool:
 class Component:
     """Co-simulation component: one sample per communication point; bad samples set a status.
 
-    Parameters
-    ----------
-    process
-        UnitProcess that it runs.
-
-    Attributes
-    ----------
-    inputs
-        Present values of the channels, NaN if missing.
-    period
-        Sampling period in seconds: the first step of each period takes a sample. 0: every step.
-    outputs, status
-        Output values, in the order of `UnitProcess.outputs`, and status code of the last step.
+    `inputs`: present values of the channels, NaN if missing.
+    `period`: sampling period in seconds: the first step of each period takes a sample. 0: every
+    step.
+    `outputs`, `status`: output values, in the order of `UnitProcess.outputs`, and status code of
+    the last step.
     """
 
     def __init__(self, process: UnitProcess) -> None:

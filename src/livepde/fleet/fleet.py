@@ -423,14 +423,9 @@ class Fleet:
     def subset(self, which: IntArray, state: Any, samples: int) -> Fleet:
         """Return a fleet of some members in their present states; for `Shard`.
 
-        Parameters
-        ----------
-        which
-            Numbers of the members.
-        state
-            Of the engine; None before the first sample.
-        samples
-            How many they have taken.
+        `which`: numbers of the members.
+        `state`: of the engine; None before the first sample.
+        `samples`: how many they have taken.
         """
         other = copy.copy(self)
         other._starts = {}

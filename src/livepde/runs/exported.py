@@ -335,15 +335,8 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
 def into_place(target: Path, write: Callable[[Path], object], *, force: bool = False) -> None:
     """Write a file or folder next to its target, and move it there when it is complete.
 
-    Parameters
-    ----------
-    write
-        Called with a temporary path of the same name; files written beside it are moved, too.
-
-    Raises
-    ------
-    RunError
-        Something is there already and `force` is not set; it cannot be written.
+    `write`: called with a temporary path of the same name; files written beside it are moved, too.
+    Raises `RunError`: something is there already and `force` is not set; it cannot be written.
     """
     try:
         refuse_file(target, force)

@@ -31,17 +31,9 @@ def configure(kind: str = "text", level: int = logging.INFO) -> None:
     The loggers are livepde.run, livepde.mqtt and livepde.opcua. An event of the run has the fields
     kind, channel and t in JSON.
 
-    Parameters
-    ----------
-    kind
-        "text", or "json": one object for each line, with the time in UTC.
-    level
-        Lowest level of the messages of livepde.
-
-    Raises
-    ------
-    RunError
-        The package python-json-logger is not installed.
+    `kind`: "text", or "json": one object for each line, with the time in UTC.
+    `level`: lowest level of the messages of livepde.
+    Raises `RunError`: the package python-json-logger is not installed.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
@@ -185,20 +177,9 @@ class Monitor:
     else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes
     none of these codes: it is in the content of /health, and a metric.
 
-    Parameters
-    ----------
-    address
-        Where to listen.
-    health
-        Returns the content of /health as JSON; its "ok" decides between the codes 200 and 503, and
-        its "why" is what /readyz says.
-    metrics
-        The metrics that /metrics serves.
-
-    Raises
-    ------
-    RunError
-        The port is taken.
+    `health`: returns the content of /health as JSON; its "ok" decides between the codes 200 and
+    503, and its "why" is what /readyz says.
+    Raises `RunError`: the port is taken.
     """
 
     def __init__(

@@ -166,15 +166,8 @@ class Judge:
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
-        Parameters
-        ----------
-        M
-            As it is now, (members, r, rank).
-
-        Returns
-        -------
-        w
-            Shape (members, r, windows times directions).
+        `M`: as it is now, (members, r, rank).
+        `w`: shape (members, r, windows times directions).
         """
         members, at, due = len(ledger.seen), self._at, ledger.due
         # Only as many rows as some member has waiting are summed.
