@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
+STATUS_FLAGS = {  # attributes of the variable that holds indices in these
+    "flag_values": list(range(len(STATUS_CODES))),
+    "flag_meanings": " ".join(STATUS_CODES),
+}
 
 NOTE = "note_"  # prefix of a note whose own name is taken
 SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a run
@@ -397,11 +401,7 @@ class Layout:
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
         data |= self._errors(rows)
-        flags = {
-            "flag_values": list(range(len(STATUS_CODES))),
-            "flag_meanings": " ".join(STATUS_CODES),
-        }
-        data["status"] = ("time", rows.status, flags)
+        data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
             taken = name in data or name in coords  # by an unknown, say

@@ -19,7 +19,7 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
 from livepde.readout import unknown_of
-from livepde.records import NOTE, STATUS_CODES, Layout, Record, Snapshot
+from livepde.records import NOTE, STATUS_CODES, STATUS_FLAGS, Layout, Record, Snapshot
 from livepde.result import Estimate, kept
 
 if TYPE_CHECKING:
@@ -217,11 +217,7 @@ class FleetResult:
         if layout.withheld is not None:
             errors = self._series("withheld_error", len(layout.withheld))
             data["withheld_error"] = ((*both, "withheld"), errors, unit)
-        flags = {
-            "flag_values": list(range(len(STATUS_CODES))),
-            "flag_meanings": " ".join(STATUS_CODES),
-        }
-        data["status"] = (both, self._series("status"), flags)
+        data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         for name, values in self._diagnostics().items():
