@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -139,15 +139,35 @@ class FleetEstimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Row:
-    """Record of an estimate: numbers, and no state."""
+    """Record of an estimate: numbers over members, and no state."""
 
     t: float
-    parameters: Mapping[str, tuple[Array, Array]]
     innovation: Array
     withheld_error: Array
     status: IntArray
     steps: Array
     diagnostics: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, estimate: FleetEstimate, **more: Any) -> Self:
+        """Return the record of an estimate, with the numbers that a subclass adds."""
+        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
+        return cls(
+            t=estimate.t,
+            innovation=estimate.innovation,
+            withheld_error=estimate.withheld_error,
+            status=np.array(codes, dtype=np.int32),
+            steps=estimate.steps,
+            diagnostics=estimate.diagnostics.named(),
+            **more,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _NumbersRow(_Row):
+    """Record with the unknown numbers and their standard deviations."""
+
+    parameters: Mapping[str, tuple[Array, Array]]
 
 
 class FleetResult:
@@ -162,25 +182,14 @@ class FleetResult:
         self.members = tuple(members)
         self.layout = layout
         self.last: FleetEstimate | None = None
-        self._rows: list[_Row] = []
+        self._rows: list[_NumbersRow] = []
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate."""
-        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
-        self._rows.append(
-            _Row(
-                t=estimate.t,
-                parameters=estimate.parameters,
-                innovation=estimate.innovation,
-                withheld_error=estimate.withheld_error,
-                status=np.array(codes, dtype=np.int32),
-                steps=estimate.steps,
-                diagnostics=estimate.diagnostics.named(),
-            )
-        )
+        self._rows.append(_NumbersRow.of(estimate, parameters=estimate.parameters))
         self.last = estimate
 
     def settle(self, estimate: FleetEstimate) -> None:
@@ -244,16 +253,10 @@ class FleetResult:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _MemberRow:
-    """Record of an estimate, each array over members."""
+class _MemberRow(_Row):
+    """Record with `Record.numbers` and, where they are kept, the fields."""
 
-    t: float
     numbers: Array
-    innovation: Array
-    withheld_error: Array
-    status: Sequence[int]
-    steps: Sequence[int]
-    diagnostics: Mapping[str, Sequence[float]]
     profiles: Mapping[str, Array] | None
     correlation: Array | None
 
@@ -264,14 +267,14 @@ class _MemberRow:
             profiles = {name: values[k] for name, values in self.profiles.items()}
             correlation = None if self.correlation is None else self.correlation[k]
             snapshot = Snapshot(profiles, {}, correlation)
-        diagnostics = {name: values[k] for name, values in self.diagnostics.items()}
+        diagnostics = {name: values[k].item() for name, values in self.diagnostics.items()}
         return Record(
             t=self.t,
             numbers=self.numbers[k],
             innovation=self.innovation[k],
             withheld_error=self.withheld_error[k],
-            status=self.status[k],
-            steps=self.steps[k],
+            status=int(self.status[k]),
+            steps=int(self.steps[k]),
             notes={name: value for name, value in diagnostics.items() if np.isfinite(value)},
             snapshot=snapshot,
         )
@@ -304,19 +307,8 @@ class FleetRecords:
             profiles = self._profiles(beliefs.u, factors)
             labels = list(self.model.parameter_space.labels.values())
             correlation = correlation_of(factors.q[:, labels]) if len(labels) > 1 else None
-        row = _MemberRow(
-            t=estimate.t,
-            numbers=self._numbers(beliefs, factors),
-            innovation=estimate.innovation,
-            withheld_error=estimate.withheld_error,
-            status=[STATUS_CODES.index(status.code) for status in estimate.statuses],
-            steps=estimate.steps.tolist(),
-            diagnostics={
-                name: values.tolist() for name, values in estimate.diagnostics.named().items()
-            },
-            profiles=profiles,
-            correlation=correlation,
-        )
+        numbers = self._numbers(beliefs, factors)
+        row = _MemberRow.of(estimate, numbers=numbers, profiles=profiles, correlation=correlation)
         self._count += 1
         self._rows.append(row)
         self.size += row.numbers.size + row.innovation.size + row.withheld_error.size
