@@ -457,10 +457,8 @@ class Run:
 
     def arrivals(self) -> list[Table]:
         """Return the table of rows that were irregular, if any; of a run with a journal."""
-        if not (self.path / JOURNAL).is_file():
-            return []
-        with Journal.open(self.path / JOURNAL) as kept:
-            return arrivals(kept)
+        with self.reading() as journal:
+            return [] if journal is None else arrivals(journal)
 
     def summary(self) -> list[Table]:
         """Return its tables: verdict, estimates ± standard deviation, errors of each channel."""

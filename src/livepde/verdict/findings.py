@@ -398,14 +398,10 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON can hold it."""
-        return {
-            "level": self.level,
-            "findings": [finding.to_dict() for finding in self.findings],
-            "untested": list(self.untested),
-            "unseen": list(self.unseen),
-            "judged": self.judged,
-            "errors": None if self.errors is None else self.errors.to_dict(),
-        }
+        findings = [finding.to_dict() for finding in self.findings]
+        errors = None if self.errors is None else self.errors.to_dict()
+        lists = {"untested": list(self.untested), "unseen": list(self.unseen)}
+        return {**vars(self), **lists, "findings": findings, "errors": errors}
 
     def __str__(self) -> str:
         return "\n".join([self.level, *(f"- {text}" for text in self.sentences)])
