@@ -52,7 +52,6 @@ if TYPE_CHECKING:
 
     from livepde.plots import RunPlots
 
-
 Kept = TypeVar("Kept")
 
 
