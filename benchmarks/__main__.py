@@ -14,7 +14,7 @@ from livepde.cli import main
 from livepde.cli.export import Standard
 from livepde.cli.options import CodeOption, SetOption, load_case
 from livepde.cli.printing import can_draw, named, terminal
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 __all__ = ["app"]
 

@@ -34,7 +34,7 @@ from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, GradientLaw, Refit, ResidualDamping, SensitivityLaw
 from livepde.linalg import Array
 from livepde.observation import Discrepancy, Observation, Tikhonov
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import StepFailed
 
 LawBuilder: TypeAlias = Callable[[Data], tuple[Observation, AnyLaw] | None]

@@ -24,7 +24,7 @@ from livepde.identifier import Identifier
 from livepde.laws import GradientLaw, ResidualDamping
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 SIZES = (64, 256, 1024, 2500, 10_000)  # nodes of the square
 LEVELS = (0.0, 1e-3, 1e-2)  # noise over the root mean square of the readings

@@ -13,7 +13,7 @@ import typer
 from livepde.cli.experiments import run_experiment
 from livepde.cli.options import JsonOption
 from livepde.cli.printing import named, report_outcome
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 Measurement: TypeAlias = Callable[..., Outcome]
 

@@ -40,8 +40,7 @@ from livepde.model import Model
 from livepde.observation import Points
 from livepde.plots import NORMAL_95
 from livepde.result import Estimate
-from livepde.runs import unexplained
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome, unexplained
 from livepde.stepping import Advance, Alexander2, ForwardStage, Interval, advance
 
 LEVELS = (0.68, 0.95)

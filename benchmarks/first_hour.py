@@ -33,7 +33,7 @@ from benchmarks.honest.problems.borehole import Borehole
 from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 Array = NDArray[Any]
 FOLDER = ROOT / "examples" / "first_hour"

@@ -27,7 +27,7 @@ from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.records import STATUS_CODES
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.samples import Sample
 
 CLOSE = 1e-10  # relative difference of any output, between the unit and the identifier

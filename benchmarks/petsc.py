@@ -26,7 +26,7 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
 from livepde.petsc import DolfinxModel, ImplicitStep, PetscFilter, PetscObserver, number_modes
 from livepde.petsc.vectors import gathered
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 STEP = 0.05
 FIRST = 2  # samples before the clock starts: preconditioners are made

@@ -32,7 +32,7 @@ from livepde.laws import SensitivityLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Points
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 SIZES = (31, 200, 1_000, 10_000)

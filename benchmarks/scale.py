@@ -36,7 +36,7 @@ from livepde.laws.coupled.equation import Metric, StageForms, StageProblem, Stag
 from livepde.linalg import Array
 from livepde.model import Model, h1_form
 from livepde.observation import Full, Subdomain
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, ImplicitEuler, simulate
 
 __all__ = [

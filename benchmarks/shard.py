@@ -24,7 +24,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import heat
 from livepde.observation import Points
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, simulate
 
 SIZE = 250  # members of a shard: a step of more takes more memory at a time

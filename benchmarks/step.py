@@ -25,7 +25,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Points, Subdomain
 from livepde.reproduce import seed
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, Scheme, simulate
 
 SIZES = (31, 1_000, 10_000, 100_000)  # nodes

@@ -21,7 +21,7 @@ from livepde.fleet import Fleet
 from livepde.identifier import Identifier
 from livepde.laws import SensitivityLaw
 from livepde.linalg import Array, Mask
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 BOUNDS: dict[tuple[int, int], float] = {
     (31, 2): 9.0,

@@ -19,7 +19,7 @@ from benchmarks.first_hour import FOLDER, TABLES, save
 from benchmarks.jobs import each
 from livepde.cases import load
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.verdict import Verdict
 
 Array = NDArray[Any]

@@ -9,7 +9,7 @@ import typer
 
 from benchmarks.commands import Program, chosen
 from livepde.cli import main
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 __all__ = ["app"]
 

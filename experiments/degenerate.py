@@ -36,7 +36,7 @@ from livepde.progress import watched
 from livepde.reproduce.experiment import failures
 from livepde.reproduce.seed_excited import q_true, u_true
 from livepde.result import Estimate, Result
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 

@@ -53,7 +53,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce.experiment import track
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 from livepde.streams.twin import Truth

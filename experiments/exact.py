@@ -44,7 +44,7 @@ from livepde.model import Model
 from livepde.observation import Full, Observation, Subdomain
 from livepde.observation.reconstruction import Pseudoinverse, Tikhonov
 from livepde.progress import watched
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, Newton
 
 

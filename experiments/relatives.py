@@ -23,7 +23,7 @@ from livepde.laws import AnyLaw, ResidualDamping
 from livepde.observation import Full, Observation, Subdomain
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Track, failures, track
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 PULLS = (0.1, 1.0, 10.0)
 SOURCES: dict[str, tuple[Any, float]] = {  # problem -> (module, gain)

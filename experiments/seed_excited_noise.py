@@ -29,7 +29,7 @@ from livepde.observation import Discrepancy, Full, Pseudoinverse, Tikhonov
 from livepde.progress import watched
 from livepde.reproduce import seed_excited
 from livepde.reproduce.experiment import failures
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.samples import Sample
 from livepde.streams import LocalPolynomial, RelativeNoise, Twin
 

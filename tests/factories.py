@@ -244,3 +244,17 @@ std = "1e-5 m^2/s"
 kind = "sensitivity"
 """
 INTERPOLATED_ROD_CASE = ROD_CASE.replace('"20 degC"', '"interpolate"', 1)
+
+
+def sided(mesh):
+    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
+
+
+BODIES = {
+    "line": lambda: lp.interval(0.0, 1.0, 10),
+    "triangle": lambda: sided(MeshTri().refined(2)),
+    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 3)),
+    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
+    "hexahedron": lambda: sided(MeshHex().refined(1)),
+}
+"""Kind of cell -> a body of size one in each direction, with a boundary on its left."""

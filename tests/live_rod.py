@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 import livepde as lp
-from livepde.result import layout_of
+from livepde.frames import layout_of
 from livepde.runs.feeds import Gathered
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import Live

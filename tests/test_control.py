@@ -241,74 +241,70 @@ def test_a_mesh_of_few_cells_is_reduced_to_itself():
     assert small.error({"a": 0.9}, h=0.05)["middle"] < 1e-3
 
 
+def kalman(**options: Any) -> ct.Kalman:
+    return ct.Kalman(reduced(modes=1), **{"period": PERIOD, "drive": {}, **options})
+
+
+def reduction(**options: Any) -> ct.ReducedModel:
+    return ct.reduce(rod(), OUTPUTS, **{"controls": ["heater"], **options})
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (lambda: reduction(controls=["heater", "heater"]), "each once"),
+        (lambda: reduction(controls="heater"), r"controls='heater'.*give a list"),
+        (lambda: reduction(controls=["valve"]), r"controls=\['valve'\]; the channels"),
+        (lambda: reduction(inputs={"wind": 1.0}), "inputs names 'wind'"),
+        (lambda: reduction(inputs={"room": np.nan}), r"inputs\['room'\] must be a finite number"),
+        (lambda: reduction(modes=2.5), "modes must be a whole number"),
+        (lambda: reduction(rates=(-1.0,)), "rates must be positive"),
+        (lambda: reduction(u=np.nan), "u is not finite"),
+        (lambda: reduced().error({"c": 1.0}, h=PERIOD), r"q names 'c'; the unknown numbers are"),
+        (lambda: reduced().error(h=-1.0), "h must be positive"),
+        (lambda: replace(GOAL, inputs={"heater": (0.0, 1.0, 2.0)}), "least < largest"),
+        (lambda: replace(GOAL, inputs={"heater": (None, 1.0)}), "least < largest"),
+        (lambda: replace(GOAL, price={"heater": np.nan}), r"price\['heater'\] must be a number"),
+        (lambda: replace(GOAL, penalty=-1.0), "penalty must be at least 0"),
+        (lambda: replace(GOAL, track={"tip": "much"}), r"track\['tip'\] must be a positive number"),
+        (lambda: replace(GOAL, track=["tip"]), "track must be a mapping"),
+        (lambda: kalman(q={"c": 1.0}), "q names 'c'"),
+        (lambda: kalman(q={"k": -1.0}), r"q\['k'\] must be a number from 0 to inf"),
+        (lambda: kalman(period=0.0), "period must be a positive number"),
+        (lambda: kalman(drive={"heater": np.nan}), "deviation of 'heater' must be a number"),
+        (lambda: kalman(x=[1.0]), "x has shape"),
+        (lambda: ct.Trust(spread=np.nan), "Trust: spread must be"),
+        (lambda: ct.Trust(misfit=0.0), "Trust: misfit must be"),
+        (lambda: ct.Trust(patience=1.5), "Trust: patience must be"),
+        (lambda: ct.LQ(reduced(), replace(GOAL, track={"end": 1.0}), PERIOD), "track names 'end'"),
+        (
+            lambda: ct.LQ(reduced(), replace(GOAL, track={}, price={"heater": 1.0}), PERIOD),
+            "no positive weight",
+        ),
+        (
+            lambda: ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"valve": 1.0}),
+            "before names 'valve'",
+        ),
+    ],
+)
+def test_what_makes_no_sense_is_told(build, says):
+    with pytest.raises(lp.errors.ConfigurationError, match=says):
+        build()
+
+
 @pytest.mark.slow
-def test_names_that_do_not_exist_are_told():
-    with pytest.raises(lp.errors.ConfigurationError, match="each once"):
-        ct.reduce(rod(), OUTPUTS, ["heater", "heater"])
-    with pytest.raises(lp.errors.ConfigurationError, match="inputs names 'wind'"):
-        ct.reduce(rod(), OUTPUTS, ["heater"], inputs={"wind": 1.0})
-    with pytest.raises(
-        lp.errors.ConfigurationError, match="q names 'c'; the unknown numbers are \\['k'"
-    ):
-        reduced().error({"c": 1.0}, h=PERIOD)
-    with pytest.raises(lp.errors.ConfigurationError, match="h must be positive"):
-        reduced().error(h=-1.0)
-    with pytest.raises(lp.errors.ConfigurationError, match="q names 'c'"):
-        ct.Kalman(reduced(), PERIOD, drive={}, q={"c": 1.0})
-    with pytest.raises(lp.errors.ConfigurationError, match=r"controls='heater'.*give a list"):
-        ct.reduce(rod(), OUTPUTS, "heater")
-    with pytest.raises(lp.errors.ConfigurationError, match="before names 'valve'"):
-        ct.Loop(identifier(), ct.LQ(reduced(), GOAL, PERIOD), before={"valve": 1.0})
-    with pytest.raises(lp.errors.ConfigurationError, match="controls=\\['valve'\\]; the channels"):
-        ct.reduce(rod(), OUTPUTS, ["valve"])
-    with pytest.raises(lp.errors.ConfigurationError, match="track names 'end'"):
-        ct.LQ(reduced(), replace(GOAL, track={"end": 1.0}), PERIOD)
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"inputs": {"heater": (0.0, 1.0, 2.0)}}, "least < largest"),
-        ({"inputs": {"heater": 1.0}}, "least < largest"),
-        ({"price": {"heater": np.nan}}, "price\\['heater'\\] must be a number"),
-        ({"penalty": -1.0}, "penalty must be at least 0"),
-        ({"track": {"tip": "much"}}, "track\\['tip'\\] must be a positive number"),
-        ({"track": ["tip"]}, "track must be a mapping"),
-        ({"inputs": {"heater": (None, 1.0)}}, "least < largest"),
-    ],
-)
-def test_goals_that_make_no_sense_are_told(changes, says):
-    with pytest.raises(lp.errors.ConfigurationError, match=says):
-        replace(GOAL, **changes)
-
-
+@needs_mpc
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"modes": 2.5}, "modes must be a whole number"),
-        ({"rates": (-1.0,)}, "rates must be positive"),
-        ({"u": np.nan}, "u is not finite"),
-        ({"inputs": {"room": np.nan}}, r"inputs\['room'\] must be a finite number"),
-    ],
-)
-def test_numbers_of_a_reduction_that_make_no_sense_are_told(options, says):
-    with pytest.raises(lp.errors.ConfigurationError, match=says):
-        ct.reduce(rod(), OUTPUTS, ["heater"], **options)
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"q": {"k": -1.0}}, r"q\['k'\] must be a number from 0 to inf"),
+        ({"horizon": 2.5}, "horizon must be a whole number"),
+        ({"kappa": np.inf}, "kappa must be a number"),
         ({"period": 0.0}, "period must be a positive number"),
-        ({"drive": {"heater": np.nan}}, "deviation of 'heater' must be a number"),
-        ({"offset": {"heater": -1.0}}, "deviation of 'heater' must be a number"),
-        ({"x": [1.0]}, "x has shape"),
     ],
 )
-def test_numbers_of_the_filter_that_make_no_sense_are_told(options, says):
+def test_settings_of_mpc_that_make_no_sense_are_told(options, says):
     with pytest.raises(lp.errors.ConfigurationError, match=says):
-        ct.Kalman(reduced(modes=1), **{"period": PERIOD, "drive": {}, **options})
+        ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
 
 
 # --- filter --------------------------------------------------------------------------------------
@@ -489,12 +485,6 @@ def test_a_control_does_the_work_of_another_that_is_at_its_end():
     np.testing.assert_allclose(step(x, np.array([*v, ROOM])), x, rtol=1e-6)
 
 
-def test_prices_alone_are_not_for_the_linear_quadratic_controller():
-    priced = replace(GOAL, track={}, price={"heater": 1.0})
-    with pytest.raises(lp.errors.ConfigurationError, match="no positive weight"):
-        ct.LQ(reduced(modes=1), priced, PERIOD)
-
-
 @pytest.mark.slow
 @needs_mpc
 def test_the_predictive_controller_is_optimal_where_nothing_binds():
@@ -556,22 +546,6 @@ def test_scenarios_are_deviations_of_what_is_gaussian():
     for k in 20.0 * np.exp([0.0, 1.2, -1.2]):
         expected = model.matrices(np.array([k]), PERIOD).A.ravel("F")
         assert np.abs(rows - expected).max(axis=1).min() < 1e-9
-
-
-@pytest.mark.slow
-@needs_mpc
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"horizon": 0}, "horizon must be a whole number"),
-        ({"horizon": 2.5}, "horizon must be a whole number"),
-        ({"kappa": np.inf}, "kappa must be a number"),
-        ({"period": 0.0}, "period must be a positive number"),
-    ],
-)
-def test_settings_of_the_controller_that_make_no_sense_are_told(options, says):
-    with pytest.raises(lp.errors.ConfigurationError, match=says):
-        ct.MPC(reduced(modes=2), GOAL, **{"period": PERIOD, **options})
 
 
 @pytest.mark.slow
@@ -650,14 +624,6 @@ def test_what_may_be_negative_is_measured_by_its_prior():
     for std, doubt in ((0.1, ""), (0.4, "s = 0.01 is known to 0.4 only")):
         estimate = told(q=np.array([0.01]), q_std=np.array([std]))
         assert ct.Trust().doubt(estimate, small) == doubt
-
-
-@pytest.mark.parametrize(
-    "levels", [{"spread": np.nan}, {"misfit": 0.0}, {"patience": 0}, {"patience": 1.5}]
-)
-def test_levels_of_trust_that_make_no_sense_are_told(levels):
-    with pytest.raises(lp.errors.ConfigurationError, match=f"Trust: {next(iter(levels))} must be"):
-        ct.Trust(**levels)
 
 
 @pytest.mark.slow

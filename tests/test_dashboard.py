@@ -20,17 +20,18 @@ import numpy as np
 import pytest
 import xarray as xr
 from browser import chromium, count, text, wait
+from factories import BODIES
 from patience import PATIENCE
-from skfem import MeshHex, MeshTri
+from skfem import MeshTri
 from typer.testing import CliRunner
 
 import livepde as lp
 from livepde import cli, runs
-from livepde.dashboard import canvas, cards, cuts, field_views, panels, serve
+from livepde.dashboard import canvas, cards, field_views, panels, serve
 from livepde.dashboard import view as views
 from livepde.dashboard.view import Spread, View
+from livepde.frames import layout_of
 from livepde.models import heat
-from livepde.result import layout_of
 from livepde.runs import JOURNAL, Journal, RunWriter, drive, journal_of
 from livepde.runs.database import checksum
 from livepde.runs.journal import Event
@@ -39,21 +40,8 @@ from livepde.runs.web import Address
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
 
 
-def sided(mesh):
-    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
-
-
-MESHES = {
-    "line": lambda: lp.interval(0.0, 1.0, 10),
-    "triangle": lambda: sided(MeshTri().refined(2)),
-    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 3)),
-    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (3, 2, 2)),
-    "hexahedron": lambda: sided(MeshHex().refined(1)),
-}
-
-
 def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Identifier:
-    mesh = MESHES[kind]()
+    mesh = BODIES[kind]()
     alpha = lp.Scalar(lp.LogNormal(0.1, 0.05), unit="m^2/s")
     if field:
         alpha = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(0.1), unit="m^2/s")
@@ -100,7 +88,7 @@ def dataset(kind: str = "line", count: int = 6, **options):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", BODIES)
 @pytest.mark.parametrize("field", [False, True])
 def test_every_kind_of_run_has_its_panels(kind, field):
     data = dataset(kind, field=field)
@@ -197,7 +185,7 @@ def test_names_from_files_are_text_in_figures():
 @pytest.mark.parametrize("kind", ["triangle", "quad"])
 def test_a_map_is_exact_for_what_is_linear(kind):
     data = dataset(kind, count=1)
-    found = cuts.plane_map(data)
+    found = field_views.plane_map(data)
     values = found.of(2.0 * data["x"].values - 3.0 * data["y"].values)
     assert found.inside.all()
     assert np.allclose(values, 2.0 * found.x - 3.0 * found.y[:, None])
@@ -218,7 +206,7 @@ def test_a_hole_stays_open():
         {"triangle": (("cell", "corner"), mesh.t.T[outside])},
         {axis: ("vertex", mesh.p[k]) for k, axis in enumerate("xy")},
     )
-    found = cuts.plane_map(data)
+    found = field_views.plane_map(data)
     x, y = np.meshgrid(found.x, found.y)
     hole = (abs(x - 1.5) < 0.4) & (abs(y - 1.5) < 0.4)
     values = found.of(np.ones(mesh.nvertices))
@@ -240,9 +228,9 @@ def test_cuts_of_a_cube_are_whole_and_exact(kind, share):
         return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
 
     values = linear(*(data[axis].values for axis in "xyz"))
-    parts = cuts.slices(data, share)
+    parts = field_views.slices(data, share)
     assert [area(part) for part in parts] == pytest.approx([1.0, 1.0, 1.0])
-    assert area(cuts.boundary(data)) == pytest.approx(6.0)
+    assert area(field_views.boundary(data)) == pytest.approx(6.0)
     for axis, part in enumerate(parts):
         assert np.allclose(part.points[:, axis], share)
         assert np.allclose(part.of(values), linear(*part.points.T))
@@ -581,7 +569,7 @@ def several(tmp_path):
 
 @pytest.mark.slow
 def test_many_runs_are_a_table(several):
-    from livepde.dashboard.overview import PerRun, overview_table
+    from livepde.dashboard.page import PerRun, overview_table
 
     views = PerRun(several, "", 10, lambda name: View(several / name))
     for _ in range(2):

@@ -11,7 +11,7 @@ from skfem import ElementHex1, ElementLineHermite, ElementQuadBFS, ElementTriP2,
 import livepde as lp
 from experiments import dimensions
 from livepde.fem import Moment, box, quadratic, smooth
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 
 @pytest.fixture(scope="module", params=["discrete", "analytic"])

@@ -21,7 +21,6 @@ from skfem import ElementLineP1, MeshTri
 from typer.testing import CliRunner
 
 import livepde as lp
-from benchmarks import fmu
 from benchmarks.__main__ import app as benchmarks
 from benchmarks.fmu import compare_fmu, running
 from livepde.cases import load
@@ -31,9 +30,8 @@ from livepde.exchange import (
     export_fmu,
     river_regressor,
 )
-from livepde.exchange.component import Component
-from livepde.exchange.recipe import recipe_of
-from livepde.exchange.unit_process import REFUSED, WAITING, of_code
+from livepde.exchange.fmu_export import recipe_of
+from livepde.exchange.unit_process import REFUSED, WAITING, Component, of_code
 from livepde.models import heat
 from livepde.units import in_si
 
@@ -113,20 +111,6 @@ def test_the_unit_compares_with_its_case(rod, unit):
     assert found.samples == 61
     assert set(found.differences) == {*OUTPUTS, "T_30_model", "estimate_time"}
     assert found.largest <= 1e-10
-
-
-@pytest.mark.long
-def test_the_comparison_shows_how_far_it_is(rod, unit, monkeypatch):
-    bars = {}
-
-    def watched(rows, total, what):
-        for bars[what], row in enumerate(rows, start=1):
-            assert total == 61
-            yield row
-
-    monkeypatch.setattr(fmu, "watched", watched)
-    assert compare_fmu(unit, load(rod), progress=True).samples == 61
-    assert bars == {"in Python": 61, "in the unit": 61}
 
 
 @pytest.mark.long

@@ -16,44 +16,30 @@ import pandas as pd
 import pytest
 import xarray as xr
 from commands import call
+from factories import BODIES
 from meshio.xdmf import TimeSeriesReader
 from scipy.io import netcdf_file
 from selenium import webdriver
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.wait import WebDriverWait
-from skfem import MeshHex, MeshTri
 
 import livepde as lp
 from livepde import runs
 from livepde.dashboard.html_report import write_report
 from livepde.errors import ConfigurationError, LivepdeError, RunError
+from livepde.frames import layout_of
 from livepde.models import heat
 from livepde.plots import interval_95
-from livepde.result import layout_of
 from livepde.runs import Check, RunWriter, drive, tables
-from livepde.runs.conventions import cf, udunits
-from livepde.runs.exported import export
+from livepde.runs.exported import cf, export, udunits
 from livepde.runs.journal import Event, Journal
 
 ORIGIN = "2025-04-01 06:00:00"
 SAMPLES = 6
 
 
-def unit_mesh(mesh):
-    return mesh.with_boundaries({"left": lambda p: np.isclose(p[0], 0.0)})
-
-
-MESHES = {
-    "line": lambda: lp.interval(0.0, 1.0, 4),
-    "triangle": lambda: unit_mesh(MeshTri().refined(2)),
-    "quad": lambda: lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 2)),
-    "tetra": lambda: lp.fem.box((0.0, 1.0), (0.0, 1.0), (0.0, 1.0), (2, 1, 1)),
-    "hexahedron": lambda: unit_mesh(MeshHex().refined(1)),
-}
-
-
 def identifier(kind: str = "line", field: bool = False) -> lp.Identifier:
-    mesh = MESHES[kind]()
+    mesh = BODIES[kind]()
     halves = {"near side": lambda x: x[0] < 0.5, "far": lambda x: x[0] >= 0.5}
     alpha = lp.Piecewise(halves, lp.LogNormal(0.1, 0.05), unit="m^2/s")
     if field:
@@ -241,7 +227,7 @@ def test_fields_are_bound_to_places_on_disk(rod, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", [kind for kind in MESHES if kind != "line"])
+@pytest.mark.parametrize("kind", [kind for kind in BODIES if kind != "line"])
 def test_a_mesh_after_ugrid(tmp_path, kind):
     export(made(tmp_path / "run", kind), tmp_path / "run.nc")
     with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as found:
@@ -299,17 +285,11 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
     assert np.array_equal(columns["loss [s-1]"], data["loss"])
 
 
-@pytest.mark.slow
-def test_a_table_without_dates(tmp_path):
-    export(made(tmp_path / "rod"), tmp_path / "rod.csv")
-    assert pd.read_csv(tmp_path / "rod.csv").columns[0] == "time [s]"
-
-
 # --- fields on their mesh --------------------------------------------------------------------
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", BODIES)
 def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -339,7 +319,7 @@ def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("ending", [".vtu", ".vtk"])
-@pytest.mark.parametrize("kind", MESHES)
+@pytest.mark.parametrize("kind", BODIES)
 def test_vtk_holds_one_time(tmp_path, kind, ending):
     run = made(tmp_path / "run", kind)
     export(run, tmp_path / f"last{ending}")
@@ -625,12 +605,6 @@ def test_a_browser_draws_a_report_and_asks_nobody(tmp_path, browser, kind):
 
 
 # --- the command -----------------------------------------------------------------------------
-
-
-def test_help_teaches():
-    code, output = call("export", "--help")
-    assert code == 0
-    assert "Example:" in output
 
 
 @pytest.mark.slow

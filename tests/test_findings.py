@@ -287,10 +287,10 @@ RUNS = {
     "assess: changed": Pair(partial(disturbed, 0.5), partial(disturbed, 1.0)),
     "assess: refused": Pair(partial(rod, "spikes"), rod),
     "assess: prior": Pair(partial(rod, "far from the prior"), rod),
-    "channel_ledgers: input": Pair(partial(fed, gaps=True), fed),
-    "channel_ledgers: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
-    "shifts: hold": Pair(partial(fed, between="next"), fed),
-    "shifts: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
+    "ledger: input": Pair(partial(fed, gaps=True), fed),
+    "ledger: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
+    "findings: hold": Pair(partial(fed, between="next"), fed),
+    "findings: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
     "findings: effect": Pair(partial(ended, 0.08), ended),
     "findings: bound": Pair(partial(warned_of, NARROW), partial(warned_of, ONE)),
     "findings: flat": Pair(partial(warned_of, BESIDE), partial(warned_of, ONE)),
@@ -335,7 +335,7 @@ LONG = {
     "run_verdict: jump",
     "run_verdict: misfit",
     "run_verdict: pause",
-    "shifts: discretisation",
+    "findings: discretisation",
     "verdict: step",
 }
 EACH = [pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in RUNS]

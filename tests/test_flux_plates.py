@@ -18,8 +18,7 @@ from livepde.errors import CaseError, ObservationError
 from livepde.fem import Inputs, Moment
 from livepde.models import conduction
 from livepde.observation import Combined, FluxPlates
-from livepde.runs.summary import tables
-from livepde.runs.thermal_resistance import LAYERS, SURFACES, resistance
+from livepde.runs.summary import LAYERS, SURFACES, resistance, tables
 
 REPORTS = Path(__file__).parent / "reports"
 NOW = Moment(0.0, Inputs())

@@ -52,7 +52,6 @@ def frozen(ident):
     [
         ((0.1, [1.0, 2.0, 3.0], {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "needs"),
         ((0.1, "warm", {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "number"),
-        ((0.1, [[1.0], [2.0, 3.0]], {"heat": 1.0, "T_end": 0.0}), lp.errors.SampleError, "number"),
         (
             (0.1, [1.0, np.inf], {"heat": 1.0, "T_end": 0.0}),
             lp.errors.SampleError,
@@ -60,7 +59,6 @@ def frozen(ident):
         ),
         ((*sample(a="warm"),), lp.errors.SampleError, "channel 'a': got 'warm'"),
         ((*sample(a=True),), lp.errors.SampleError, "channel 'a'"),
-        ((*sample(a=object()),), lp.errors.SampleError, "channel 'a'"),
         ((*sample(heat=np.inf),), lp.errors.SampleError, "heat"),
         ((*sample(d=1.0),), lp.errors.SampleError, "unknown channel 'd'"),
         ((0.1, [1.0, 2.0], {"cold": 1.0}), lp.errors.SampleError, "unknown input 'cold'"),
@@ -326,12 +324,6 @@ def test_a_table_of_a_result():
     errors = result.to_xarray()["innovation"].sel(sensor="a").values
     assert table["innovation:a"]["rmse"] == pytest.approx(np.sqrt(np.mean(errors**2)))
     assert table["withheld_error:c"]["count"] == 20
-
-
-@pytest.mark.long
-def test_a_result_can_be_drawn():
-    figure = identifier().run(stream()).plot()
-    assert figure.axes
 
 
 def test_a_field_in_the_plane():

@@ -6,7 +6,6 @@ import csv
 import itertools
 import json
 import os
-import pickle
 import shutil
 import sqlite3
 import subprocess
@@ -695,27 +694,19 @@ HOSTILE = [
     "UPDATE meta SET value = '[' || replace(hex(zeroblob(50000)), '00', '[')",
     "UPDATE meta SET value = replace(hex(zeroblob(50000)), '00', '[') WHERE key = 'layout'",
     "UPDATE meta SET value = '{}' WHERE key = 'layout'",
-    "UPDATE meta SET value = '7' WHERE key = 'channels'",
     "UPDATE meta SET value = '[\"a\"]' WHERE key = 'channels'",
     "UPDATE meta SET value = replace(value, '\"a\"', '3') WHERE key = 'layout'",
     "UPDATE meta SET value = x'ff00' WHERE key = 'layout'",
     "UPDATE samples SET t = 'late'",
     "UPDATE samples SET channels = x'00'",
-    "UPDATE samples SET channels = 'text'",
     "UPDATE samples SET channels = zeroblob(80000000) WHERE id = 1",
     "UPDATE estimates SET numbers = x'0011'",
-    "UPDATE estimates SET numbers = zeroblob(8)",
-    "UPDATE estimates SET numbers = 5",
-    "UPDATE estimates SET notes = '[1]'",
     'UPDATE estimates SET notes = \'{"a": "b"}\'',
     "UPDATE estimates SET notes = '{\"a\": ' || hex(zeroblob(3000)) || '}'",
     "UPDATE estimates SET notes = replace(hex(zeroblob(50000)), '00', '[')",
-    "UPDATE estimates SET t = 'x'",
     "UPDATE estimates SET status = 99",
-    "UPDATE estimates SET status = 'ok'",
     "UPDATE estimates SET steps = x'ff'",
     "UPDATE fields SET content = x''",
-    "UPDATE fields SET content = 'text'",
     "UPDATE fields SET content = '{}' || x'00'",
     'UPDATE fields SET content = CAST(\'{"told": {}, "profiles": {"u": -1}}\' AS BLOB) || x\'00\'',
     'UPDATE fields SET content = CAST(\'{"told":{},"profiles":{"u":1e99}}\' AS BLOB) || x\'00\'',
@@ -773,17 +764,9 @@ def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
         refused(path)
 
 
-class Evil:
-    """What a pickle could do."""
-
-    def __reduce__(self):
-        return os.system, ("touch evil",)
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["pickle", "text", "complex", "shape"])
-def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kind):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("kind", ["text", "complex", "shape"])
+def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, kind):
     path = finished(tmp_path)
     good = identifier()
     good.step(0.0, {"a": 1.0, "b": 1.0, "left": 1.0})
@@ -793,15 +776,14 @@ def test_a_checkpoint_made_to_do_harm_is_one_sentence(tmp_path, monkeypatch, kin
         "complex": {**leaves, "z": leaves["z"].astype(complex)},
         "shape": {**leaves, "z": np.zeros((2, 2))},
     }
-    state = pickle.dumps(Evil()) if kind == "pickle" else checkpoint.packed(header, other[kind])
     with sqlite3.connect(path) as raw:
+        state = checkpoint.packed(header, other[kind])
         raw.execute("UPDATE checkpoints SET state = ?", (state,))
     raw.close()
     signed(path)
     with pytest.raises(lp.errors.RunError) as caught:
         reads(path)
     assert "\n" not in str(caught.value)
-    assert not (tmp_path / "evil").exists()
 
 
 # --- readers -------------------------------------------------------------------------------------
@@ -1067,14 +1049,6 @@ def test_a_record_that_cannot_be_written_is_one_sentence(tmp_path, monkeypatch):
     (path / "run.json.0.partial").mkdir()
     with pytest.raises(lp.errors.RunError, match="cannot be written: File exists; free disk space"):
         RunWriter.reopen(path, command=["x"], settings=(), **options)
-
-
-@pytest.mark.process
-def test_an_error_has_an_exit_code(tmp_path):
-    command = [sys.executable, "-m", "livepde", "report", str(tmp_path)]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE)
-    assert found.returncode == 2
-    assert found.stderr.startswith("Error: ")
 
 
 def test_an_error_while_a_journal_is_opened_is_told_once(tmp_path, monkeypatch):

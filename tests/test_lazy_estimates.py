@@ -10,12 +10,12 @@ import pytest
 
 import livepde as lp
 from livepde.checkpoint import flatten
+from livepde.frames import interval_ends
 from livepde.laws import Belief
 from livepde.laws.filter_state import FilterState
 from livepde.models import heat
 from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import Record, RecordArrays, Snapshot
-from livepde.result import interval_ends
 
 
 def rod(unknown=None, law=None, withheld=None, cells=30):
@@ -154,58 +154,33 @@ def test_arrays_give_back_the_records_that_they_took():
     profile = {"u": rng.normal(size=4), "u_std": rng.normal(size=4)}
     plain = Snapshot(profile, {})
     whole = Snapshot(profile, {"q": (1.5, 3)}, rng.normal(size=(2, 2)))
-    nothing = np.zeros(0)
+
+    def record(t, status, steps, notes, snapshot=None):
+        numbers, innovation = rng.normal(size=3), rng.normal(size=2)
+        return Record(
+            t=t,
+            numbers=numbers,
+            innovation=innovation,
+            withheld_error=np.zeros(0),
+            status=status,
+            steps=steps,
+            notes=notes,
+            snapshot=snapshot,
+        )
+
     given = [
-        Record(
-            t=0.5,
-            numbers=rng.normal(size=3),
-            innovation=rng.normal(size=2),
-            withheld_error=nothing,
-            status=0,
-            steps=1,
-            notes={"a": 1.0},
-            snapshot=plain,
-        ),
-        Record(
-            t=1.0,
-            numbers=rng.normal(size=3),
-            innovation=rng.normal(size=2),
-            withheld_error=nothing,
-            status=4,
-            steps=2,
-            notes={},
-        ),
-        Record(
-            t=1.5,
-            numbers=rng.normal(size=3),
-            innovation=rng.normal(size=2),
-            withheld_error=nothing,
-            status=1,
-            steps=0,
-            notes={"b": 2.0},
-            snapshot=whole,
-        ),
-        Record(
-            t=2.0,
-            numbers=rng.normal(size=3),
-            innovation=rng.normal(size=2),
-            withheld_error=nothing,
-            status=0,
-            steps=9,
-            notes={"b": 3.0, "a": 4.0},
-        ),
+        record(0.5, 0, 1, {"a": 1.0}, plain),
+        record(1.0, 4, 2, {}),
+        record(1.5, 1, 0, {"b": 2.0}, whole),
+        record(2.0, 0, 9, {"b": 3.0, "a": 4.0}),
     ]
     kept = RecordArrays.of(given)
     assert RecordArrays.of(kept) is kept
     assert (len(kept), kept.last_snapshot, list(kept.notes)) == (4, 2, ["a", "b"])
     np.testing.assert_array_equal(kept.notes["a"], [1.0, np.nan, np.nan, 4.0])
     for one, other in zip(kept, given, strict=True):
-        assert (one.t, one.status, one.steps, one.notes) == (
-            other.t,
-            other.status,
-            other.steps,
-            other.notes,
-        )
+        for name in ("t", "status", "steps", "notes"):
+            assert getattr(one, name) == getattr(other, name)
         np.testing.assert_array_equal(one.numbers, other.numbers)
         np.testing.assert_array_equal(one.innovation, other.innovation)
         assert one.withheld_error.shape == (0,)

@@ -23,7 +23,7 @@ from livepde.verdict import (
     Verdict,
     discretised,
 )
-from livepde.verdict.averaged import NU, TEMPER, Causes, Family, LinearModel, averaged
+from livepde.verdict.evidence import NU, TEMPER, Causes, Family, LinearModel, averaged
 
 # --- the average --------------------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import livepde as lp
 from livepde import cases
 from livepde.fem import cells
 from livepde.model import Model
-from livepde.plots.dataset import note
+from livepde.plots.style import note
 from livepde.records import FIELD_ENDS, NUMBER_ENDS, STATE_ENDS, Layout
 from livepde.runs.summary import measures, tables
 

@@ -15,7 +15,7 @@ import livepde as lp
 from experiments import degenerate
 from livepde.laws.coupled.equation import StageForms
 from livepde.laws.damping import diffusion_operator
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import Advance, ImplicitEuler
 
 

@@ -11,7 +11,7 @@ import livepde as lp
 from livepde import progress
 from livepde.reproduce import EXPERIMENTS, Experiment, seed, seed_excited
 from livepde.reproduce.experiment import track
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.streams import RelativeNoise, Twin
 
 pytestmark = pytest.mark.study

@@ -15,8 +15,7 @@ import pytest
 
 import livepde
 from livepde.verdict.assess import _words
-from livepde.verdict.directions import ScoreDirection
-from livepde.verdict.missing_terms import FIXED
+from livepde.verdict.directions import FIXED, ScoreDirection
 from livepde.verdict.sentences import FINDINGS, LIKELY, Sentence
 
 SOURCE = Path(livepde.__file__).parent

@@ -1,4 +1,4 @@
-"""Where estimates and logs go, and what happens when they cannot."""
+"""Where estimates and logs go, what happens when they cannot, and what reaches standard error."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from live_rod import live, rows
 from patience import PATIENCE
 
-from livepde.runs.standard_streams import JsonLinesSink, configure
+from livepde.runs.monitor import JsonLinesSink, configure
 from livepde.streams.sources import Rows
 
 
@@ -47,7 +47,7 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from live_rod import live, rows
-from livepde.runs.standard_streams import JsonLinesSink
+from livepde.runs.monitor import JsonLinesSink
 from livepde.streams.sources import Rows
 run = live(Path(sys.argv[1]), Rows(rows(30)), sinks=[JsonLinesSink(sys.stdout)])
 run.run()
@@ -113,3 +113,45 @@ def test_a_log_as_text(capsys, logs):
     logging.getLogger("livepde.run").info("not said")
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("WARNING nothing from the source")
+
+
+PROGRAM = """
+import logging, sys, warnings
+import numpy as np, typer
+from livepde.cli.program import main
+from livepde.runs.monitor import configure
+
+program = typer.Typer()
+
+@program.command()
+def command(live: bool = False):
+    if live:
+        configure()
+    np.array([1000.0]) / np.array([0.0])
+    warnings.warn("two\\n  lines", UserWarning)
+    try:
+        raise ValueError("the page\\nfails")
+    except ValueError:
+        logging.getLogger("dash.dash").exception("Exception on %s", "/_dash-update-component")
+    logging.getLogger("livepde.run").warning("an event")
+
+sys.exit(main(program))
+"""
+LINES = [
+    "<string> warns: divide by zero encountered in divide (RuntimeWarning)",
+    "<string> warns: two lines (UserWarning)",
+    "dash.dash: Exception on /_dash-update-component: ValueError: the page",
+    "an event",
+]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("live", [False, True])
+def test_warnings_and_exceptions_of_libraries_are_one_line_each(live: bool) -> None:
+    command = [sys.executable, "-W", "default", "-c", PROGRAM, *(["--live"] if live else [])]
+    found = subprocess.run(
+        command, capture_output=True, text=True, timeout=PATIENCE, check=True
+    ).stderr.splitlines()
+    if live:  # after date, time and level
+        found = [line.split(" ", 3)[3] for line in found]
+    assert found == LINES

@@ -11,7 +11,7 @@ from scipy.stats import spearmanr
 from benchmarks.census.faults import FAULTS
 from benchmarks.census.trace import VISIBLE
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 if TYPE_CHECKING:
     from benchmarks.census.run import Score

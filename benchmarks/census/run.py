@@ -17,7 +17,7 @@ from benchmarks.census.trace import trace
 from benchmarks.honest.problem import Problem
 from benchmarks.honest.problems import PROBLEMS as TRUTHS
 from benchmarks.jobs import each
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.verdict import Finding, Verdict
 
 PROBLEMS = ("rod", "column", "wall", "profile", "plate", "flux", "warm-rod", "borehole")

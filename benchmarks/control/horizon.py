@@ -13,7 +13,7 @@ from benchmarks.control.problem import Problem
 from benchmarks.control.runs import nominal
 from livepde.checkpoint import packed, unpacked
 from livepde.control import Known, ReducedModel
-from livepde.control.mpc import packages, quiet
+from livepde.control.controllers import packages, quiet
 from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed

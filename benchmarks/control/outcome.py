@@ -20,7 +20,7 @@ from benchmarks.control.wall import wall
 from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 OF_TRUE = 1.10  # cost over that of the true model, after the jump has been learned
 OF_FIXED = 0.70  # cost over that of the wrong fixed model, then

@@ -13,7 +13,7 @@ from benchmarks.honest.noise import KINDS
 from benchmarks.honest.problems import PROBLEMS
 from benchmarks.honest.twin import SHARES, Run
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 Array = NDArray[Any]
 Found: TypeAlias = Mapping[tuple[str, str], Sequence[Run]]

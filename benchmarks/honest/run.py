@@ -10,7 +10,7 @@ from benchmarks.honest.problems import PROBLEMS
 from benchmarks.honest.report import outcome
 from benchmarks.honest.twin import twins
 from benchmarks.jobs import each
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 QUICK = ("rod", "flux", "column", "borehole")
 """Problems of the quick run."""

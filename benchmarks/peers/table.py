@@ -30,7 +30,7 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import LivepdeError
 from livepde.laws import SensitivityLaw
 from livepde.progress import watched
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 PROBLEMS: Mapping[str, Problem] = {
     **{problem.name: problem for problem in (ROD, ROD_SOURCE)},

@@ -10,7 +10,7 @@ from benchmarks.refit.jumps import AT, JumpTrial
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.trial import Trial
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 MEDIAN_PASSES = 9.0
 LEVEL = 0.9  # share of the fits whose passes are bounded, and that outliers must not move

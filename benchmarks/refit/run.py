@@ -10,7 +10,7 @@ from benchmarks.refit.jumps import JumpTrial, jump_trials
 from benchmarks.refit.problems import PROBLEMS
 from benchmarks.refit.report import outcome
 from benchmarks.refit.trial import Trial, trial
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 JUMPS = "jumps"
 PARTS = (*PROBLEMS, JUMPS)

@@ -11,7 +11,7 @@ from importlib import import_module
 
 from benchmarks.jobs import each
 from livepde.diagnostics.check_report import Check
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 __all__ = ["PARTS", "silent"]
 

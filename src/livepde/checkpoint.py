@@ -128,10 +128,7 @@ def packed(header: Mapping[str, Any], leaves: Mapping[str, Any]) -> bytes:
 def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Array]]:
     """Return header and leaves of a buffer; `where` names it in messages.
 
-    Raises
-    ------
-    RunError
-        It is no checkpoint, or damaged.
+    Raises `RunError`: it is no checkpoint, or damaged.
     """
     try:
         magic, length, digest = START.unpack_from(content)
@@ -155,7 +152,6 @@ def unpacked(content: bytes, where: str) -> tuple[dict[str, Any], dict[str, Arra
 
 
 def _digest(*parts: Any) -> bytes:
-    """Return the checksum of buffers, one after the other."""
     found = hashlib.blake2b(digest_size=DIGEST)
     for part in parts:
         found.update(part)

@@ -1,27 +1,35 @@
-"""Results of a run as tables of pandas, as a dataset with axes, and as draws."""
+"""Results of a run as tables of pandas, as a dataset with axes, and as draws; their names."""
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from livepde.dates import instants
 from livepde.errors import LawError
-from livepde.fem import FunctionSpace
+from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
 from livepde.laws import Belief
 from livepde.linalg import Array
+from livepde.model import Model
+from livepde.observation import Observed
+from livepde.readout import unknown_of
 from livepde.records import (
     DATE,
     ESTIMATES,
     PARAMETER,
     STATISTIC,
     STATUS_CODES,
+    Layout,
+    Snapshot,
     field_names,
     interval_95,
+    refused_readings,
     scalars,
+    used_errors,
 )
 from livepde.verdict import ModelErrors
 
@@ -29,6 +37,8 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+MEDIAN = "the median"
+FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 STATISTICS = ("value", "std", "low", "high")
 ERRORS = (("innovation", "sensor"), ("withheld_error", "withheld"))
 
@@ -186,13 +196,9 @@ def predictive(
 ) -> dict[str, xr.Dataset]:
     """Return draws of readings and log densities: see `Result.to_inference_data`.
 
-    Parameters
-    ----------
-    measured
-        Readings, one column for each sensor.
-    expected, std
-        What they are for each draw, shape (n, samples, sensors), and their standard deviations
-        about it, shape (samples, sensors).
+    `measured`: readings, one column for each sensor.
+    `expected`, `std`: what they are for each draw, shape (n, samples, sensors), and their standard
+    deviations about it, shape (samples, sensors).
     """
     import xarray as xr
 
@@ -220,7 +226,162 @@ def predictive(
 
 
 def _factor(belief: Belief) -> Array:
-    """Return the square root of the covariance of the unknowns."""
     if belief.q_factor is None:
         raise LawError("this law has no covariance: use SensitivityLaw.")
     return belief.q_factor
+
+
+def layout_of(
+    model: Model, observed: Observed, withheld: Observed | None, ignored: Sequence[str] = ()
+) -> Layout:
+    """Return names, units and coordinates of the records of a run.
+
+    `ignored`: names of withheld sensors that never count.
+    """
+    numbers: dict[str, dict[str, Any]] = {}
+    for label in model.parameter_space.labels:
+        unknown = unknown_of(model.parameter_space, label)
+        unit: dict[str, Any] = {"units": unknown.unit}
+        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
+        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
+        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
+        numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
+        numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
+    comments: dict[str, str] = {}
+    for name, block in model.parameter_space.fields.items():
+        if not isinstance(block.field.prior, Normal):
+            comments |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
+    points = model.mesh.p[:, vertex_order(model)]
+    components = model.state_space.fields.items()
+    places = {**observed.places, **({} if withheld is None else withheld.places)}
+    units = {
+        name: unit
+        for one in (observed, withheld)
+        if one is not None
+        for name, unit in zip(one.names, one.units, strict=True)
+    }
+    stated = {unit for unit in units.values() if unit}
+    several = len(stated) > 1
+    return Layout(
+        time_unit=model.time_unit,
+        sensor_unit="" if several else "".join(stated),
+        coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
+        cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
+        sensors=list(observed.names),
+        withheld=None if withheld is None else list(withheld.names),
+        numbers=numbers,
+        units=_units(model),
+        scalars=list(model.parameter_space.labels),
+        fields=list(model.parameter_space.fields),
+        state=[key for name, block in components for key in block.variables(name)],
+        length_unit=model.length_unit,
+        places={name: at.tolist() for name, at in places.items()},
+        comments=comments,
+        attrs={"ignored": "\n".join(ignored)} if ignored else {},
+        sensor_units=units if several else {},
+    )
+
+
+def vertex_order(model: Model) -> Any:
+    """In which order vertices are kept: along an interval, else as the mesh has them."""
+    points = model.mesh.p
+    return np.argsort(points[0]) if len(points) == 1 else slice(None)
+
+
+def _units(model: Model) -> dict[str, str]:
+    unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
+    found = {name: unknown.unit for name, unknown in unknowns.items()}
+    for name, block in model.state_space.fields.items():
+        found |= dict.fromkeys(block.variables(name), found[name])
+    return found
+
+
+def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
+    """Return variables with the ends of 95 % intervals, if those are not mean +- 1.96 std."""
+    if unknown.prior.symmetric:
+        return {}
+    low, high = unknown.interval(values, std)
+    return {f"{name}_low": low, f"{name}_high": high}
+
+
+def _prior(unknown: Any) -> dict[str, float]:
+    """Return prior and finite bounds of a scalar unknown as attributes of its variable."""
+    bounds = zip(("lower_bound", "upper_bound"), unknown.prior.bounds, strict=True)
+    found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
+    if not unknown.evolution.moves:  # one that moves is never known better for good
+        found["prior_std"] = float(unknown.prior.std)
+    return found
+
+
+def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
+    """Return the table of a run's dataset: last estimates, and errors of each channel."""
+    rows: dict[str, dict[str, float]] = {}
+    for label in filter(None, data.attrs["scalars"].split("\n") if data.sizes["time"] else ()):
+        rows[label] = {
+            "value": float(data[label][-1]),
+            "std": float(data[f"{label}_std"][-1]),
+        }
+    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+        if variable not in data:
+            continue
+        columns = used_errors(data, variable, dimension).T
+        for name, column in zip(data[dimension].values, columns, strict=True):
+            errors = column[np.isfinite(column)]
+            rows[f"{variable}:{name}"] = {
+                "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
+                "count": float(len(errors)),
+            }
+    for name, which in refused_readings(data).items():
+        rows[f"innovation:{name}"]["refused"] = float(which.sum())
+    return rows
+
+
+def snapshot_of(model: Model, belief: Belief) -> Snapshot:
+    """Return the fields at the vertices."""
+    space, told, left_out = model.parameter_space, {}, {}
+    for name, field in space.fields.items():
+        left = belief.modes_left(space.part(name))
+        if len(left):
+            # A mode counts by the share of its prior variance that the data have taken away.
+            told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
+            left_out[name] = belief.left_out(field.at_vertices, space.part(name))
+    order, rows = vertex_order(model), [*space.labels.values()]
+    ordered = {name: values[order] for name, values in _profiles(model, belief).items()}
+    if belief.q_factor is None or len(rows) < 2:
+        return Snapshot(ordered, told, None, left_out)
+    return Snapshot(ordered, told, correlation_of(belief.q_factor[rows]), left_out)
+
+
+def _profiles(model: Model, belief: Belief) -> dict[str, Array]:
+    """Return values and standard deviations of all fields at the vertices."""
+    found: dict[str, Array] = {}
+    for name, block in model.state_space.fields.items():
+        part = model.state_space.part(name)
+        found |= _split(name, block, block.at_vertices @ belief.u[part])
+        if belief.u_factor is not None:
+            squares = (block.at_vertices @ belief.u_factor[part]) ** 2
+            found |= _split(name, block, np.sqrt(squares.sum(axis=1)), "_std")
+    for name, field in model.parameter_space.fields.items():
+        part = model.parameter_space.part(name)
+        found[name] = field.at_vertices @ belief.q[part]
+        std = belief.deviation(field.at_vertices, part)
+        if std is not None:
+            found[f"{name}_std"] = std
+            unknown = model.parameter_space.unknowns[name]
+            found |= interval_ends(name, unknown, found[name], std)
+    return found
+
+
+def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
+    """Return the variables of a component with their values at the vertices."""
+    names = block.variables(name)
+    rows = values.reshape(len(names), -1)
+    return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
+
+
+def correlation_of(rows: Array) -> Array:
+    """Return the correlation of numbers by a square root of their covariance, (..., numbers, r)."""
+    size = np.linalg.norm(rows, axis=-1)
+    unit = rows / np.where(size > 0.0, size, 1.0)[..., None]
+    correlation: Array = unit @ unit.swapaxes(-1, -2)
+    return correlation

@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 class Hindsight:
     """Record of the accepted samples of a run and its estimates, for smoothing.
 
-    Parameters
-    ----------
-    q0
-        Latent parameter before the first sample.
+    `q0`: latent parameter before the first sample.
     """
 
     def __init__(self, q0: Array) -> None:
@@ -38,12 +35,8 @@ class Hindsight:
     def add(self, estimate: Estimate, interval: Interval, q: Array) -> None:
         """Add a sample.
 
-        Parameters
-        ----------
-        interval
-            Interval since the last accepted sample.
-        q
-            Latent parameter after the sample.
+        `interval`: interval since the last accepted sample.
+        `q`: latent parameter after the sample.
         """
         taken = estimate.status.taken
         opens = taken and interval.t0 == interval.t1
@@ -86,7 +79,6 @@ class Hindsight:
     def _records(
         self, result: Result, problem: Problem, beliefs: Iterable[Belief]
     ) -> Iterator[Record]:
-        """Iterate over the records in reverse time order."""
         count = len(self._estimates)
         # Samples that were not taken have the belief of the last one that was.
         said = groupby(reversed(list(enumerate(self._estimates))), key=lambda item: item[1][0])
@@ -115,10 +107,7 @@ class Hindsight:
 class LinearReadings:
     """Readings of samples for draws of the unknowns, to first order.
 
-    Parameters
-    ----------
-    shifts
-        Latent coefficients of the draws minus those of the linearisation point, shape (n, m).
+    `shifts`: latent coefficients of the draws minus those of the linearisation point, shape (n, m).
     """
 
     def __init__(self, shifts: Array) -> None:
@@ -130,15 +119,10 @@ class LinearReadings:
     def add(self, predicted: Array, rows: Array, factor: Array, noise: Array) -> None:
         """Add a sample.
 
-        Parameters
-        ----------
-        predicted
-            Its readings at the linearisation point, shape (sensors,).
-        rows, factor
-            Joint square root of the covariance of readings and latent unknowns, shapes
-            (sensors, r) and (m, r).
-        noise
-            Standard deviation of each reading, shape (sensors,).
+        `predicted`: its readings at the linearisation point, shape (sensors,).
+        `rows`, `factor`: joint square root of the covariance of readings and latent unknowns,
+        shapes (sensors, r) and (m, r).
+        `noise`: standard deviation of each reading, shape (sensors,).
         """
         if not np.array_equal(factor, self._factor):  # of constant unknowns it stays the same
             inverse = np.linalg.pinv(factor)
@@ -163,10 +147,7 @@ class LinearReadings:
 def with_smoothed(data: xr.Dataset, smoothed: xr.Dataset) -> xr.Dataset:
     """Return the dataset of a run with added variables `k_smoothed` and `k_smoothed_std`.
 
-    Parameters
-    ----------
-    smoothed
-        Smoothed dataset of the same samples, as `Identifier.smoothed` returns it.
+    `smoothed`: smoothed dataset of the same samples, as `Identifier.smoothed` returns it.
     """
     attrs, found = data.attrs, {}
     own = {*attrs["scalars"].split("\n"), *attrs["fields"].split(), *attrs["state"].split()}

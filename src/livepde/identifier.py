@@ -216,10 +216,7 @@ class Identifier(Shown):
     def started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
         """Return an identifier of the same parts with another start; for `Fleet.identifier`.
 
-        Parameters
-        ----------
-        q0, u0, errors
-            Latent parameter, state and its own errors, shapes (m,), (n,) and (errors, n).
+        Latent parameter, state and its own errors have the shapes (m,), (n,) and (errors, n).
         """
         other = copy.copy(self)
         other._q0, other._u0 = q0, u0
@@ -230,15 +227,7 @@ class Identifier(Shown):
     def placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
         """Return an identifier of the same parts in another state; for `Fleet.identifier`.
 
-        Parameters
-        ----------
-        state
-            Of the law; None before the first sample.
-        ends
-            Time, measurements, inputs, their gaps and what verdicts count, as `Fleet.ends` has
-            them for one member.
-        samples
-            How many were taken.
+        `state` is None before the first sample; `ends` is that of one member in `Fleet.ends`.
         """
         other = copy.copy(self)
         other._state, other._samples = state, samples
@@ -303,7 +292,6 @@ class Identifier(Shown):
         self._inputs = self._known = inputs
 
     def _start(self, inputs: Inputs) -> Any:
-        """Return the state of the law at the initial time."""
         moment = Moment(self._t, inputs)
         if self.model.form_initial is not None:
             u0 = self.model.initial_state(self._q0, moment)
@@ -360,10 +348,9 @@ class Identifier(Shown):
         Returns
         -------
         estimate
-            The estimate after the sample. A step that fails numerically changes nothing and says so
-            in its `status`; the next sample tries again from the last good state. One with the
-            status "departed" takes the sample and holds the unknowns. Bad input raises and changes
-            nothing.
+            A step that fails numerically changes nothing and says so in its `status`; the next
+            sample tries again from the last good state. One with the status "departed" takes the
+            sample and holds the unknowns. Bad input raises and changes nothing.
 
         Raises
         ------
@@ -529,7 +516,6 @@ class Identifier(Shown):
         return belief
 
     def _belief(self) -> Belief:
-        """Return the belief of the law about the physical parameter."""
         return self.problem.physical(self.latent_belief())
 
     def _estimate(
@@ -554,7 +540,9 @@ class Identifier(Shown):
             predicted = self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
             error = withheld - predicted
             if scored and t >= self.assimilate_from:
-                variance = self._predicted_variance(belief, Moment(t, inputs))
+                # Of the predicted values, without the noise of the sensors.
+                rows = seen_rows(self.withheld, belief, Moment(t, inputs))
+                variance = np.zeros(len(error)) if rows is None else (rows * rows).sum(axis=1)
                 self._withheld = self._withheld.add(withheld, predicted, variance)
         return Estimate.deferred(
             read,
@@ -570,14 +558,6 @@ class Identifier(Shown):
             judge=self._judge(judge, lambda: report.diagnostics),
             fit=self.law.fit(self._work, self._state),
         )
-
-    def _predicted_variance(self, belief: Belief, moment: Moment) -> Array:
-        """Return the variance of the predicted values of withheld sensors, without their noise."""
-        rows = None if self.withheld is None else seen_rows(self.withheld, belief, moment)
-        if rows is None:
-            return np.zeros(self._withheld.last.shape)
-        found: Array = (rows * rows).sum(axis=1)
-        return found
 
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
@@ -802,7 +782,12 @@ class Identifier(Shown):
         begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
         result.readings = partial(self._channels.readings, taken)
-        for item in _watched(stream, progress, total):
+        if progress:
+            from livepde.progress import watched
+
+            size = total if total is not None else getattr(stream, "__len__", lambda: None)()
+            stream = watched(stream, size)
+        for item in stream:
             sample = sample_of(item)
             estimate = self.step(sample.t, sample.z, sample.inputs)
             if not len(result):
@@ -912,19 +897,9 @@ class Identifier(Shown):
     ) -> tuple[Array, Array]:
         """Return readings that draws of the unknowns lead to, and their standard deviation.
 
-        Linear about q: the samples are taken again from there, without their readings.
-
-        Parameters
-        ----------
-        noise
-            Of each sensor, shape (sensors,).
-        q, draws
-            Coefficients of constant unknowns, shapes (m,) and (n, m).
-
-        Returns
-        -------
-        readings, std
-            Shapes (n, samples, sensors) and (samples, sensors); NaN where a step fails.
+        Linear about q, shape (m,), for draws of shape (n, m): the samples are taken again from
+        there, without their readings. Shapes (n, samples, sensors) and (samples, sensors); NaN
+        where a step fails.
         """
         latent = self.model.latent
         centre = latent.inverse(q)
@@ -1073,12 +1048,3 @@ def _check_start(model: Model, t0: float, u0: Any, uncertain: Mapping[str, Any])
             raise ConfigurationError(f"{name} describes u0: give u0, too.")
     if u0 is not None and model.form_initial is not None:
         raise ConfigurationError("the model has its own initial state (initial=): leave out u0.")
-
-
-def _watched(stream: Iterable[Any], progress: bool, total: int | None) -> Iterable[Any]:
-    if not progress:
-        return stream
-    from livepde.progress import watched
-
-    size = total if total is not None else getattr(stream, "__len__", lambda: None)()
-    return watched(stream, size)

@@ -1,16 +1,21 @@
-"""Scalar unknowns of an estimate as one row: value, standard deviation, interval, share left."""
+"""Unknowns of an estimate: the marginal of one, and the numbers of all scalars as one row."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace, Normal
 from livepde.laws import Belief
 from livepde.linalg import Array
+from livepde.verdict import FLAT, Finding, at_bound, flat
 
 LEVEL = 0.95
 
@@ -93,3 +98,121 @@ def _ends(unknown: Any) -> Ends:
         return min(max(low, lower), upper), min(max(high, lower), upper)
 
     return clipped
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
+
+    Attributes
+    ----------
+    median
+        A number; of a field an array of coefficients.
+    deviation
+        Standard deviation to first order: that of the latent value times the slope of the transform
+        at the median. NaN for a law without covariance.
+    unknown
+        The unknown with its prior.
+    """
+
+    median: Any
+    deviation: Any
+    unknown: Any
+    _read: Callable[[ArrayLike], Marginal] | None = None
+
+    def at(self, points: ArrayLike) -> Marginal:
+        """Return the marginals of the values of a field at points.
+
+        Parameters
+        ----------
+        points
+            Coordinates of one or more points: on an interval a number or shape (points,), else
+            shape (d,) or (points, d).
+
+        Returns
+        -------
+        marginals
+            Its median, deviation, mean, std and intervals have a number for each point; of a vector
+            field a row of components.
+
+        Raises
+        ------
+        ConfigurationError
+            The unknown is a number, or the estimate was pickled.
+        ObservationError
+            A point outside of the mesh.
+
+        Examples
+        --------
+        >>> import livepde as lp
+        >>> from livepde.models import heat
+        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
+        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
+        >>> estimate = rod.step(0.1, [20.0])
+        >>> estimate["u"].at([0.25, 0.5]).mean.round(3)
+        array([20., 20.])
+        """
+        if self._read is None:
+            raise ConfigurationError("at: only a field has values at points; this is a number.")
+        return self._read(points)
+
+    @property
+    def mean(self) -> Any:
+        """Mean: the median of a `Normal`, larger than it for a `LogNormal`."""
+        return self._moments[0]
+
+    @property
+    def std(self) -> Any:
+        """Standard deviation: `deviation` of a `Normal`, larger for a `LogNormal`."""
+        return self._moments[1]
+
+    @cached_property
+    def _moments(self) -> tuple[Any, Any]:
+        mean, std = self.unknown.prior.moments(self.median, self.deviation)
+        return (float(mean), float(std)) if isinstance(self.median, float) else (mean, std)
+
+    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
+        """Return the ends of the central interval that holds it with probability `level`.
+
+        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
+        without covariance.
+        """
+        low, high = self.unknown.interval(self.median, self.deviation, level)
+        return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
+
+    def __str__(self) -> str:
+        """Return mean and standard deviation; under a transform median and 95 % interval."""
+        if not isinstance(self.median, float):
+            return repr(self)
+        if isinstance(self.unknown.prior, Normal):
+            return f"{self.mean:.4g} ± {self.std:.2g}"
+        low, high = self.interval()
+        return f"{self.median:.4g} (95 %: {low:.4g} to {high:.4g})"
+
+
+def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
+    """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
+    for label, row in space.labels.items():
+        unknown, value = unknown_of(space, label), float(belief.q[row])
+        lower, upper = map(float, unknown.prior.bounds)
+        if value in (lower, upper):
+            yield at_bound(label, value)
+        left = float(belief.left([row])[0])
+        if left > FLAT and not unknown.evolution.moves:
+            yield flat(label, left)
+
+
+def coordinates_of(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
+    """Return coordinates of points, shape (axes, points), and whether one point is meant."""
+    try:
+        given = np.asarray(points, dtype=float)
+    except (TypeError, ValueError):
+        given = np.zeros((0, 0, 0))
+    one = given.ndim == 0 or (given.ndim == 1 and axes > 1)
+    columns = given.reshape(-1, 1) if axes == 1 and given.ndim < 2 else np.atleast_2d(given)
+    if columns.ndim != 2 or columns.shape[1] != axes:
+        shapes = "(points,)" if axes == 1 else f"({axes},) or (points, {axes})"
+        raise ConfigurationError(
+            f"estimate['{name}'].at: got points {points!r:.60}; expected numbers, shape {shapes}."
+        )
+    return columns.T, one

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 
 NORMAL_95 = 1.959964  # half-width of a 95 % interval in standard deviations
 STATUS_CODES = ("ok", "not_converged", "not_finite", "singular", "departed")
+STATUS_FLAGS = {  # attributes of the variable that holds indices in these
+    "flag_values": list(range(len(STATUS_CODES))),
+    "flag_meanings": " ".join(STATUS_CODES),
+}
 
 NOTE = "note_"  # prefix of a note whose own name is taken
 SMOOTHED = "_smoothed"  # suffix of a variable estimated from all samples of a run
@@ -49,23 +53,15 @@ FIELD_ENDS = {
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """Fields at one time.
+    """Fields at one time."""
 
-    Attributes
-    ----------
-    profiles
-        Variable -> values at the vertices, in the order of `Layout.coordinates`.
-    told
-        Field -> number of modes that the data have determined, and number of all modes.
-    correlation
-        Correlation of the scalar unknowns, shape (unknowns, unknowns); None without covariance.
-    left_out
-        Field -> share of its mean variance in modes that the law leaves out.
-    """
-
+    # Variable -> values at the vertices, in the order of `Layout.coordinates`
     profiles: Mapping[str, Array]
+    # Field -> number of modes that the data have determined, and number of all modes
     told: Mapping[str, tuple[float, int]]
+    # Correlation of the scalar unknowns, shape (unknowns, unknowns); None without covariance
     correlation: Array | None = None
+    # Field -> share of its mean variance in modes that the law leaves out
     left_out: Mapping[str, float] = field(default_factory=dict)
 
     def to_bytes(self) -> bytes:
@@ -337,53 +333,35 @@ def _array(values: array[float]) -> Array:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names, units and coordinates of the numbers of records, as plain values.
+    """Names, units and coordinates of the numbers of records, as plain values."""
 
-    Attributes
-    ----------
-    time_unit, sensor_unit
-        Units of time and innovations; `sensor_unit` is empty if the sensors have several.
-    coordinates
-        Axis -> coordinates of the vertices.
-    cells
-        Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an
-        interval none, its vertices are in order.
-    sensors, withheld
-        Names of the sensors; `withheld` is None if no sensor is withheld.
-    numbers
-        Variable over time -> its attributes, in the order of `Record.numbers`.
-    units
-        Unknown or component of the state -> unit.
-    scalars, fields, state
-        Labels of scalar unknowns, names of unknown fields and of variables of the state.
-    length_unit
-        Unit of coordinates.
-    places
-        Sensor, withheld or not, that is at one point -> its coordinates.
-    attrs
-        Attributes of the dataset: title, origin (the date of t = 0), equation.
-    comments
-        Variable of a field -> what its numbers are, where that is not a mean or a standard
-        deviation.
-    sensor_units
-        Sensor, withheld or not -> its unit; empty if they have one in common.
-    """
-
+    # time_unit, sensor_unit: units of time and innovations; `sensor_unit` is empty if the sensors
+    # have several
     time_unit: str
     sensor_unit: str
-    coordinates: Mapping[str, Sequence[float]]
+    coordinates: Mapping[str, Sequence[float]]  # axis -> coordinates of the vertices
+    # Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an interval
+    # none, its vertices are in order
     cells: Mapping[str, Sequence[Sequence[int]]]
+    # sensors, withheld: names of the sensors; `withheld` is None if no sensor is withheld
     sensors: Sequence[str]
     withheld: Sequence[str] | None
+    # Variable over time -> its attributes, in the order of `Record.numbers`
     numbers: Mapping[str, Mapping[str, Any]]
-    units: Mapping[str, str]
+    units: Mapping[str, str]  # unknown or component of the state -> unit
+    # scalars, fields, state: labels of scalar unknowns, names of unknown fields and of variables of
+    # the state
     scalars: Sequence[str]
     fields: Sequence[str]
     state: Sequence[str]
-    length_unit: str = ""
+    length_unit: str = ""  # unit of coordinates
+    # Sensor, withheld or not, that is at one point -> its coordinates
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    # Attributes of the dataset: title, origin (the date of t = 0), equation
     attrs: Mapping[str, Any] = field(default_factory=dict)
+    # Variable of a field -> what its numbers are, where that is not a mean or a standard deviation
     comments: Mapping[str, str] = field(default_factory=dict)
+    # Sensor, withheld or not -> its unit; empty if they have one in common
     sensor_units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -398,10 +376,7 @@ class Layout:
     def dataset(self, records: Iterable[Record], last: Snapshot | None = None) -> xr.Dataset:
         """Return records as a dataset; see `Result.to_xarray`.
 
-        Parameters
-        ----------
-        last
-            The fields at the last time, if its record holds none.
+        `last`: the fields at the last time, if its record holds none.
         """
         import xarray as xr
 
@@ -426,11 +401,7 @@ class Layout:
         if "correlation" in data:
             coords["unknown"] = ("unknown", list(self.scalars))
         data |= self._errors(rows)
-        flags = {
-            "flag_values": list(range(len(STATUS_CODES))),
-            "flag_meanings": " ".join(STATUS_CODES),
-        }
-        data["status"] = ("time", rows.status, flags)
+        data["status"] = ("time", rows.status, dict(STATUS_FLAGS))
         data["steps"] = ("time", rows.steps, {"long_name": "substeps taken"})
         for name, values in rows.notes.items():
             taken = name in data or name in coords  # by an unknown, say
@@ -478,10 +449,7 @@ class Layout:
     def own_names(cls, axes: Iterable[str], cells: Iterable[str]) -> set[str]:
         """Return the names of dimensions, coordinates and variables that every dataset has.
 
-        Parameters
-        ----------
-        axes, cells
-            Coordinates and kinds of cells of the mesh.
+        `axes`, `cells`: coordinates and kinds of cells of the mesh.
         """
         pair = ["1", "2"]  # two unknown numbers, so that they have a correlation
         grid, none = {axis: [0.0] for axis in axes}, {kind: [[0]] for kind in cells}
@@ -522,7 +490,6 @@ class Layout:
         return found
 
     def _snapshots(self, kept: Sequence[Snapshot]) -> dict[str, Any]:
-        """Return the variables of the fields."""
         data: dict[str, Any] = {}
         if not kept:
             return data
@@ -544,7 +511,6 @@ class Layout:
         return data
 
     def _errors(self, rows: RecordArrays) -> dict[str, Any]:
-        """Return the variables of innovations and errors of withheld sensors."""
         unit = {"units": self.sensor_unit}
         innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
@@ -605,12 +571,9 @@ def name_clashes(
 ) -> list[str]:
     """Return a sentence for each name that would have two meanings in a run's dataset.
 
-    Parameters
-    ----------
-    own
-        Names of the dataset itself: `Layout.own_names`.
-    state, numbers, fields
-        Variables of the state, labels of scalar unknowns, names of unknown fields.
+    `own`: names of the dataset itself: `Layout.own_names`.
+    `state`, `numbers`, `fields`: variables of the state, labels of scalar unknowns, names of
+    unknown fields.
     """
     uses: dict[str, list[str]] = {name: ["a name of the dataset itself"] for name in own}
     kinds = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -13,16 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
-from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
+from livepde.fem import FunctionSpace
 from livepde.frames import (
     covariance_of,
     draws,
     estimates,
     frame,
+    layout_of,
     over_time,
     predictive,
     prior_draws,
+    snapshot_of,
+    summary,
     times,
+    vertex_order,
     with_estimates,
 )
 from livepde.laws import Belief, Fit, Status
@@ -30,7 +34,7 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import ScalarReadout, unknown_of
+from livepde.readout import Marginal, ScalarReadout, coordinates_of, known_badly, unknown_of
 from livepde.records import (
     STATUS_CODES,
     Layout,
@@ -38,21 +42,15 @@ from livepde.records import (
     RecordArrays,
     Records,
     Snapshot,
-    refused_readings,
-    used_errors,
 )
 from livepde.showing import Shown, listed
-from livepde.verdict import FLAT, Finding, Verdict, at_bound, discretised, flat, held_inputs
+from livepde.verdict import Verdict, discretised, held_inputs
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
     from livepde.plots import RunPlots
-
-MEDIAN = "the median"
-FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
-
 
 Kept = TypeVar("Kept")
 
@@ -109,41 +107,14 @@ class Estimate(Shown):
     def deferred(
         cls,
         read: Callable[[], Belief],
-        *,
-        t: float,
-        innovation: Array,
-        withheld_error: Array,
-        status: Status,
-        steps: int,
-        diagnose: Callable[[], Diagnostics[float]],
-        held: tuple[str, ...],
-        space: FunctionSpace,
-        judge: Callable[[], Verdict],
-        fit: Fit | None = None,
-        state_space: FunctionSpace | None = None,
+        **attributes: Any,
     ) -> Estimate:
-        """Return an estimate whose belief is computed when it is first read, and kept then.
+        """Return an estimate whose belief is computed by `read` when it is first read, and kept.
 
-        Parameters
-        ----------
-        read
-            Returns the belief; it must give the same numbers at any time.
+        All other attributes are given; `read` must give the same numbers at any time.
         """
         estimate = object.__new__(cls)
-        estimate.__dict__.update(
-            _read=read,
-            t=t,
-            innovation=innovation,
-            withheld_error=withheld_error,
-            status=status,
-            steps=steps,
-            diagnose=diagnose,
-            held=held,
-            space=space,
-            judge=judge,
-            fit=fit,
-            state_space=state_space,
-        )
+        estimate.__dict__.update(attributes, _read=read)
         return estimate
 
     if not TYPE_CHECKING:
@@ -298,7 +269,7 @@ class Estimate(Shown):
         unknown = name in self.space.fields
         space = self.space if unknown else self.state_space
         block, part = space.fields[name], space.part(name)
-        at, one = _coordinates(points, len(block.box[0]), name)
+        at, one = coordinates_of(points, len(block.box[0]), name)
         rows = block.probe(at, f"estimate['{name}'].at: point")
         if unknown:
             values, std = rows @ self.q[part], self.belief.deviation(rows, part)
@@ -314,124 +285,6 @@ class Estimate(Shown):
         if not shape:
             return Marginal(float(values[0]), float(std[0]), unknown_of(space, name))
         return Marginal(values.reshape(shape), std.reshape(shape), unknown_of(space, name))
-
-
-def _coordinates(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
-    """Return coordinates of points, shape (axes, points), and whether one point is meant."""
-    try:
-        given = np.asarray(points, dtype=float)
-    except (TypeError, ValueError):
-        given = np.zeros((0, 0, 0))
-    one = given.ndim == 0 or (given.ndim == 1 and axes > 1)
-    columns = given.reshape(-1, 1) if axes == 1 and given.ndim < 2 else np.atleast_2d(given)
-    if columns.ndim != 2 or columns.shape[1] != axes:
-        shapes = "(points,)" if axes == 1 else f"({axes},) or (points, {axes})"
-        raise ConfigurationError(
-            f"estimate['{name}'].at: got points {points!r:.60}; expected numbers, shape {shapes}."
-        )
-    return columns.T, one
-
-
-@dataclass(frozen=True, eq=False)
-class Marginal:
-    """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
-
-    Attributes
-    ----------
-    median
-        A number; of a field an array of coefficients.
-    deviation
-        Standard deviation to first order: that of the latent value times the slope of the transform
-        at the median. NaN for a law without covariance.
-    unknown
-        The unknown with its prior.
-    """
-
-    median: Any
-    deviation: Any
-    unknown: Any
-    _read: Callable[[ArrayLike], Marginal] | None = None
-
-    def at(self, points: ArrayLike) -> Marginal:
-        """Return the marginals of the values of a field at points.
-
-        Parameters
-        ----------
-        points
-            Coordinates of one or more points: on an interval a number or shape (points,), else
-            shape (d,) or (points, d).
-
-        Returns
-        -------
-        marginals
-            Its median, deviation, mean, std and intervals have a number for each point; of a vector
-            field a row of components.
-
-        Raises
-        ------
-        ConfigurationError
-            The unknown is a number, or the estimate was pickled.
-        ObservationError
-            A point outside of the mesh.
-
-        Examples
-        --------
-        >>> import livepde as lp
-        >>> from livepde.models import heat
-        >>> model = heat(lp.interval(0.0, 1.0, 20), lp.Normal(0.1, std=0.05))
-        >>> rod = lp.Identifier(model, lp.Points({"middle": 0.5}, noise=0.1), u0=20.0)
-        >>> estimate = rod.step(0.1, [20.0])
-        >>> estimate["u"].at([0.25, 0.5]).mean.round(3)
-        array([20., 20.])
-        """
-        if self._read is None:
-            raise ConfigurationError("at: only a field has values at points; this is a number.")
-        return self._read(points)
-
-    @property
-    def mean(self) -> Any:
-        """Mean: the median of a `Normal`, larger than it for a `LogNormal`."""
-        return self._moments[0]
-
-    @property
-    def std(self) -> Any:
-        """Standard deviation: `deviation` of a `Normal`, larger for a `LogNormal`."""
-        return self._moments[1]
-
-    @cached_property
-    def _moments(self) -> tuple[Any, Any]:
-        mean, std = self.unknown.prior.moments(self.median, self.deviation)
-        return (float(mean), float(std)) if isinstance(self.median, float) else (mean, std)
-
-    def interval(self, level: float = 0.95) -> tuple[Any, Any]:
-        """Return the ends of the central interval that holds it with probability `level`.
-
-        Within its bounds, and not symmetric for a `LogNormal` or `LogitNormal`. NaN for a law
-        without covariance.
-        """
-        low, high = self.unknown.interval(self.median, self.deviation, level)
-        return (float(low), float(high)) if isinstance(self.median, float) else (low, high)
-
-    def __str__(self) -> str:
-        """Return mean and standard deviation; under a transform median and 95 % interval."""
-        if not isinstance(self.median, float):
-            return repr(self)
-        if isinstance(self.unknown.prior, Normal):
-            return f"{self.mean:.4g} ± {self.std:.2g}"
-        low, high = self.interval()
-        return f"{self.median:.4g} (95 %: {low:.4g} to {high:.4g})"
-
-
-def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
-    """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
-    for label, row in space.labels.items():
-        unknown, value = unknown_of(space, label), float(belief.q[row])
-        lower, upper = map(float, unknown.prior.bounds)
-        if value in (lower, upper):
-            yield at_bound(label, value)
-        left = float(belief.left([row])[0])
-        if left > FLAT and not unknown.evolution.moves:
-            yield flat(label, left)
 
 
 class Result(Shown):
@@ -550,38 +403,7 @@ class Result(Shown):
 
     def snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
-        space, told, left_out = self.model.parameter_space, {}, {}
-        for name, field in space.fields.items():
-            left = estimate.belief.modes_left(space.part(name))
-            if len(left):
-                # A mode counts by the share of its prior variance that the data have taken away.
-                told[name] = float(np.maximum(1.0 - left**2, 0.0).sum()), len(left)
-                left_out[name] = estimate.belief.left_out(field.at_vertices, space.part(name))
-        profiles = self._profiles(estimate).items()
-        order = vertex_order(self.model)
-        ordered = {name: values[order] for name, values in profiles}
-        return Snapshot(ordered, told, _correlation(estimate), left_out)
-
-    def _profiles(self, estimate: Estimate) -> dict[str, Array]:
-        """Return values and standard deviations of all fields at the vertices."""
-        found: dict[str, Array] = {}
-        belief = estimate.belief
-        for name, block in self.model.state_space.fields.items():
-            part = self.model.state_space.part(name)
-            found |= _split(name, block, block.at_vertices @ estimate.u[part])
-            if belief.u_factor is not None:
-                squares = (block.at_vertices @ belief.u_factor[part]) ** 2
-                deviation = np.sqrt(squares.sum(axis=1))
-                found |= _split(name, block, deviation, "_std")
-        for name, field in self.model.parameter_space.fields.items():
-            part = self.model.parameter_space.part(name)
-            found[name] = field.at_vertices @ estimate.q[part]
-            std = belief.deviation(field.at_vertices, part)
-            if std is not None:
-                found[f"{name}_std"] = std
-                unknown = self.model.parameter_space.unknowns[name]
-                found |= interval_ends(name, unknown, found[name], std)
-        return found
+        return snapshot_of(self.model, estimate.belief)
 
     def to_xarray(self) -> xr.Dataset:
         """Return a dataset of the run over time: numbers, fields, errors of the sensors.
@@ -761,7 +583,6 @@ class Result(Shown):
         return pd.DataFrame(columns | over_time(data, "withheld_error", "withheld"), times(data))
 
     def _last(self, what: str) -> Estimate:
-        """Return the last estimate."""
         if self.last is None:
             raise ConfigurationError(f"{what}: the run contains no samples yet.")
         return self.last
@@ -871,140 +692,7 @@ class Result(Shown):
 
 
 def _number(value: float) -> float | None:
-    """Return a number that JSON can hold."""
     return value if np.isfinite(value) else None
-
-
-def layout_of(
-    model: Model, observed: Observed, withheld: Observed | None, ignored: Sequence[str] = ()
-) -> Layout:
-    """Return names, units and coordinates of the records of a run.
-
-    Parameters
-    ----------
-    ignored
-        Names of withheld sensors that never count.
-    """
-    numbers: dict[str, dict[str, Any]] = {}
-    for label in model.parameter_space.labels:
-        unknown = unknown_of(model.parameter_space, label)
-        unit: dict[str, Any] = {"units": unknown.unit}
-        plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
-        numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}
-        numbers[f"{label}_std"] = {**unit, **({} if plain else {"comment": FIRST_ORDER})}
-        numbers |= dict.fromkeys(interval_ends(label, unknown, 0.0, 0.0), unit)
-        numbers[f"{label}_left"] = {"long_name": "share of the prior standard deviation"}
-    points = model.mesh.p[:, vertex_order(model)]
-    components = model.state_space.fields.items()
-    places = {**observed.places, **({} if withheld is None else withheld.places)}
-    units = {
-        name: unit
-        for one in (observed, withheld)
-        if one is not None
-        for name, unit in zip(one.names, one.units, strict=True)
-    }
-    stated = {unit for unit in units.values() if unit}
-    several = len(stated) > 1
-    return Layout(
-        time_unit=model.time_unit,
-        sensor_unit="" if several else "".join(stated),
-        coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
-        cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
-        sensors=list(observed.names),
-        withheld=None if withheld is None else list(withheld.names),
-        numbers=numbers,
-        units=_units(model),
-        scalars=list(model.parameter_space.labels),
-        fields=list(model.parameter_space.fields),
-        state=[key for name, block in components for key in block.variables(name)],
-        length_unit=model.length_unit,
-        places={name: at.tolist() for name, at in places.items()},
-        comments=_field_comments(model),
-        attrs={"ignored": "\n".join(ignored)} if ignored else {},
-        sensor_units=units if several else {},
-    )
-
-
-def vertex_order(model: Model) -> Any:
-    """In which order vertices are kept: along an interval, else as the mesh has them."""
-    points = model.mesh.p
-    return np.argsort(points[0]) if len(points) == 1 else slice(None)
-
-
-def _units(model: Model) -> dict[str, str]:
-    unknowns = {**model.state_space.unknowns, **model.parameter_space.unknowns}
-    found = {name: unknown.unit for name, unknown in unknowns.items()}
-    for name, block in model.state_space.fields.items():
-        found |= dict.fromkeys(block.variables(name), found[name])
-    return found
-
-
-def _split(name: str, block: FieldBlock, values: Array, end: str = "") -> dict[str, Array]:
-    """Return the variables of a component with their values at the vertices."""
-    names = block.variables(name)
-    rows = values.reshape(len(names), -1)
-    return {f"{key}{end}": row for key, row in zip(names, rows, strict=True)}
-
-
-def interval_ends(name: str, unknown: Any, values: Any, std: Any) -> dict[str, Any]:
-    """Return variables with the ends of 95 % intervals, if those are not mean +- 1.96 std."""
-    if unknown.prior.symmetric:
-        return {}
-    low, high = unknown.interval(values, std)
-    return {f"{name}_low": low, f"{name}_high": high}
-
-
-def _correlation(estimate: Estimate) -> Array | None:
-    """Return the correlation matrix of the scalar unknowns."""
-    labels, factor = estimate.space.labels, estimate.belief.q_factor
-    if factor is None or len(labels) < 2:
-        return None
-    rows = factor[list(labels.values())]
-    size = np.linalg.norm(rows, axis=1)
-    unit = rows / np.where(size > 0.0, size, 1.0)[:, None]
-    correlation: Array = unit @ unit.T
-    return correlation
-
-
-def _prior(unknown: Any) -> dict[str, float]:
-    """Return prior and finite bounds of a scalar unknown as attributes of its variable."""
-    bounds = zip(("lower_bound", "upper_bound"), unknown.prior.bounds, strict=True)
-    found = {name: float(bound) for name, bound in bounds if np.isfinite(bound)}
-    if not unknown.evolution.moves:  # one that moves is never known better for good
-        found["prior_std"] = float(unknown.prior.std)
-    return found
-
-
-def _field_comments(model: Model) -> dict[str, str]:
-    """Return unknown field or its standard deviation -> what it is, where it has a transform."""
-    found: dict[str, str] = {}
-    for name, block in model.parameter_space.fields.items():
-        if not isinstance(block.field.prior, Normal):
-            found |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
-    return found
-
-
-def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
-    """Return the table of a run's dataset: last estimates, and errors of each channel."""
-    rows: dict[str, dict[str, float]] = {}
-    for label in filter(None, data.attrs["scalars"].split("\n") if data.sizes["time"] else ()):
-        rows[label] = {
-            "value": float(data[label][-1]),
-            "std": float(data[f"{label}_std"][-1]),
-        }
-    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
-        if variable not in data:
-            continue
-        columns = used_errors(data, variable, dimension).T
-        for name, column in zip(data[dimension].values, columns, strict=True):
-            errors = column[np.isfinite(column)]
-            rows[f"{variable}:{name}"] = {
-                "rmse": float(np.sqrt((errors**2).mean())) if len(errors) else np.nan,
-                "count": float(len(errors)),
-            }
-    for name, which in refused_readings(data).items():
-        rows[f"innovation:{name}"]["refused"] = float(which.sum())
-    return rows
 
 
 def kept(value: Kept) -> Kept:

@@ -91,13 +91,8 @@ def _returned(source: str, arguments: list[str]) -> Iterator[str]:
         if isinstance(node, ast.Lambda):
             yield ast.unparse(node.body)
         elif isinstance(node.body[-1], ast.Return) and node.body[-1].value is not None:
-            whole = len([one for one in node.body if not _is_text(one)]) == 1
+            whole = len(node.body) - (ast.get_docstring(node) is not None) == 1
             yield ast.unparse(node.body[-1].value) if whole else f"{node.name}(...)"
-
-
-def _is_text(node: ast.stmt) -> bool:
-    """Return whether a statement is a docstring."""
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
 
 
 def _parsed(source: str) -> ast.AST:

@@ -36,12 +36,12 @@ from livepde.cases.schema import SENSORS
 from livepde.diagnostics.check_report import Bound, Sense
 from livepde.errors import DataError
 from livepde.fem import Inputs, Moment
+from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, GradientLaw
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
-from livepde.result import layout_of
 from livepde.runs import Journal
 from livepde.runs.summary import ROLES, TOTALS
 from livepde.samples import Sample

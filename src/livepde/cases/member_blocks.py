@@ -16,8 +16,9 @@ from livepde.cases.case import Case, Prepared
 from livepde.cases.case_channels import between_of
 from livepde.errors import DataError, LivepdeError, RunError
 from livepde.fleet import Fleet, FleetRecords
+from livepde.frames import layout_of
 from livepde.identifier import Identifier
-from livepde.result import Result, layout_of
+from livepde.result import Result
 from livepde.runs import Driven, Journal, stopped_by_signals
 from livepde.runs.journal import Event
 from livepde.streams import DataTable

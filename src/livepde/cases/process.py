@@ -36,7 +36,7 @@ from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount, Multiple
 from livepde.observation.flux_plates import in_cells
-from livepde.runs.thermal_resistance import LAYERS, SURFACES
+from livepde.runs.summary import LAYERS, SURFACES
 from livepde.units import conversion
 
 HELD = 1e4  # transfer coefficient at a boundary that is held, over D and the size of a cell

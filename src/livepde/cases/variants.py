@@ -17,7 +17,7 @@ from livepde.cases.read import parse, settings_in
 from livepde.cases.remedies import with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
-from livepde.plots.dataset import modes_told
+from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
 from livepde.runs import verdict

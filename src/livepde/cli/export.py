@@ -133,8 +133,7 @@ def fmu(
 
     Example:  livepde fmu mycase/case.toml --out rod.fmu
     """
-    from livepde.exchange.fmu_export import is_code, write_unit
-    from livepde.exchange.recipe import recipe_of
+    from livepde.exchange.fmu_export import is_code, recipe_of, write_unit
 
     code = is_code(source)
     if code and settings:

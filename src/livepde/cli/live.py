@@ -171,7 +171,7 @@ def _observers(
         check_installed()
     sinks: list[Sink] = [_Heartbeat()]
     if how.estimates:
-        from livepde.runs.standard_streams import JsonLinesSink
+        from livepde.runs.monitor import JsonLinesSink
 
         sinks.append(JsonLinesSink(sys.stdout))
     if how.listen is not None:

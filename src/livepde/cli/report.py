@@ -38,8 +38,7 @@ def report(
     if theory:
         _report_theory(runs.open(folder), data, as_json, allow_code)
         return
-    from livepde.runs.directory import drawn_into, markdown, write_text
-    from livepde.runs.outcome import attempted
+    from livepde.runs.directory import attempted, drawn_into, markdown, write_text
 
     opened = runs.open(folder)
     found, checks, notes = opened.dataset, opened.checks, opened.notes

@@ -120,7 +120,7 @@ def run(
     Replay:   livepde run mycase/case.toml --realtime --speed 3600 --watch 8050
     Service:  livepde run mycase/case.toml --realtime --out runs/mycase --resume --listen 9100
     """
-    from livepde.runs.standard_streams import configure
+    from livepde.runs.monitor import configure
 
     loaded = load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
@@ -302,7 +302,7 @@ def concluded(
         verdict,
         verdict_table,
     )
-    from livepde.runs.outcome import attempted
+    from livepde.runs.directory import attempted
     from livepde.verdict import Verdict
 
     loaded = prepared.case

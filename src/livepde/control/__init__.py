@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from livepde.control.estimators import Estimator, Learned, Trust
+from livepde.control.controllers import LQ, MPC
+from livepde.control.estimators import Estimator, Kalman, Learned, Trust
+from livepde.control.galerkin import Discrete, Output
 from livepde.control.goal import Controller, Decision, Goal, Known, Plan
-from livepde.control.kalman import Kalman
-from livepde.control.linear import Discrete, Output
 from livepde.control.loop import Action, Loop
-from livepde.control.lq import LQ
-from livepde.control.mpc import MPC
 from livepde.control.reduced import ReducedModel, reduce
 
 __all__ = [

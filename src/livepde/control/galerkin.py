@@ -1,22 +1,33 @@
-"""Galerkin reduction of a full model: basis, linearisation point, projected systems."""
+"""Galerkin reduction of a model: linearisation, basis of static responses and modes, systems."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import eigs, eigsh, splu
 
-from livepde.control.linear import Linear, Linearisation, Output
 from livepde.errors import ConfigurationError, ModelError
 from livepde.fem import Inputs, Moment
-from livepde.linalg import Array
+from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.readout import unknown_of
 
+# Relative difference that is attributed to rounding.
+SAME = 1e-9
+# Arbitrary time at which a model is evaluated to detect an explicit dependence on time.
+LATER = 12345.6789
+# Shift of static responses relative to the fastest rate, for processes without a steady state.
+SHIFT = 1e-9
+# Relative size below which a direction of the snapshots is dropped.
+KEPT = 1e-4
+# Relative asymmetry that is attributed to rounding.
+SYMMETRIC = 1e-10
 # Probability of the interval of an unknown number whose ends define the responses in the basis.
 LIKELY = 0.95
 # Relative nonlinearity in the unknown numbers that is attributed to rounding.
@@ -24,26 +35,139 @@ LINEAR = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
-class GalerkinReduction:
-    """Data of a Galerkin reduction: full model, basis and linearisation point.
+class Linear:
+    """Linear system M u' = -K u + E c + f for the channels c."""
+
+    # K, E, f: shapes (n, n), (n, channels) and (n,); rows of fixed coefficients are undefined
+    K: sp.csr_array
+    E: Array
+    f: Array
+
+
+def _differ(one: Array, other: Array) -> bool:
+    size = max(float(np.abs(one).max(initial=0.0)), float(np.abs(other).max(initial=0.0)))
+    return bool(np.abs(one - other).max(initial=0.0) > SAME * size)
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """Output equation of a reduced model: y = C x + D c + d for the channels c.
 
     Attributes
     ----------
-    model
-        The full model.
-    outputs, sensors
-        Controlled and measured quantities, as observations bound to the full model.
-    V, test
-        Basis, shape (n, r), and V^T M, shape (r, n).
-    u, q, inputs
-        Linearisation point: state, parameter, and value of each channel.
+    names
+        Names of the outputs.
+    C, D, d
+        Shapes (outputs, r), (outputs, channels) and (outputs,).
+    noise
+        Measurement noise of each output as a standard deviation, shape (outputs,); None if unknown.
     """
 
-    model: Model
+    names: tuple[str, ...]
+    C: Array
+    D: Array
+    d: Array
+    noise: Array | None = None
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the outputs, shape (outputs,)."""
+        y: Array = self.C @ x + self.D @ c + self.d
+        return y
+
+
+@dataclass(frozen=True, eq=False)
+class Discrete:
+    """Discrete-time model x+ = A x + B c + f with a zero-order hold of the channels c."""
+
+    A: Array
+    B: Array
+    f: Array
+
+    def with_offset(self, offset: Array | None) -> Discrete:
+        """Return the model with a constant added to the channels, shape (channels,)."""
+        return self if offset is None else replace(self, f=self.f + self.B @ offset)
+
+    def __call__(self, x: Array, c: Array) -> Array:
+        """Return the state at the end of the step."""
+        after: Array = self.A @ x + self.B @ c + self.f
+        return after
+
+
+def basis(
+    mass: sp.csr_array,
+    free: IntArray,
+    systems: Sequence[Linear],
+    drives: Array,
+    modes: int,
+    rates: Sequence[float] = (),
+) -> Array:
+    """Return an M-orthonormal basis V, V^T M V = I, zero on fixed coefficients, shape (n, r).
+
+    `mass`: mass matrix M, shape (n, n).
+    `free`: numbers of the coefficients that are not fixed.
+    `systems`: linear systems for several values of the unknowns, the first at the prior mean. The
+    basis contains the static responses of each.
+    `drives`: lifting of boundary channels and of known boundary values, shape (n, channels + 1).
+    `modes`: number of slowest eigenmodes of the first system to be added.
+    `rates`: rates of the exponential inputs exp(rate t) whose responses are added.
+    """
+    M = sp.csc_array(mass[free][:, free])
+    static, slowest = [], np.zeros((len(free), 0))
+    for system in systems:
+        K = sp.csc_array(system.K[free][:, free])
+        # A small multiple of M makes K + rate M regular: a process with insulated boundaries has no
+        # steady state, and its static response would be infinite.
+        shift = SHIFT * float(abs(K).sum(axis=1).max() / M.sum(axis=1).max())
+        loads = np.column_stack([system.E, system.f]) - system.K @ drives
+        for rate in (shift, *rates):
+            static.append(splu(sp.csc_array(K + rate * M)).solve(np.ascontiguousarray(loads[free])))
+        if system is systems[0] and modes:
+            slowest = _modes(K, M, modes, shift)
+    responses = np.hstack(static)
+    size = np.sqrt(np.maximum(np.einsum("ik,ik->k", responses, M @ responses), 0.0))
+    responses = responses[:, size > 0.0] / size[size > 0.0]
+    found = _orthonormal(np.hstack([_orthonormal(responses, M), slowest]), M)
+    V = np.zeros((mass.shape[0], found.shape[1]))
+    V[free] = found
+    return V
+
+
+def _modes(K: sp.csc_array, M: sp.csc_array, count: int, shift: float) -> Array:
+    """Return the slowest eigenmodes; real and imaginary parts for a nonsymmetric K."""
+    n = K.shape[0]
+    start, count = np.ones(n), min(count, n - 2)
+    if count < 1:  # the static responses are all there is
+        return np.zeros((n, 0))
+    if abs(K - K.T).max() <= SYMMETRIC * abs(K).max():
+        return np.asarray(eigsh(K, count, M, sigma=-shift, v0=start)[1])
+    _, vectors = eigs(K, count, M, sigma=-shift, v0=start)
+    both = np.hstack([vectors.real, vectors.imag])
+    return np.asarray(both[:, np.linalg.norm(both, axis=0) > 0.0])
+
+
+def _orthonormal(columns: Array, M: sp.csc_array) -> Array:
+    """Return the dominant directions of columns, orthonormal in M."""
+    if not columns.shape[1]:
+        return columns
+    weights, axes = np.linalg.eigh(columns.T @ (M @ columns))
+    kept = weights > KEPT**2 * weights.max()
+    found = columns @ (axes[:, kept][:, ::-1] / np.sqrt(weights[kept][::-1]))
+    root = np.linalg.cholesky(found.T @ (M @ found))  # once more: squares have lost digits
+    return np.asarray(np.linalg.solve(root, found.T).T)
+
+
+@dataclass(frozen=True, eq=False)
+class GalerkinReduction:
+    """Data of a Galerkin reduction: full model, basis and linearisation point."""
+
+    model: Model  # the full model
+    # outputs, sensors: controlled and measured quantities, as observations bound to the full model
     outputs: Observed
     sensors: Observed
+    # V, test: basis, shape (n, r), and V^T M, shape (r, n)
     V: Array
     test: Array
+    # u, q, inputs: linearisation point: state, parameter, and value of each channel
     u: Array
     q: Array
     inputs: Mapping[str, float]
@@ -83,14 +207,60 @@ class GalerkinReduction:
         return bool(self.model.parameter_space.fields) or not self.model.affine
 
     @cached_property
-    def linearisation(self) -> Linearisation:
-        """Linearisation of the full model."""
-        return Linearisation(self.model, self.u, self.inputs)
+    def moment(self) -> Moment:
+        """Time zero with the inputs of the linearisation point."""
+        return self._moment(0.0, {})
+
+    def _moment(self, t: float, change: Mapping[str, float]) -> Moment:
+        values = {name: self.inputs[name] + change.get(name, 0.0) for name in self.model.channels}
+        return Moment(t, Inputs(values))
+
+    def residual(self, u: Array, q: Array, moment: Moment) -> Array:
+        """Return B(u) + A(u) q - F for physical coefficients q."""
+        model = self.model
+        a = model.latent.inverse(q)
+        change: Array = model.form_A.vector("v", moment, q=a, u=u) + model.B(u, moment)
+        return change - model.F(moment)
+
+    def slope(self, q: Array, moment: Moment) -> sp.csr_array:
+        """Return the derivative of the residual in u, shape (n, n)."""
+        model, a = self.model, self.model.latent.inverse(q)
+        slope = model.form_A.matrix("v", "u", moment, u=self.u, q=a)
+        return sp.csr_array(slope + model.form_B.matrix("v", "u", moment, u=self.u))
+
+    def at(self, q: Array) -> Linear:
+        """Return the system for physical coefficients q, shape (m,)."""
+        K, known = self.slope(q, self.moment), self.residual(self.u, q, self.moment)
+        columns = [
+            # The model is affine in its channels (see `check`): one difference gives the exact
+            # column.
+            known - self.residual(self.u, q, self._moment(0.0, {name: 1.0}))
+            for name in self.model.channels
+        ]
+        E = np.column_stack(columns) if columns else np.zeros((len(known), 0))
+        values = np.array([self.inputs[name] for name in self.model.channels])
+        return Linear(K, E, K @ self.u - known - E @ values)
+
+    def differ(self, one: Array, other: Array) -> bool:
+        """Return True if the systems for two parameters differ."""
+        free = self.model.X.free
+        first, second = self.at(one), self.at(other)
+        rows = np.repeat(free, np.diff(first.K.indptr))
+        pairs = ((rows * first.K.data, rows * second.K.data), (first.E.T * free, second.E.T * free))
+        known = (first.f * free, second.f * free)
+        return any(_differ(*pair) for pair in (*pairs, known))
 
     @cached_property
     def boundary(self) -> tuple[Array, Array]:
-        """Lifting of boundary channels and values, as in `Linearisation.boundary`."""
-        return self.linearisation.boundary()
+        """Lifting of boundary channels, (n, channels), and of known values, (n,)."""
+        model, zero = self.model, np.zeros(self.model.X.dim)
+        off = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
+        known = model.impose(zero, off)
+        columns = []
+        for name in model.channels:
+            values = dict.fromkeys(model.channels, 0.0) | {name: 1.0}
+            columns.append(model.impose(zero, Moment(0.0, Inputs(values))) - known)
+        return np.column_stack(columns) if columns else np.zeros((len(zero), 0)), known
 
     def lift(self, x: Array, c: Array) -> Array:
         """Return the state of the full model for coordinates and channels."""
@@ -114,20 +284,17 @@ class GalerkinReduction:
         """Return the reference parameter, and those with one number at an end of its interval."""
         found, space = [self.q], self.model.parameter_space
         for label, k in space.labels.items():
-            for end in likely(space, label):
+            unknown = unknown_of(space, label)
+            for end in unknown.interval(unknown.prior.centre, unknown.prior.std, LIKELY):
                 found.append(self.q.copy())
                 found[-1][k] = end
         return found
 
     def values(self) -> list[Array]:
         """Return parameters at which systems are sampled: the reference, then one per number."""
-        found, space = [self.q], self.model.parameter_space
-        for label, k in space.labels.items():
-            low, high = likely(space, label)
-            other = self.q.copy()
-            other[k] = high if high > other[k] else low
-            found.append(other)
-        return found
+        reference, *ends = self.extremes()
+        pairs = zip(ends[::2], ends[1::2], self.rows, strict=True)
+        return [reference, *(high if high[k] > self.q[k] else low for low, high, k in pairs)]
 
     def parts(self) -> Array:
         """Return [K, E, f] as a constant part and a derivative by each unknown number.
@@ -135,7 +302,7 @@ class GalerkinReduction:
         Shape (1 + m, r, r + channels + 1).
         """
         values = self.values()
-        systems = [self._projected(self.linearisation.at(q)) for q in values]
+        systems = [self._projected(self.at(q)) for q in values]
         slopes = [
             (systems[k + 1] - systems[0]) / (values[k + 1][row] - self.q[row])
             for k, row in enumerate(self.rows)
@@ -155,13 +322,44 @@ class GalerkinReduction:
         driven = self.V.T @ (np.column_stack([system.E, system.f]) - system.K @ fixed)
         return np.column_stack([K, driven + K @ (self.test @ fixed)])
 
+    def check_linear(self) -> None:
+        """Raise `ModelError` if the model has no linear system with constant coefficients."""
+        model, free, q = self.model, self.model.X.free, self.q
+        # An explicit dependence on time is detected by evaluation at an arbitrary other time.
+        steady = self.residual(self.u, q, self.moment)
+        later = self.residual(self.u, q, self._moment(LATER, {}))
+        moved = model.impose(self.u, self._moment(LATER, {})) - model.impose(self.u, self.moment)
+        if _differ(steady * free, later * free) or moved.any():
+            raise ModelError(
+                "reduce: the model reads the time. Make what changes with time an input channel, "
+                "so that a controller can be given its forecast."
+            )
+        # A random change of all channels at once detects products of channels with the state, and
+        # of channels with each other.
+        rng = np.random.default_rng(0)
+        change = dict(zip(model.channels, rng.standard_normal(len(model.channels)), strict=True))
+        there = self._moment(0.0, change)
+        if _differ(self.slope(q, self.moment).data, self.slope(q, there).data):
+            raise ModelError(
+                "reduce: a channel multiplies the state, so that the model is not linear in its "
+                "inputs. Let it be a known number in the form, or a source or boundary value."
+            )
+        linear = self.at(q)
+        step = np.array([change[name] for name in model.channels])
+        expected = steady - linear.E @ step
+        if _differ(self.residual(self.u, q, there) * free, expected * free):
+            raise ModelError(
+                "reduce: the model is not linear in its input channels; let a channel be what "
+                "enters linearly, as the heat instead of the voltage."
+            )
+
     def check(self) -> None:
         """Raise `ModelError` if unknown numbers do not enter linearly, or vanish from the model."""
         self._check_effects()
         # The parts, made at the ends of single numbers, must give the system where all are halfway.
         both = self.q + 0.5 * sum((q - self.q for q in self.values()[1:]), np.zeros_like(self.q))
         expected = np.tensordot(np.array([1.0, *both[self.rows]]), self.parts(), axes=1)
-        found = self._projected(self.linearisation.at(both))
+        found = self._projected(self.at(both))
         if np.abs(found - expected).max() > LINEAR * np.abs(expected).max():
             raise ModelError(
                 "reduce: the model is not linear in its unknown numbers, so no reduced model has "
@@ -175,9 +373,9 @@ class GalerkinReduction:
         free = self.model.X.free
         rng = np.random.default_rng(0)
         elsewhere = self.u + free * (1.0 + np.abs(self.u).max()) * rng.standard_normal(len(free))
-        here, there = self.linearisation, replace(self.linearisation, u=elsewhere)
+        there = replace(self, u=elsewhere)
         for label, q in zip(self.model.parameter_space.labels, self.values()[1:], strict=True):
-            if there.differ(self.q, q) and not here.differ(self.q, q):
+            if there.differ(self.q, q) and not self.differ(self.q, q):
                 raise ModelError(
                     f"reduce: '{label}' has no effect on the model linearised at this state, as a "
                     "coefficient of u has none at u = 0: name another operating point with u=."
@@ -185,8 +383,7 @@ class GalerkinReduction:
 
     def output(self, observed: Observed) -> Output:
         """Return the output equation of an observation in reduced coordinates."""
-        moment = self.linearisation.moment
-        W, known = self.boundary
+        moment, (W, known) = self.moment, self.boundary
         y = observed.predict(self.u, self.q, moment)
         H = np.asarray(observed.jacobian(self.u, self.q, moment)[0].toarray())
         # The lifted state is W c + known + V (x - V^T M (W c + known)), which is affine in x and c.
@@ -194,10 +391,3 @@ class GalerkinReduction:
         D = H @ W - C @ (self.test @ W)
         d = y - H @ self.u + H @ known - C @ (self.test @ known)
         return Output(tuple(observed.names), C, D, d, observed.noise)
-
-
-def likely(space: Any, label: str) -> tuple[float, float]:
-    """Return the ends of the prior's 95 % interval of an unknown number."""
-    unknown = unknown_of(space, label)
-    low, high = unknown.interval(unknown.prior.centre, unknown.prior.std, LIKELY)
-    return float(low), float(high)

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
-from livepde.control.estimators import Estimator, Learned, Trust
+from livepde.control.estimators import Estimator, Kalman, Learned, Trust
 from livepde.control.goal import Controller, Decision, Known, Plan
-from livepde.control.kalman import Kalman
 from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array
@@ -102,18 +101,14 @@ class Loop:
             if not given:
                 width = np.where(np.isfinite(high - low), 0.1 * (high - low), 1.0)
                 given = dict(zip(model.controls, width.tolist(), strict=True))
-            nominal = Kalman(
-                model,
-                controller.period,
-                drive=given,
-                x=model.project(estimator.u0),
-            )
+            start = model.project(estimator.u0)
+            nominal = Kalman(model, controller.period, drive=given, x=start)
             estimator = Learned(estimator, nominal, trust)
         elif trust is not None:
             raise ConfigurationError("Loop: trust is for an Identifier; give it to `Learned`.")
         self.estimator: Estimator = estimator
         self.controller = controller
-        start = np.where(np.isfinite(low), low, 0.0)
+        applied = np.where(np.isfinite(low), low, 0.0)
         for name, value in (before or {}).items():
             if name not in model.controls:
                 raise ConfigurationError(
@@ -121,8 +116,8 @@ class Loop:
                 )
             if not np.isfinite(value):
                 raise ConfigurationError(f"Loop: before['{name}'] must be a number; got {value}.")
-            start[model.controls.index(name)] = float(value)
-        self._before: Array = start
+            applied[model.controls.index(name)] = float(value)
+        self._before: Array = applied
         self._memory: Array = controller.start()
         self._disturbances: Array = np.full(len(model.disturbances), np.nan)
 
@@ -274,11 +269,9 @@ class Loop:
         """
         where = str(path)
         header, leaves = checkpoint.unpacked(checkpoint.read(path), where)
-        shapes = {"before": self._before, "disturbances": self._disturbances}
-        wrong = [
-            k for k, mine in shapes.items() if k not in leaves or leaves[k].shape != mine.shape
-        ]
-        if header.get("kind") != "loop" or wrong or leaves["memory"].shape != self._memory.shape:
+        own = {"before": self._before, "disturbances": self._disturbances, "memory": self._memory}
+        fits = all(k in leaves and leaves[k].shape == mine.shape for k, mine in own.items())
+        if header.get("kind") != "loop" or not fits:
             raise RunError(f"{where} is of another loop: build it as it was when it was saved.")
         self.estimator.restore(leaves["estimator"].tobytes(), where)
         self._before, self._memory = leaves["before"], leaves["memory"]

@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from livepde.control.basis import basis
-from livepde.control.galerkin import GalerkinReduction
-from livepde.control.linear import Discrete, Output
+from livepde.control.galerkin import Discrete, GalerkinReduction, Output, basis
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
@@ -290,7 +288,6 @@ class ReducedModel:
 
 
 def _known(what: str, inputs: Mapping[str, float] | None, channels: Sequence[str]) -> None:
-    """Raise an error for inputs that are not channels or not numbers."""
     for name, value in (inputs or {}).items():
         if name not in channels:
             raise ConfigurationError(
@@ -367,9 +364,8 @@ def reduce(
             "operating point: name that with u=, a number, a function of x or coefficients."
         )
     frame = GalerkinReduction.linearised(model, outputs, sensors, u, q, inputs)
-    linearisation = frame.linearisation
-    linearisation.check(frame.q)
-    systems = [linearisation.at(value) for value in frame.extremes()]
+    frame.check_linear()
+    systems = [frame.at(value) for value in frame.extremes()]
     lifting = np.column_stack(frame.boundary)
     V = basis(model.mass, np.flatnonzero(model.X.free), systems, lifting, modes, rates)
     frame = replace(frame, V=V, test=V.T @ model.mass)

@@ -42,8 +42,7 @@ def serve(path: Path, address: Address) -> Server:
         Dash is not installed.
     """
     check_installed()
-    from livepde.dashboard.overview import overview_page
-    from livepde.dashboard.page import page
+    from livepde.dashboard.page import overview_page, page
     from livepde.runs import RECORD, run_names
 
     if not (path / RECORD).exists() and run_names(path):

@@ -44,11 +44,6 @@ def unit_label(data: xr.Dataset, name: str) -> str:
     return labelled("", unit_of(data, name)).strip().strip("[]")
 
 
-def _rgba(colour: str, alpha: float) -> str:
-    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-    return f"rgba({red},{green},{blue},{alpha})"
-
-
 def empty(xlabel: str = "", ylabel: str = "", height: int = HEIGHT) -> go.Figure:
     """Return an empty figure in the style of the page."""
     axis = {"gridcolor": GRID, "zerolinecolor": GRID, "linecolor": "#9aa5b1", "automargin": True}
@@ -114,9 +109,9 @@ def band(
         "showlegend": False,
     }
     figure.add_scatter(x=x, y=low, name="from", hoverinfo="skip", **shared)
-    figure.add_scatter(
-        x=x, y=high, fill="tonexty", fillcolor=_rgba(colour, opacity), hoverinfo="skip", **shared
-    )
+    red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+    fill = f"rgba({red},{green},{blue},{opacity})"
+    figure.add_scatter(x=x, y=high, fill="tonexty", fillcolor=fill, hoverinfo="skip", **shared)
 
 
 def show(figure: go.Figure, parts: Sequence[Array]) -> None:
@@ -135,23 +130,14 @@ def show(figure: go.Figure, parts: Sequence[Array]) -> None:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """Axis of model times: dates, or numbers in a unit that suits the span.
+    """Axis of model times: dates, or numbers in a unit that suits the span."""
 
-    Attributes
-    ----------
-    scale, start
-        Coefficients of the coordinate `start + t * scale`; of dates in milliseconds since 1970, the
-        convention of Plotly.
-    unit
-        Unit of numbers.
-    dates
-        Whether times are dates.
-    """
-
+    # scale, start: coefficients of the coordinate `start + t * scale`; of dates in milliseconds
+    # since 1970, the convention of Plotly
     scale: float
     start: float = 0.0
-    unit: str = ""
-    dates: bool = False
+    unit: str = ""  # unit of numbers
+    dates: bool = False  # whether times are dates
 
     def values(self, t: Any) -> Any:
         """Return the coordinates of times on the axis."""

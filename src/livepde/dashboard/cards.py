@@ -17,7 +17,7 @@ from dash import html
 
 from livepde.dashboard.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
-from livepde.plots.dataset import groups, labelled, modes_told, prior_left
+from livepde.plots.style import groups, labelled, modes_told, prior_left
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
 from livepde.runs import severities
 from livepde.runs.summary import STATES, channel_errors, determination, digits

@@ -1,16 +1,21 @@
-"""Fields of a run in a browser: along an interval, on a plane domain, in a solid."""
+"""Fields of a run in a browser: along an interval, on a plane domain, in a solid.
+
+Matrices that interpolate values at the vertices to the drawn points are cached.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
+import scipy.sparse as sp
 import xarray as xr
+from scipy.spatial import Delaunay
 
-from livepde.dashboard import cuts
 from livepde.dashboard.canvas import (
     GRID,
     at_time,
@@ -25,8 +30,205 @@ from livepde.dashboard.canvas import (
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
 
+MOST_LINES = 120  # of a map in each direction
+OUTSIDE = 1e-9  # barycentric coordinates may be negative by so much
+# A hexahedron as six tetrahedra around its diagonal from corner 0 to corner 6.
+TETRAHEDRA = ((0, 1, 2, 6), (0, 2, 3, 6), (0, 3, 7, 6), (0, 7, 4, 6), (0, 4, 5, 6), (0, 5, 1, 6))
+FACES = {
+    "tetra": ((0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3)),
+    "hexahedron": (
+        (0, 1, 2, 3),
+        (4, 5, 6, 7),
+        (0, 1, 5, 4),
+        (1, 2, 6, 5),
+        (2, 3, 7, 6),
+        (3, 0, 4, 7),
+    ),
+}
 FINE = 0.2  # share of a mesh's lines on each side that may lie far out
 OUT = 4.0  # how many times larger a domain is than where its mesh is fine, to begin there
+
+
+@dataclass(frozen=True, eq=False)
+class Map:
+    """A plane domain on a grid that is as fine as its mesh."""
+
+    # x, y: lines of the grid
+    x: Array
+    y: Array
+    # From vertices to the points of the grid, row by row; shape (len(y) * len(x), vertices)
+    weights: sp.csr_array
+    inside: Any  # points that lie in the domain
+
+    def of(self, values: Array) -> Array:
+        """Return a field on the grid, shape (len(y), len(x)); NaN outside the domain."""
+        found = np.where(self.inside, self.weights @ values, np.nan)
+        return found.reshape(len(self.y), len(self.x))
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles in space."""
+
+    points: Array  # shape (points, 3)
+    triangles: Any  # shape (triangles, 3)
+    weights: sp.csr_array  # from the vertices of the mesh to the points
+
+    def of(self, values: Array) -> Array:
+        """Return a field at the points."""
+        found: Array = self.weights @ values
+        return found
+
+
+def plane_map(data: xr.Dataset) -> Map:
+    """Return the map of a run in two space dimensions."""
+    points = np.column_stack([data["x"].values, data["y"].values])
+    return _plane_map(_Mesh(points, _corners(data, ("triangle", "quad"))))
+
+
+def boundary(data: xr.Dataset) -> Surface:
+    """Return the surface of a solid domain."""
+    return _boundary(_solid(data))
+
+
+def slices(data: xr.Dataset, share: float = 0.5) -> list[Surface]:
+    """Return the cuts of a solid domain by three planes, across x, y and z.
+
+    `share`: position of each plane, as a share of the range of its coordinate.
+    """
+    return _slices(_solid(data), share)
+
+
+class _Mesh:
+    """Vertices and cells, hashed by their content: a key for cached cuts."""
+
+    def __init__(self, points: Array, cells: Any) -> None:
+        self.points = points
+        self.cells = cells
+        self._key = (points.tobytes(), cells.tobytes())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Mesh) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+
+def _corners(data: xr.Dataset, kinds: tuple[str, ...]) -> Any:
+    """Return the vertices of each cell; without cells in the dataset those of Delaunay."""
+    for kind in kinds:
+        if kind in data:
+            return data[kind].values.astype(np.intp)
+    axes = [data[axis].values for axis in "xyz" if axis in data.coords]
+    return Delaunay(np.column_stack(axes)).simplices.astype(np.intp)
+
+
+def _solid(data: xr.Dataset) -> _Mesh:
+    points = np.column_stack([data[axis].values for axis in "xyz"])
+    return _Mesh(points, _corners(data, ("tetra", "hexahedron")))
+
+
+def _lines(values: Array) -> Array:
+    """Return the lines of a grid: through vertices, and between them while there are few."""
+    lines = np.unique(values.round(12))
+    # Every other line while there are too many, but always the last; then halve the distances.
+    while len(lines) > MOST_LINES:
+        lines = np.unique(np.append(lines[::2], lines[-1]))
+    while 2 * len(lines) - 1 <= MOST_LINES:
+        lines = np.insert(lines, np.arange(1, len(lines)), (lines[1:] + lines[:-1]) / 2)
+        if len(lines) < 2:
+            break
+    return lines
+
+
+@lru_cache(maxsize=4)
+def _plane_map(mesh: _Mesh) -> Map:
+    corners = mesh.cells
+    if corners.shape[1] == 4:
+        corners = np.vstack([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    x, y = (_lines(values) for values in mesh.points.T)
+    count = len(x) * len(y)
+    vertices = np.zeros((count, 3), dtype=np.intp)
+    weights = np.zeros((count, 3))
+    inside = np.zeros(count, dtype=bool)
+    p = mesh.points[corners]  # (triangles, 3, 2)
+    margin = OUTSIDE * np.ptp(mesh.points, axis=0)
+    low, high = p.min(axis=1) - margin, p.max(axis=1) + margin
+    columns = np.searchsorted(x, low[:, 0]), np.searchsorted(x, high[:, 0], "right")
+    rows = np.searchsorted(y, low[:, 1]), np.searchsorted(y, high[:, 1], "right")
+    for k, (a, b, c) in enumerate(p):
+        i, j = np.meshgrid(
+            np.arange(columns[0][k], columns[1][k]), np.arange(rows[0][k], rows[1][k])
+        )
+        # Barycentric coordinates of the grid points in the box of a triangle, by Cramer's rule.
+        to_b, to_c = b - a, c - a
+        area = to_b[0] * to_c[1] - to_b[1] * to_c[0]
+        if not i.size or not area:
+            continue
+        dx, dy = x[i] - a[0], y[j] - a[1]
+        second = (dx * to_c[1] - dy * to_c[0]) / area
+        third = (dy * to_b[0] - dx * to_b[1]) / area
+        share = np.stack([1.0 - second - third, second, third], axis=-1)
+        hit = (share >= -OUTSIDE).all(axis=-1)
+        at = (j * len(x) + i)[hit]
+        vertices[at], weights[at], inside[at] = corners[k], share[hit], True
+    matrix = sp.csr_array(
+        (weights.ravel(), (np.repeat(np.arange(count), 3), vertices.ravel())),
+        shape=(count, len(mesh.points)),
+    )
+    return Map(x, y, matrix, inside)
+
+
+@lru_cache(maxsize=4)
+def _boundary(mesh: _Mesh) -> Surface:
+    faces = FACES["tetra" if mesh.cells.shape[1] == 4 else "hexahedron"]
+    every = np.vstack([mesh.cells[:, list(face)] for face in faces])
+    _, first, count = np.unique(
+        np.sort(every, axis=1), axis=0, return_index=True, return_counts=True
+    )
+    outer = every[first[count == 1]]  # a face between two cells is there twice
+    if outer.shape[1] == 4:
+        outer = np.vstack([outer[:, [0, 1, 2]], outer[:, [0, 2, 3]]])
+    used, triangles = np.unique(outer, return_inverse=True)
+    weights = sp.eye_array(len(mesh.points), format="csr")[used]
+    return Surface(mesh.points[used], triangles.reshape(outer.shape), weights)
+
+
+@lru_cache(maxsize=8)
+def _slices(mesh: _Mesh, share: float) -> list[Surface]:
+    cells = mesh.cells
+    if cells.shape[1] == 8:
+        cells = np.vstack([cells[:, list(corners)] for corners in TETRAHEDRA])
+    least, size = mesh.points.min(axis=0), np.ptp(mesh.points, axis=0)
+    return [_slice(mesh.points, cells, axis, least[axis] + share * size[axis]) for axis in range(3)]
+
+
+def _slice(points: Array, cells: Any, axis: int, at: float) -> Surface:
+    """Return the cut of tetrahedra by a plane across an axis."""
+    height = points[:, axis] - at
+    above = (height >= 0.0)[cells]
+    order = np.argsort(~above, axis=1, kind="stable")  # corners above the plane come first
+    cells, count = np.take_along_axis(cells, order, axis=1), above.sum(axis=1)
+    # The plane cuts off one corner or three (a triangle), or two (a quadrilateral: two triangles).
+    edges = []  # of three edges that are cut each makes a triangle
+    for number, triangles in (
+        (1, (((0, 1), (0, 2), (0, 3)),)),
+        (2, (((0, 2), (0, 3), (1, 3)), ((0, 2), (1, 3), (1, 2)))),
+        (3, (((0, 3), (1, 3), (2, 3)),)),
+    ):
+        cut = cells[count == number]
+        edges += [np.stack([cut[:, list(edge)] for edge in three], 1) for three in triangles]
+    every = np.concatenate(edges).reshape(-1, 2)
+    ends, triangles_of = np.unique(np.sort(every, axis=1), axis=0, return_inverse=True)
+    first, second = height[ends[:, 0]], height[ends[:, 1]]
+    # The height is linear along an edge, and zero where the plane cuts it.
+    share = first / (first - second)  # one is above the plane, the other one below it
+    rows = np.arange(len(ends))
+    weights = sp.csr_array(
+        (np.append(1.0 - share, share), (np.append(rows, rows), ends.T.ravel())),
+        shape=(len(ends), len(points)),
+    )
+    return Surface(weights @ points, triangles_of.reshape(-1, 3), weights)
 
 
 def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], str]:
@@ -42,7 +244,7 @@ def drawn_by(data: xr.Dataset, cut: float) -> tuple[Callable[..., go.Figure], st
 
 
 def _zoomed(data: xr.Dataset) -> bool:
-    drawn = cuts.plane_map(data)
+    drawn = plane_map(data)
     return _fine(drawn.x) is not None or _fine(drawn.y) is not None
 
 
@@ -68,7 +270,7 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
 
 def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
     """Draw a field on a plane domain, on lines as dense as its mesh."""
-    drawn = cuts.plane_map(data)
+    drawn = plane_map(data)
     values = data[name].values[at_time(data, "snapshot", at)]
     unit = labelled("", unit_of(data, "x")).strip()
     figure = empty(f"x {unit}", f"y {unit}", height=380)
@@ -111,7 +313,7 @@ def field_solid(
     """Draw a field in a solid: its surface, seen through, and cuts across x, y and z."""
     values = data[name].values[at_time(data, "snapshot", at)]
     figure = empty(height=440)
-    parts = [(cuts.boundary(data), 0.15), *((found, 1.0) for found in cuts.slices(data, cut))]
+    parts = [(boundary(data), 0.15), *((found, 1.0) for found in slices(data, cut))]
     low, high = float(values.min()), float(values.max())
     for k, (surface, opacity) in enumerate(parts):
         x, y, z = surface.points.T

@@ -15,9 +15,9 @@ import numpy as np
 from livepde import runs
 from livepde.dashboard.view import with_readings
 from livepde.errors import RunError, optional
-from livepde.plots.dataset import sensor_names
-from livepde.runs import Check, Journal, Run, Table
-from livepde.runs.directory import CASE, JOURNAL
+from livepde.plots.style import sensor_names
+from livepde.runs import Check, Run, Table
+from livepde.runs.directory import CASE
 from livepde.runs.exported import into_place
 from livepde.runs.journal import Event
 
@@ -32,23 +32,11 @@ MOST_READINGS = 100_000  # samples of a run whose readings are drawn
 def write_report(run: Run, target: Path, *, force: bool = False) -> None:
     """Write the report of a run, also of one that still continues.
 
-    Parameters
-    ----------
-    force
-        Replace an existing file.
-
-    Raises
-    ------
-    RunError
-        The target exists, or cannot be written; the run contains no estimates.
-    ConfigurationError
-        Plotly or Jinja2 is not installed.
+    `force`: replace an existing file.
+    Raises `RunError`: the target exists, or cannot be written; the run contains no estimates.
+    Raises `ConfigurationError`: Plotly or Jinja2 is not installed.
     """
-
-    def write(path: Path) -> None:
-        path.write_text(page_of(run), encoding="utf-8")
-
-    into_place(target, write, force=force)
+    into_place(target, lambda path: path.write_text(page_of(run), encoding="utf-8"), force=force)
 
 
 def page_of(run: Run) -> str:
@@ -70,6 +58,7 @@ def page_of(run: Run) -> str:
     if not data.sizes["time"]:
         raise RunError(f"{run.path} contains no estimates yet, so there is nothing to report.")
     axis, drawn = when_axis(data), panels(data)
+    times = [f"{key} {run.record[key]}" for key in ("started", "ended") if key in run.record]
     case = run.path / CASE
     here = Path(__file__).parent
     environment = Environment(
@@ -95,7 +84,7 @@ def page_of(run: Run) -> str:
         case=case.read_text(encoding="utf-8", errors="replace") if case.is_file() else "",
         drawings={panel.name: json.loads(panel.figure.to_json()) for panel in drawn},
         config=CONFIG,
-        written=_written(run),
+        written=" · ".join([f"livepde {run.record.get('livepde', '')}".rstrip(), *times]),
         style=(here / STYLE).read_text(encoding="utf-8"),
         plotly=get_plotlyjs(),
         nonce=secrets.token_urlsafe(16),
@@ -120,7 +109,6 @@ def _verdict(run: Run) -> list[tuple[str, str]]:
 
 
 def _shown(table: Table) -> Table:
-    """Return a table with its numbers as text."""
     rows = [
         [f"{cell:.5g}" if isinstance(cell, float) else str(cell) for cell in row]
         for row in table.rows
@@ -133,20 +121,11 @@ def _checked(check: Check) -> tuple[str, ...]:
     return check.name, f"{check.value:.5g}", f"{check.sense} {check.bound_text}", result
 
 
-def _written(run: Run) -> str:
-    """Return by which version, and when."""
-    record = run.record
-    times = [f"{key} {record[key]}" for key in ("started", "ended") if key in record]
-    return " · ".join([f"livepde {record.get('livepde', '')}".rstrip(), *times])
-
-
 def _journal(run: Run, axis: TimeAxis) -> dict[str, Any]:
     """Return the events of the run, and counts of values not used, as the template takes them."""
-    path = run.path / JOURNAL
-    events: list[Event] = []
-    counts: dict[tuple[str, str], int] = {}
-    if path.is_file():
-        with Journal.open(path) as journal:
+    events, counts = list[Event](), dict[tuple[str, str], int]()
+    with run.reading() as journal:
+        if journal is not None:
             events, counts = journal.events, journal.counts
     newest = events[: -MOST_EVENTS - 1 : -1]
     return {

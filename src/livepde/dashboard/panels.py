@@ -31,7 +31,7 @@ from livepde.dashboard.field_views import drawn_by, field_profile
 from livepde.dashboard.view import READINGS
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE
-from livepde.plots.dataset import (
+from livepde.plots.style import (
     MOST_LINES,
     groups,
     labelled,
@@ -57,20 +57,11 @@ SURE, FLAT = 0.1, 0.9  # shares of the prior standard deviation: determined, not
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A figure with its title and caption.
+    """A figure with its title and caption."""
 
-    Attributes
-    ----------
-    name
-        Unique name among the panels of a run.
-    section
-        Key of `SECTIONS`.
-    title, about
-        Title and caption, as plain text.
-    """
-
-    name: str
-    section: str
+    name: str  # unique name among the panels of a run
+    section: str  # key of `SECTIONS`
+    # title, about: title and caption, as plain text
     title: str
     about: str
     figure: go.Figure
@@ -79,14 +70,9 @@ class Panel:
 def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[Panel]:
     """Return all panels of a run.
 
-    Parameters
-    ----------
-    data
-        A run's dataset; empty ones give no panel.
-    at
-        Time to look back to; default the newest.
-    cut
-        Position of the cuts through solids, as a share of their size along each axis.
+    `data`: a run's dataset; empty ones give no panel.
+    `at`: time to look back to; default the newest.
+    `cut`: position of the cuts through solids, as a share of their size along each axis.
     """
     if not data.sizes.get("time"):
         return []
@@ -268,10 +254,7 @@ def _bounded(data: xr.Dataset) -> xr.Dataset:
 def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -> go.Figure:
     """Draw numbers of one unit over time, with their 95 % bands, reference and bounds.
 
-    Parameters
-    ----------
-    labels
-        Scalar unknowns of the dataset.
+    `labels`: scalar unknowns of the dataset.
     """
     data = _bounded(data)
     figure, axis = over_time(data, unit_label(data, labels[0]), at)
@@ -340,10 +323,7 @@ def residuals(
 ) -> go.Figure:
     """Draw errors of sensors over time: each, or of many their range.
 
-    Parameters
-    ----------
-    variable, dimension
-        "innovation" over "sensor", or "withheld_error" over "withheld".
+    `variable`, `dimension`: "innovation" over "sensor", or "withheld_error" over "withheld".
     """
     data = _bounded(data)
     figure, axis = over_time(data, unit_label(data, variable), at)

@@ -40,10 +40,7 @@ QUIET = 10.0  # seconds without news after which it is asked whether anyone stil
 class Spread(Generic[T]):
     """Items by number, at most so many, spread evenly; the first and the newest are among them.
 
-    Parameters
-    ----------
-    most
-        How many are kept.
+    `most`: how many are kept.
     """
 
     def __init__(self, most: int) -> None:
@@ -86,59 +83,37 @@ class Spread(Generic[T]):
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """Contents of the live page of a run.
+    """Contents of the live page of a run."""
 
-    Attributes
-    ----------
-    version
-        Number that changes with the contents.
-    title, status
-        Title and status of the run. Status is "waiting" (for the first sample), "running", "silent"
-        (its source), "stopped" (unfinished, but without a writer), "finished", "interrupted" or
-        "failed"; "unreadable" with a sentence in `problem`.
-    dataset
-        Estimates, thinned; None before the first.
-    samples, gap
-        Number of estimates; one in `gap` of them is in the dataset.
-    reading
-        True while there is more to read.
-    events, counts
-        Events and counts of the journal.
-    unwell
-        Reason why the run is not well, as in /health; empty if it is.
-    doubts, notes, checks
-        Findings against the estimates, further notes of the run, and its checks.
-    written
-        Time of the last write, in seconds since 1970.
-    ended
-        Date when the run ended, "" before.
-    """
-
-    version: int = 0
+    version: int = 0  # number that changes with the contents
+    # title, status: title and status of the run. Status is "waiting" (for the first sample),
+    # "running", "silent" (its source), "stopped" (unfinished, but without a writer), "finished",
+    # "interrupted" or "failed"; "unreadable" with a sentence in `problem`.
     title: str = ""
     status: str = "waiting"
-    dataset: xr.Dataset | None = None
+    dataset: xr.Dataset | None = None  # estimates, thinned; None before the first
+    # samples, gap: number of estimates; one in `gap` of them is in the dataset
     samples: int = 0
     gap: int = 1
-    reading: bool = False
+    reading: bool = False  # true while there is more to read
+    # events, counts: events and counts of the journal
     events: Sequence[Event] = ()
     counts: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    unwell: str = ""
+    unwell: str = ""  # reason why the run is not well, as in /health; empty if it is
+    # doubts, notes, checks: findings against the estimates, further notes of the run, and its
+    # checks
     doubts: Sequence[str] = ()
     notes: Sequence[str] = ()
     checks: Sequence[Check] = ()
-    written: float = 0.0
-    ended: str = ""
+    written: float = 0.0  # time of the last write, in seconds since 1970
+    ended: str = ""  # date when the run ended, "" before
     problem: str = ""
 
 
 def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
     """Return a dataset with the readings of its sensors and withheld sensors, `READINGS`.
 
-    Parameters
-    ----------
-    readings
-        Shape (time, sensors), the withheld ones last.
+    `readings`: shape (time, sensors), the withheld ones last.
     """
     parts = np.split(readings, [data.sizes["sensor"]], axis=1)
     return data.assign(
@@ -156,15 +131,7 @@ class View:
     Memory and the cost of each update are bounded, whatever the length of the run: only new records
     of a journal are read, and those in memory are thinned.
 
-    Parameters
-    ----------
-    path
-        The run directory.
-
-    Raises
-    ------
-    RunError
-        There is no run.
+    Raises `RunError`: there is no run.
     """
 
     def __init__(self, path: Path) -> None:

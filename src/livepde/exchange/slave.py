@@ -14,13 +14,9 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 from livepde import __version__
-from livepde.exchange.component import Component
-from livepde.exchange.recipe import opened
-from livepde.exchange.unit_process import PERIOD, STATUS, OutputVariable, UnitProcess
+from livepde.exchange.fmu_export import FOLDER, opened
+from livepde.exchange.unit_process import PERIOD, STATUS, Component, OutputVariable, UnitProcess
 from livepde.units import in_si
-
-# Name of the folder within the resources of the unit.
-FOLDER = "process"
 
 if not sys.orig_argv:
     # In a host program other than Python the exporters finalise the interpreter from a thread of
@@ -62,6 +58,10 @@ class IdentifierSlave:
     def _register(self, process: UnitProcess) -> None:
         causality, variability = self._kit("{}Causality"), self._kit("{}Variability")
         real, whole = (("Real", "Integer"), ("Float64", "Int32"))[self.fmi - 2]
+        unit = self.component
+
+        def put(k: int, value: float) -> None:
+            unit.inputs[k] = value
 
         def add(kind: str, item: OutputVariable, cause: Any, get: Any, **more: Any) -> None:
             about = {"description": item.text, "causality": cause, "getter": get, **more}
@@ -74,33 +74,15 @@ class IdentifierSlave:
             time = OutputVariable("time", "s", "Time.")
             add(real, time, causality.independent, float, variability=variability.continuous)
         for k, port in enumerate(process.inputs):
-            put = partial(self._put, k)
             item = OutputVariable(port.name, port.unit, port.text)
-            add(real, item, causality.input, partial(self._input, k), setter=put)
+            add(real, item, causality.input, lambda k=k: unit.inputs[k], setter=partial(put, k))
         for k, item in enumerate(process.outputs()):
-            add(real, item, causality.output, partial(self._output, k))
-        add(whole, OutputVariable("status", "", STATUS), causality.output, self._status)
+            add(real, item, causality.output, lambda k=k: unit.outputs[k])
+        item = OutputVariable("status", "", STATUS)
+        add(whole, item, causality.output, lambda: unit.status)
         item = OutputVariable(PERIOD, "s", "Time between samples; 0: every step takes one.")
-        about = {"setter": self._set_period, "variability": variability.fixed}
-        add(real, item, causality.parameter, self._period, **about)
-
-    def _put(self, k: int, value: float) -> None:
-        self.component.inputs[k] = value
-
-    def _input(self, k: int) -> float:
-        return self.component.inputs[k]
-
-    def _output(self, k: int) -> float:
-        return self.component.outputs[k]
-
-    def _set_period(self, value: float) -> None:
-        self.component.period = value
-
-    def _period(self) -> float:
-        return self.component.period
-
-    def _status(self) -> int:
-        return self.component.status
+        about = {"setter": partial(setattr, unit, "period"), "variability": variability.fixed}
+        add(real, item, causality.parameter, lambda: unit.period, **about)
 
     def to_xml(self, *options: Any) -> Element:
         """Return the model description, with elements that the exporter omits."""

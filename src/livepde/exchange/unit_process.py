@@ -1,4 +1,4 @@
-"""Process behind a co-simulation unit: identifier, input and output channels."""
+"""Process behind a co-simulation unit: identifier, channels, present inputs and outputs."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from datetime import datetime
 
 import numpy as np
 
+from livepde import checkpoint
 from livepde.cases import Case
 from livepde.errors import ConfigurationError, LivepdeError
+from livepde.frames import snapshot_of, vertex_order
 from livepde.identifier import Identifier
 from livepde.laws import GradientLaw
+from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
 from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES
-from livepde.result import Estimate, Result, vertex_order
+from livepde.result import Estimate
 from livepde.samples import Sample, number
 from livepde.streams import Column
 from livepde.streams.table import channel_value
@@ -34,22 +37,18 @@ STEPS = {"degC": "K", "degF": "degR"}
 STATUS = "How the last step went: {}, {} waits for a first sample, {} sample refused.".format(
     ", ".join(f"{k} {code}" for k, code in enumerate(STATUS_CODES)), WAITING, REFUSED
 )
+# Difference of times that is attributed to rounding, relative to the period.
+SAME = 1e-9
 
 
 @dataclass(frozen=True)
 class Port:
-    """Input or output channel of a unit, in the unit of its data.
-
-    Attributes
-    ----------
-    column
-        Conversion of values to the unit of the model.
-    """
+    """Input or output channel of a unit, in the unit of its data."""
 
     name: str
     unit: str
     text: str
-    column: Column
+    column: Column  # conversion of values to the unit of the model
 
     def taken(self, value: float, missing: frozenset[float]) -> float:
         """Return a value in the unit of the model; NaN if it is missing or invalid."""
@@ -83,38 +82,22 @@ class DataTimes:
 
 @dataclass(frozen=True, eq=False)
 class UnitProcess:
-    """An identifier with the inputs and outputs of a co-simulation unit.
+    """An identifier with the inputs and outputs of a co-simulation unit."""
 
-    Attributes
-    ----------
-    name, title
-        A short name, and one line about it.
-    inputs
-        Input channels, read at each communication point.
-    sensors
-        Sensor channels whose model values are outputs, including withheld ones.
-    begin
-        Function that returns the identifier started by a first sample; it may raise `LivepdeError`.
-    second
-        One second in the model's unit of time.
-    missing
-        Numbers that denote a missing sample, in addition to NaN.
-    covariance
-        True if the law provides standard deviations.
-    experiment
-        Times of the case's own data, if it has any.
-    """
-
+    # name, title: a short name, and one line about it
     name: str
     title: str
     model: Model
-    inputs: tuple[Port, ...]
+    inputs: tuple[Port, ...]  # input channels, read at each communication point
+    # Sensor channels whose model values are outputs, including withheld ones
     sensors: tuple[Port, ...]
+    # Function that returns the identifier started by a first sample; it may raise `LivepdeError`
     begin: Callable[[Sample], Identifier]
-    second: float = 1.0
+    second: float = 1.0  # one second in the model's unit of time
+    # Numbers that denote a missing sample, in addition to NaN
     missing: frozenset[float] = frozenset()
-    covariance: bool = True
-    experiment: DataTimes | None = None
+    covariance: bool = True  # true if the law provides standard deviations
+    experiment: DataTimes | None = None  # times of the case's own data, if it has any
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -135,10 +118,7 @@ class UnitProcess:
     def outputs(self) -> list[OutputVariable]:
         """Return descriptions of the outputs except the status, in the order of `shown`.
 
-        Raises
-        ------
-        ConfigurationError
-            Two outputs have the same name.
+        Raises `ConfigurationError`: two outputs have the same name.
         """
         found = [OutputVariable("estimate_time", "s", "Time of the last sample that was used.")]
         space = self.model.parameter_space
@@ -187,8 +167,7 @@ class UnitProcess:
         for value, std in estimate.parameters.values():
             found += self._pair(value, std)
         if self.fields:
-            result = Result(identifier.model, identifier.observed, identifier.withheld)
-            profiles = result.snapshot(estimate).profiles
+            profiles = snapshot_of(identifier.model, estimate.belief).profiles
             for name in self.fields:
                 values = profiles[name]
                 deviations = profiles.get(f"{name}_std", np.full_like(values, math.nan))
@@ -205,10 +184,7 @@ class UnitProcess:
 def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
     """Return the process of a case.
 
-    Parameters
-    ----------
-    origin
-        The date of t = 0, if the times of the case's data are dates.
+    `origin`: the date of t = 0, if the times of the case's data are dates.
     """
     ports = {}
     for name, channel in case.spec.channels.items():
@@ -234,10 +210,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
 def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
     """Return the process of a function that returns an identifier before its first sample.
 
-    Raises
-    ------
-    ConfigurationError
-        The function fails, or returns another type.
+    Raises `ConfigurationError`: the function fails, or returns another type.
     """
     try:
         identifier = build()
@@ -276,3 +249,91 @@ def _ports(observed: Observed, text: str) -> list[Port]:
 
 def _has_covariance(law: object) -> bool:
     return not isinstance(law, GradientLaw)
+
+
+class Component:
+    """Co-simulation component: one sample per communication point; bad samples set a status.
+
+    `inputs`: present values of the channels, NaN if missing.
+    `period`: sampling period in seconds: the first step of each period takes a sample. 0: every
+    step.
+    `outputs`, `status`: output values, in the order of `UnitProcess.outputs`, and status code of
+    the last step.
+    """
+
+    def __init__(self, process: UnitProcess) -> None:
+        self.process = process
+        self.inputs = [math.nan] * len(process.inputs)
+        self.outputs = process.unknown()
+        self.status = WAITING
+        self.period = 0.0
+        self._next = -math.inf
+        self._first = np.zeros(0)
+        self._identifier: Identifier | None = None
+
+    def take(self, seconds: float) -> str:
+        """Take the present inputs as the sample of a time; return a message for the user, or ''."""
+        if self.period > 0.0 and seconds < self._next:
+            return ""
+        process, t = self.process, seconds * self.process.second
+        try:
+            z = self._sample()
+            if z is None:
+                return ""
+            if self._identifier is None:
+                self._identifier = self._begun(np.array([t, *z.values()]))
+            estimate = self._identifier.step(t, z)
+            if self.period > 0.0:
+                # Sample times are multiples of the period, with a tolerance: rounding of
+                # communication times must neither skip nor repeat a sample.
+                self._next = self.period * (math.floor(seconds / self.period + SAME) + 1.0 - SAME)
+        except LivepdeError as error:
+            if math.isnan(self.outputs[0]):  # the first one: the next may begin
+                self._identifier = None
+            self.status = WAITING if self._identifier is None else REFUSED
+            return f"t = {seconds:g} s: {error}"
+        self.status = STATUS_CODES.index(estimate.status.code)
+        self.outputs = process.shown(self._identifier, estimate)
+        return "" if estimate.status.ok else f"t = {seconds:g} s: {estimate.status}"
+
+    def dump(self) -> bytes:
+        """Return the complete state; `restore` continues with identical numbers."""
+        leaves = {"inputs": self.inputs, "outputs": self.outputs, "status": self.status}
+        leaves |= {"period": self.period, "next": self._next}
+        if self._identifier is not None:
+            leaves["first"] = self._first
+            leaves["identifier"] = np.frombuffer(self._identifier.dump(), dtype=np.uint8)
+        return checkpoint.packed({}, leaves)
+
+    def restore(self, content: bytes) -> None:
+        """Restore a state returned by `dump`; raise `RunError` if it is of another unit."""
+        where = "the state of the unit"
+        _, leaves = checkpoint.unpacked(content, where)
+        self.inputs, self.outputs = leaves["inputs"].tolist(), leaves["outputs"].tolist()
+        self.status = int(leaves["status"])
+        self.period, self._next = float(leaves["period"]), float(leaves["next"])
+        if "identifier" not in leaves:
+            self._identifier = None
+            return
+        # A new identifier is built only if the state began with another sample.
+        if self._identifier is None or not np.array_equal(
+            self._first, leaves["first"], equal_nan=True
+        ):
+            self._identifier = self._begun(leaves["first"])
+        self._identifier.restore(leaves["identifier"].tobytes(), where)
+
+    def _sample(self) -> dict[str, float] | None:
+        """Return the inputs in the model's units, NaN if missing; None without a needed one."""
+        ports, missing = self.process.inputs, self.process.missing
+        given = zip(ports, self.inputs, strict=True)
+        z = {port.name: port.taken(value, missing) for port, value in given}
+        # A case leaves out rows of its data without a needed channel, too.
+        lost = any(math.isnan(z[port.name]) for port in ports if port.column.needed)
+        return None if lost else z
+
+    def _begun(self, first: Array) -> Identifier:
+        """Return the identifier started by a first sample: its time, then the inputs."""
+        self._first = first
+        names = [port.name for port in self.process.inputs]
+        z = dict(zip(names, first[1:].tolist(), strict=True))
+        return self.process.begin(Sample(t=float(first[0]), z=z))

@@ -19,6 +19,7 @@ from livepde.laws import (
     MemberReports,
     Problem,
     Report,
+    SensitivityLaw,
     Status,
     stepped,
 )
@@ -33,14 +34,9 @@ State: TypeAlias = Any
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """Square roots of the covariances of all members; see `livepde.laws.Belief`.
+    """Square roots of the covariances of all members; see `livepde.laws.Belief`."""
 
-    Attributes
-    ----------
-    q, u, prior
-        Shapes (members, m, r), (members, n, r) and (members, m, k).
-    """
-
+    # q, u, prior: shapes (members, m, r), (members, n, r) and (members, m, k)
     q: Array
     u: Array
     prior: Array
@@ -48,21 +44,13 @@ class Factors:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`.
+    """Estimates of all members, of the physical parameter; see `livepde.laws.Belief`."""
 
-    Attributes
-    ----------
-    q, u
-        Shapes (members, m) and (members, n).
-    q_std
-        Standard deviations of q, or None if the law has no covariance.
-    factors
-        Covariances; None where members step separately, each with its own.
-    """
-
+    # q, u: shapes (members, m) and (members, n)
     q: Array
     u: Array
-    q_std: Array | None
+    q_std: Array | None  # standard deviations of q, or None if the law has no covariance
+    # Covariances; None where members step separately, each with its own
     factors: Factors | None = None
 
 
@@ -112,12 +100,8 @@ class FleetEngine(ABC):
     def member(self, state: State, k: int) -> Any:
         """Return the state of a member as the law itself has it."""
 
-    def leaves(self, state: State) -> dict[str, Any]:
-        """Return the state as plain arrays."""
-        return checkpoint.flatten(state)
-
     def restored(self, template: State, leaves: Mapping[str, Array]) -> State:
-        """Return the state that `leaves` gave; raises KeyError or ValueError if it does not fit."""
+        """Return the state of these leaves; raises KeyError or ValueError if they do not fit."""
         return checkpoint.rebuild(template, leaves)
 
 
@@ -180,6 +164,9 @@ class BlockEngine(FleetEngine):
     (errors, n), `initial` how it was given.
     """
 
+    law: SensitivityLaw
+    work: SensitivityWork
+
     def __init__(
         self,
         law: Any,
@@ -219,21 +206,16 @@ class BlockEngine(FleetEngine):
         return begun
 
     def step(self, state: SensitivityState, span: Span) -> tuple[SensitivityState, MemberReports]:
-        found: tuple[SensitivityState, MemberReports]
-        found = self.law.step_members(self.work, state, span)
-        return found
+        return self.law.step_members(self.work, state, span)
 
     def finite(self, state: SensitivityState) -> bool:
-        finite: bool = self.law.finite(self.work, state)
-        return finite
+        return self.law.finite(self.work, state)
 
     def settled(self, state: SensitivityState) -> SensitivityState:
-        settled: SensitivityState = self.law.settled(self.work, state)
-        return settled
+        return self.law.settled(self.work, state)
 
     def believed(self, state: SensitivityState, k: int) -> Belief:
-        belief: Belief = self.law.member_belief(self.work, state.now, k)
-        return belief
+        return self.law.member_belief(self.work, state.now, k)
 
     @nonfinite_allowed()  # of members whose step has failed
     def beliefs(self, state: SensitivityState) -> Beliefs:

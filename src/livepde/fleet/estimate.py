@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.fem import FunctionSpace
-from livepde.fleet.engines import Beliefs
+from livepde.fleet.engines import Beliefs, Factors
+from livepde.frames import correlation_of, interval_ends, vertex_order
 from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
-from livepde.records import NOTE, STATUS_CODES, Layout
+from livepde.model import Model
+from livepde.readout import unknown_of
+from livepde.records import NOTE, STATUS_CODES, STATUS_FLAGS, Layout, Record, Snapshot
 from livepde.result import Estimate, kept
 
 if TYPE_CHECKING:
@@ -136,15 +139,35 @@ class FleetEstimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Row:
-    """Record of an estimate: numbers, and no state."""
+    """Record of an estimate: numbers over members, and no state."""
 
     t: float
-    parameters: Mapping[str, tuple[Array, Array]]
     innovation: Array
     withheld_error: Array
     status: IntArray
     steps: Array
     diagnostics: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, estimate: FleetEstimate, **more: Any) -> Self:
+        """Return the record of an estimate, with the numbers that a subclass adds."""
+        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
+        return cls(
+            t=estimate.t,
+            innovation=estimate.innovation,
+            withheld_error=estimate.withheld_error,
+            status=np.array(codes, dtype=np.int32),
+            steps=estimate.steps,
+            diagnostics=estimate.diagnostics.named(),
+            **more,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _NumbersRow(_Row):
+    """Record with the unknown numbers and their standard deviations."""
+
+    parameters: Mapping[str, tuple[Array, Array]]
 
 
 class FleetResult:
@@ -159,25 +182,14 @@ class FleetResult:
         self.members = tuple(members)
         self.layout = layout
         self.last: FleetEstimate | None = None
-        self._rows: list[_Row] = []
+        self._rows: list[_NumbersRow] = []
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def add(self, estimate: FleetEstimate) -> None:
         """Add one estimate."""
-        codes = [STATUS_CODES.index(status.code) for status in estimate.statuses]
-        self._rows.append(
-            _Row(
-                t=estimate.t,
-                parameters=estimate.parameters,
-                innovation=estimate.innovation,
-                withheld_error=estimate.withheld_error,
-                status=np.array(codes, dtype=np.int32),
-                steps=estimate.steps,
-                diagnostics=estimate.diagnostics.named(),
-            )
-        )
+        self._rows.append(_NumbersRow.of(estimate, parameters=estimate.parameters))
         self.last = estimate
 
     def settle(self, estimate: FleetEstimate) -> None:
@@ -214,11 +226,7 @@ class FleetResult:
         if layout.withheld is not None:
             errors = self._series("withheld_error", len(layout.withheld))
             data["withheld_error"] = ((*both, "withheld"), errors, unit)
-        flags = {
-            "flag_values": list(range(len(STATUS_CODES))),
-            "flag_meanings": " ".join(STATUS_CODES),
-        }
-        data["status"] = (both, self._series("status"), flags)
+        data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
         for name, values in self._diagnostics().items():
@@ -242,3 +250,103 @@ class FleetResult:
     def _table(self, values: Any, *more: int) -> Array:
         """Return values of shape (times, members, *more) as (members, times, *more)."""
         return np.swapaxes(np.reshape(values, (len(self._rows), len(self.members), *more)), 0, 1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _MemberRow(_Row):
+    """Record with `Record.numbers` and, where they are kept, the fields."""
+
+    numbers: Array
+    profiles: Mapping[str, Array] | None
+    correlation: Array | None
+
+    def record(self, k: int) -> Record:
+        """Return the record of a member."""
+        snapshot = None
+        if self.profiles is not None:
+            profiles = {name: values[k] for name, values in self.profiles.items()}
+            correlation = None if self.correlation is None else self.correlation[k]
+            snapshot = Snapshot(profiles, {}, correlation)
+        diagnostics = {name: values[k].item() for name, values in self.diagnostics.items()}
+        return Record(
+            t=self.t,
+            numbers=self.numbers[k],
+            innovation=self.innovation[k],
+            withheld_error=self.withheld_error[k],
+            status=int(self.status[k]),
+            steps=int(self.steps[k]),
+            notes={name: value for name, value in diagnostics.items() if np.isfinite(value)},
+            snapshot=snapshot,
+        )
+
+
+class FleetRecords:
+    """Estimates of members that step together, as `Result` keeps those of one.
+
+    `model`: whose unknowns are numbers.
+    `fields_every`: fields of every so many samples are kept.
+    """
+
+    def __init__(self, model: Model, fields_every: int = 1) -> None:
+        self.model = model
+        self.fields_every = fields_every
+        self.size = 0  # numbers that wait
+        self._count = 0
+        self._rows: list[_MemberRow] = []
+
+    def add(self, estimate: FleetEstimate) -> None:
+        """Add one estimate of all members.
+
+        Raises `ConfigurationError`: members step separately: each has an `Estimate` of its own.
+        """
+        beliefs, profiles, correlation = estimate.beliefs, None, None
+        factors = beliefs.factors
+        if factors is None:
+            raise ConfigurationError("what members do that step separately is kept separately.")
+        if self._count % self.fields_every == 0:
+            profiles = self._profiles(beliefs.u, factors)
+            labels = list(self.model.parameter_space.labels.values())
+            correlation = correlation_of(factors.q[:, labels]) if len(labels) > 1 else None
+        numbers = self._numbers(beliefs, factors)
+        row = _MemberRow.of(estimate, numbers=numbers, profiles=profiles, correlation=correlation)
+        self._count += 1
+        self._rows.append(row)
+        self.size += row.numbers.size + row.innovation.size + row.withheld_error.size
+        self.size += sum(values.size for values in (profiles or {}).values())
+
+    def records(self, k: int) -> Iterator[Record]:
+        """Iterate over the records of a member."""
+        return (row.record(k) for row in self._rows)
+
+    def clear(self) -> None:
+        """Drop the rows, once they are written."""
+        self._rows.clear()
+        self.size = 0
+
+    def _numbers(self, beliefs: Beliefs, factors: Factors) -> Array:
+        """Return `Record.numbers` of all members, shape (members, numbers)."""
+        space, columns = self.model.parameter_space, []
+        after, before = (np.linalg.norm(factor, axis=2) for factor in (factors.q, factors.prior))
+        # Share of the prior standard deviation that remains; NaN where the prior had none.
+        shares = after / np.where(before > 0.0, before, np.nan)
+        for label, k in space.labels.items():
+            value, std = beliefs.q[:, k], after[:, k]
+            ends = interval_ends(label, unknown_of(space, label), value, std)
+            columns += [value, std, *ends.values(), shares[:, k]]
+        return np.stack(columns, axis=1)
+
+    def _profiles(self, u: Array, factors: Factors) -> dict[str, Array]:
+        """Return values and standard deviations of the state, (members, vertices) each."""
+        found: dict[str, Array] = {}
+        members, _, r = factors.u.shape
+        order = vertex_order(self.model)
+        for name, block in self.model.state_space.fields.items():
+            part, names = self.model.state_space.part(name), block.variables(name)
+            columns = factors.u[:, part].transpose(1, 0, 2).reshape(-1, members * r)
+            # Variances at the vertices: sums of squares of the rows of the factor there.
+            squares = ((block.at_vertices @ columns) ** 2).reshape(-1, members, r).sum(axis=2)
+            deviations = np.sqrt(squares)
+            for end, values in {"": block.at_vertices @ u[:, part].T, "_std": deviations}.items():
+                rows = values.T.reshape(members, len(names), -1)[:, :, order]
+                found |= {f"{key}{end}": rows[:, c] for c, key in enumerate(names)}
+        return found

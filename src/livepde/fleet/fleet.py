@@ -24,6 +24,7 @@ from livepde.fem import Inputs, Moment
 from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
+from livepde.frames import layout_of
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, Belief, MemberReports, SensitivityLaw, Status
 from livepde.laws.verdict import COUNTS
@@ -31,7 +32,6 @@ from livepde.linalg import Array, IntArray, nonfinite_allowed
 from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.records import STATUS_CODES
-from livepde.result import layout_of
 from livepde.samples import check_noise, noise_channel
 from livepde.stepping import Advance, Between, Scheme, Span, own_noise
 
@@ -264,7 +264,11 @@ class Fleet:
         self._one.check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
-        self._check_order(t, last)
+        if t < last or (t == last and self._samples):
+            raise TimeOrderError(
+                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
+                "sort the stream, and drop repeated samples."
+            )
         values, held = self._filled(named)
         none = np.zeros(len(self))
         missing = np.array([held.get(name, none) for name in self.inputs], dtype=float)
@@ -339,15 +343,7 @@ class Fleet:
                 found[name] = unknown | held.get(name, np.zeros(len(self), dtype=bool))
         return found
 
-    def _check_order(self, t: float, last: float) -> None:
-        if t < last or (t == last and self._samples):
-            raise TimeOrderError(
-                f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
-                "sort the stream, and drop repeated samples."
-            )
-
     def _expected(self, span: Span) -> MemberReports:
-        """Return the predicted readings at the start."""
         members = range(len(self))
         beliefs = [self._believed(self._state, k) for k in members]
         predicted = [
@@ -427,14 +423,9 @@ class Fleet:
     def subset(self, which: IntArray, state: Any, samples: int) -> Fleet:
         """Return a fleet of some members in their present states; for `Shard`.
 
-        Parameters
-        ----------
-        which
-            Numbers of the members.
-        state
-            Of the engine; None before the first sample.
-        samples
-            How many they have taken.
+        `which`: numbers of the members.
+        `state`: of the engine; None before the first sample.
+        `samples`: how many they have taken.
         """
         other = copy.copy(self)
         other._starts = {}
@@ -600,9 +591,8 @@ class Fleet:
         header = {**self.header, "begun": self._state is not None}
         leaves = {"samples": self._samples, **self.ends, **self.fingerprint.leaves}
         if self._state is not None:
-            leaves |= {
-                f"state/{path}": leaf for path, leaf in self._engine.leaves(self._state).items()
-            }
+            state = checkpoint.flatten(self._state)
+            leaves |= {f"state/{path}": leaf for path, leaf in state.items()}
         return checkpoint.packed(header, leaves)
 
     def load(self, path: str | os.PathLike[str]) -> None:
@@ -661,7 +651,6 @@ def _check_positive(name: str, noise: Array) -> None:
 
 
 def _numbers(what: str, values: ArrayLike) -> Array:
-    """Return a new array of floats."""
     try:
         if np.asarray(values).dtype.kind in "USb":
             raise TypeError

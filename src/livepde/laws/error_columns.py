@@ -23,7 +23,7 @@ from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.stepping import ForwardStage
-from livepde.verdict.missing_terms import boundary_lifts, flux_loads, force, scaled_channel
+from livepde.verdict.directions import boundary_lifts, flux_loads, force, scaled_channel
 
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute
 MOST_STEPS = 500  # in which answers go on: errors of unknown size are smooth enough

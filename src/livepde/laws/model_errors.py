@@ -3,7 +3,7 @@
 What errors would do to the readings makes the columns of a linear model: those of the process are
 answers to it (`livepde.laws.error_columns`), those of sensors are added here. Single causes have
 one column each, families many, with an amplitude for each shape in space and course in time. See
-`livepde.verdict.averaged` for the average over them.
+`livepde.verdict.evidence` for the average over them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.observation import Points
-from livepde.verdict.averaged import Causes, Family, LinearModel, Mixture, averaged
 from livepde.verdict.directions import sensor_shifts
+from livepde.verdict.evidence import Causes, Family, LinearModel, Mixture, averaged
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
 MANY = 150  # samples that tell apart what the full list has

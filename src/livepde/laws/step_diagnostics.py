@@ -11,7 +11,7 @@ import numpy as np
 
 from livepde.linalg import Array
 from livepde.verdict import Shifts
-from livepde.verdict.shifts import NOT_KNOWN, known
+from livepde.verdict.findings import NOT_KNOWN, known
 
 Number = TypeVar("Number")
 Other = TypeVar("Other")

@@ -8,7 +8,6 @@ changed.
 from __future__ import annotations
 
 from livepde.plots.curves import ensemble, history, loops, profiles
-from livepde.plots.dataset import labelled, scored_from, sensor_places, time_scale
 from livepde.plots.run_figure import (
     RunPlots,
     corner,
@@ -19,7 +18,15 @@ from livepde.plots.run_figure import (
     overview,
     residuals,
 )
-from livepde.plots.style import GREY, PALETTE, figure
+from livepde.plots.style import (
+    GREY,
+    PALETTE,
+    figure,
+    labelled,
+    scored_from,
+    sensor_places,
+    time_scale,
+)
 from livepde.records import NORMAL_95, interval_95
 
 __all__ = [

@@ -10,8 +10,17 @@ from numpy.typing import ArrayLike
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.plots.dataset import labelled, time_scale, time_text
-from livepde.plots.style import GREY, PALETTE, empty, finish, panel, shades_of
+from livepde.plots.style import (
+    GREY,
+    PALETTE,
+    empty,
+    finish,
+    labelled,
+    panel,
+    shades_of,
+    time_scale,
+    time_text,
+)
 from livepde.records import NORMAL_95, interval_95
 
 if TYPE_CHECKING:

@@ -12,19 +12,25 @@ import numpy as np
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
 from livepde.plots.curves import profiles
-from livepde.plots.dataset import (
+from livepde.plots.style import (
+    GREY,
     MOST_LINES,
+    PALETTE,
+    empty,
+    figure_class,
+    finish,
     groups,
     labelled,
     note,
+    panel,
     scored_from,
     sensor_names,
     sensor_places,
     sensor_units,
+    time_axis,
     time_text,
     time_values,
 )
-from livepde.plots.style import GREY, PALETTE, empty, figure_class, finish, panel, time_axis
 from livepde.records import field_names, interval_95, refused_readings, used_errors
 
 if TYPE_CHECKING:
@@ -403,7 +409,6 @@ def _limit_values(values: Array, ax: Axes) -> None:
 
 
 def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
-    """Mark samples with a failed step."""
     failed = time_values(data, data["time"].values[data["status"].values != 0])
     if len(failed):
         ax.plot(
@@ -417,7 +422,6 @@ def _mark_failures(data: xr.Dataset, ax: Axes) -> None:
 
 
 def _mark_jumps(data: xr.Dataset, ax: Axes) -> None:
-    """Draw a line at each alarm of the jump test."""
     alarms = note(data, "jump")
     if alarms is None:
         return
@@ -477,7 +481,6 @@ def _map_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
 
 
 def _range_panel(data: xr.Dataset, name: str, ax: Axes) -> Axes:
-    """Draw smallest, median and largest value of a field in space over time."""
     t, values = time_values(data, data["snapshot"].values), data[name].values
     ax.fill_between(
         t, values.min(axis=1), values.max(axis=1), color=PALETTE[0], alpha=0.2, label="range"

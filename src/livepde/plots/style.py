@@ -1,19 +1,28 @@
-"""Common style of figures: empty figures, colours, grids and legends."""
+"""What figures show of the dataset of a run, and their common style: colours, axes, legends."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from livepde.dates import instants, when
 from livepde.errors import optional
-from livepde.plots.dataset import time_label
+from livepde.linalg import Array
+from livepde.records import NOTE, scalars
 
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+# Largest number of lines in a panel; more sensors are drawn as one line with their range.
+MOST_LINES = 7
+# Time span from which a unit of the time axis is used, its length in seconds, its name.
+CLOCKS = ((2 * 86400.0, 86400.0, "d"), (2 * 3600.0, 3600.0, "h"))
 # Palette of Okabe and Ito (2008), distinguishable with all common kinds of colour blindness. Yellow
 # is omitted, because it is invisible on white.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -22,6 +31,134 @@ GREY = "#7f7f7f"
 MOST_POINTS = 20_000
 # Width and height of a panel in inches.
 PANEL = (5.4, 3.4)
+
+
+def prior_left(data: xr.Dataset, label: str, k: int = -1) -> float:
+    """Return the share of its prior standard deviation that a number has left at sample k, or NaN.
+
+    Laws without a covariance do not know it.
+    """
+    return float(data[f"{label}_left"].values[k]) if f"{label}_left" in data else math.nan
+
+
+def modes_told(data: xr.Dataset, name: str, k: int = -1) -> tuple[float, int, float]:
+    """Return how many modes of a field the data determine at snapshot k, their number, and `left`.
+
+    `left` is the root mean square over all modes of the remaining share of the prior standard
+    deviation: a mode with the share s counts 1 - s^2 among those that were told.
+    """
+    modes = data[f"{name}_modes"]
+    count, told = int(modes.attrs["of"]), float(modes.values[k])
+    return told, count, math.sqrt(max(1.0 - told / count, 0.0)) if count else math.nan
+
+
+def note(data: xr.Dataset, name: str) -> Array | None:
+    """Return a note of the law over time, shape (samples,); None if the run has none.
+
+    A note whose name clashes with that of a variable is stored under another one: see
+    `Layout.dataset`.
+    """
+    key = f"{NOTE}{name}" if f"{NOTE}{name}" in data else name
+    about = (str(data.attrs.get(kind, "")) for kind in ("fields", "state"))
+    unknown = {*scalars(data), *" ".join(about).split()}
+    if key not in data or key in unknown or data[key].dims != ("time",):
+        return None
+    values: Array = data[key].values
+    return values
+
+
+def groups(data: xr.Dataset) -> dict[str, list[str]]:
+    """Return a mapping from unknown to the labels of its numbers: one, or one per region."""
+    found: dict[str, list[str]] = {}
+    for label in scalars(data):
+        found.setdefault(label.partition("[")[0], []).append(label)
+    return found
+
+
+def labelled(name: str, unit: str) -> str:
+    """Return the label of an axis."""
+    for plain, pretty in (("degC", "°C"), ("**", "^"), ("^2", "²"), ("^3", "³")):
+        unit = unit.replace(plain, pretty)
+    return f"{name} [{unit}]" if unit and unit != "1" else name
+
+
+def time_scale(data: xr.Dataset) -> tuple[float, str]:
+    """Return factor and unit of the time axis: days or hours for long runs in seconds."""
+    unit = str(data["time"].attrs.get("units", ""))
+    if unit in ("s", "second", "seconds") and data.sizes["time"]:
+        span = float(data["time"][-1] - data["time"][0])
+        for least, factor, name in CLOCKS:
+            if span >= least:
+                return factor, name
+    return 1.0, unit
+
+
+def time_values(data: xr.Dataset, times: ArrayLike) -> Array:
+    """Return coordinates on a time axis: dates if the run has them, else as `time_scale`."""
+    dates = instants(data, times)
+    if dates is None:
+        scaled: Array = np.asarray(times, dtype=float) / time_scale(data)[0]
+        return scaled
+    values: Array = dates.tz_localize(None).to_numpy()
+    return values
+
+
+def time_label(data: xr.Dataset) -> str:
+    """Return the label of a time axis; empty for dates."""
+    return "" if instants(data, []) is not None else labelled("t", time_scale(data)[1])
+
+
+def time_text(data: xr.Dataset, t: float) -> str:
+    """Return one time as text: a date, or a number with its unit."""
+    if instants(data, []) is not None:
+        return when(data, t)
+    factor, unit = time_scale(data)
+    return f"t = {t / factor:.4g} {unit}".rstrip()
+
+
+def scored_from(data: xr.Dataset) -> int:
+    """Return the index of the first assimilated sample; earlier ones are not scored."""
+    start = data.attrs.get("assimilate_from")
+    if start is None:
+        return 0
+    first = int(np.searchsorted(data["time"].values, float(start)))
+    return first if first < data.sizes["time"] else 0
+
+
+def sensor_names(data: xr.Dataset) -> list[str]:
+    """Return the names of the assimilated and then of the withheld sensors."""
+    return [str(name) for of in ("sensor", "withheld") if of in data for name in data[of].values]
+
+
+def sensor_units(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
+    """Return the unit of each sensor."""
+    units = dict.fromkeys(names, str(data["innovation"].attrs.get("units", "")))
+    for dimension in ("sensor", "withheld"):
+        if f"{dimension}_unit" in data.coords:
+            own = data[f"{dimension}_unit"].values
+            units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
+    return units
+
+
+class SensorPlaces(NamedTuple):
+    """Names and coordinates of sensors on a plane domain."""
+
+    names: list[str]
+    x: Array
+    y: Array
+
+
+def sensor_places(data: xr.Dataset) -> dict[str, SensorPlaces]:
+    """Return the places of sensors on a plane domain, under "sensor" and "withheld"."""
+    return {
+        kind: SensorPlaces(
+            [str(name) for name in data[kind].values],
+            data[f"{kind}_x"].values,
+            data[f"{kind}_y"].values,
+        )
+        for kind in ("sensor", "withheld")
+        if f"{kind}_y" in data.coords
+    }
 
 
 def figure_class() -> type[Figure]:
@@ -34,10 +171,7 @@ def figure_class() -> type[Figure]:
 def figure(rows: int = 1, columns: int = 1, title: str = "") -> tuple[Figure, list[Axes]]:
     """Return an empty figure and its panels, row by row.
 
-    Raises
-    ------
-    ConfigurationError
-        Matplotlib is not installed.
+    Raises `ConfigurationError`: Matplotlib is not installed.
     """
     drawn = empty(rows, columns, title)
     return drawn, list(drawn.subplots(rows, columns, squeeze=False).ravel())

@@ -36,7 +36,7 @@ from livepde.progress import watched
 from livepde.reproduce import seed, seed_excited
 from livepde.reproduce.experiment import Experiment, Track, failures, track
 from livepde.result import Result
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.samples import Sample
 from livepde.streams import RelativeNoise, Twin
 

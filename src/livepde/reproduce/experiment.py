@@ -14,7 +14,7 @@ from livepde.identifier import Identifier
 from livepde.linalg import Array
 from livepde.progress import watched
 from livepde.result import Estimate, Result
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.streams import Twin
 
 

@@ -29,7 +29,7 @@ from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Subdomain
 from livepde.reproduce.experiment import Experiment, Track, failures, track
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 

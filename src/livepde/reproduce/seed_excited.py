@@ -24,7 +24,7 @@ from livepde.laws import ResidualDamping, SensitivityLaw, Shadows
 from livepde.model import Model
 from livepde.observation import Full
 from livepde.reproduce.experiment import Experiment, Track, failures, track
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
 

@@ -6,6 +6,7 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.runs.directory import (
     JOURNAL,
     RECORD,
+    Outcome,
     Run,
     RunWriter,
     free_path,
@@ -16,7 +17,6 @@ from livepde.runs.directory import open_run as open
 from livepde.runs.drive import Driven, conduct, drive, journal_of, stopped_by_signals
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import Backlog, Live, Retention, Sink
-from livepde.runs.outcome import Outcome
 from livepde.runs.run_verdict import (
     clock_findings,
     doubts,

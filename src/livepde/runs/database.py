@@ -1,10 +1,10 @@
-"""The SQLite file of a journal: connections, locks, checksums and error messages."""
+"""The SQLite file of a journal: tables, connections, locks, checksums and error messages."""
 
 from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,26 @@ REMEDIES = {  # primary result code of SQLite -> what to do
     sqlite3.SQLITE_LOCKED: "stop the other program that uses it",
 }
 CORRUPT = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+
+SCHEMA = (
+    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) "
+    "WITHOUT ROWID",
+    "CREATE TABLE samples (id INTEGER PRIMARY KEY, t REAL NOT NULL, channels BLOB NOT NULL, "
+    "position TEXT NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE estimates (id INTEGER PRIMARY KEY, t REAL NOT NULL, status INTEGER NOT NULL, "
+    "steps INTEGER NOT NULL, numbers BLOB NOT NULL, notes TEXT NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE fields (id INTEGER PRIMARY KEY, last INTEGER NOT NULL, content BLOB NOT NULL, "
+    "crc INTEGER NOT NULL)",
+    "CREATE TABLE checkpoints (id INTEGER PRIMARY KEY, state BLOB NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE events (id INTEGER PRIMARY KEY, t REAL NOT NULL, kind TEXT NOT NULL, "
+    "channel TEXT NOT NULL, message TEXT NOT NULL, crc INTEGER NOT NULL, "
+    "UNIQUE (t, kind, channel, message))",
+    "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
+    "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
+    "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, said TEXT NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
+)
 
 
 def in_memory() -> sqlite3.Connection:
@@ -195,3 +215,13 @@ def checksum(table: str, *values: Any) -> int:
             value = repr(value + 0.0 if isinstance(value, float) else value).encode()
         total = zlib.crc32(value, zlib.crc32(b"\0", total))
     return total
+
+
+def fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
+    """Make the tables of a new journal."""
+    with connection:
+        connection.execute("BEGIN")  # one commit for all
+        for command in SCHEMA:
+            connection.execute(command)
+        rows = [(key, value, checksum("meta", key, value)) for key, value in meta.items()]
+        connection.executemany("INSERT INTO meta VALUES (?, ?, ?)", rows)

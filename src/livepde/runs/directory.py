@@ -1,4 +1,4 @@
-"""The run directory: files of a run, their writer and their reader.
+"""The run directory: the outcome of a run, its files, their writer and their reader.
 
 ::
 
@@ -22,12 +22,13 @@ import os
 import re
 import tomllib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from livepde.atomic_write import PARTIAL, replacing, write_bytes
 from livepde.dates import with_epoch, without_epoch
@@ -35,13 +36,16 @@ from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import RunError
 from livepde.identifier import Identifier
 from livepde.runs.journal import Journal
-from livepde.runs.outcome import FigureFactory, attempted
 from livepde.runs.run_verdict import verdict, verdict_table
 from livepde.runs.summary import arrivals, tables
 
 if TYPE_CHECKING:
     import xarray as xr
 
+T = TypeVar("T")
+
+FigureFactory: TypeAlias = Callable[[], Any]
+"""Returns a matplotlib Figure; called only when somebody wants to see it."""
 FORMAT = 2
 RUNS = "runs"  # where the command line puts them
 RECORD, CASE, ESTIMATES = "run.json", "case.toml", "estimates.nc"
@@ -53,6 +57,58 @@ LONGEST = 10_000_000  # bytes of a record
 OWN, COPY, CONTENT = "sha256", "case_copy_sha256", "estimates_sha256"
 MARKUP = re.compile("<(?=[A-Za-z/!?])")  # of HTML: titles and notes bring none along
 WRITTEN_LATER = (".md", ".png")  # by who looks at a run, which need not be his own
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """Tables, checks, notes, dataset and figures of an experiment.
+
+    Attributes
+    ----------
+    tables, checks, notes
+        Printed parts, in this order.
+    dataset
+        The run, as `Result.to_xarray()` gives it.
+    figures
+        File name without suffix -> function that draws a matplotlib figure.
+    """
+
+    tables: Sequence[Table] = ()
+    checks: Sequence[Check] = ()
+    notes: Sequence[str] = ()
+    dataset: xr.Dataset | None = None
+    figures: Mapping[str, FigureFactory] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """True if every check is."""
+        return all(check.ok for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object: checks, tables, notes."""
+        return {
+            "checks": [check.to_dict() for check in self.checks],
+            "tables": [table.to_dict() for table in self.tables],
+            "notes": list(self.notes),
+        }
+
+
+def attempted(what: str, compute: Callable[[], T], otherwise: T, notes: list[str]) -> T:
+    """Return the value of a computation, or `otherwise` and a note with the reason if it fails.
+
+    A run keeps its data even if one of its diagnostics fails. `OSError`, and so `RunError`
+    (a directory that cannot be written), is raised.
+    """
+    try:
+        return compute()
+    except OSError:
+        raise
+    except Exception as error:  # noqa: BLE001  whatever it is, it is told
+        reason = str(error).split("\n", 1)[0].rstrip(".") or "no reason given"
+        notes.append(
+            f"{what} failed ({type(error).__name__}: {reason[:200]}); everything else is complete."
+        )
+        return otherwise
 
 
 def free_path(wanted: Path) -> Path:
@@ -103,7 +159,6 @@ def run_names(folder: Path) -> list[str]:
 
 
 def _refuse_links(path: Path) -> None:
-    """Raise `RunError` if a file of a run is a link: writing to it would change another file."""
     for item in path.iterdir():
         if item.is_symlink():
             raise RunError(f"{item} is a link: a run is resumed in regular files only.")
@@ -198,10 +253,7 @@ class RunWriter:
 
         The case may have another `intake.shift` than before, which is kept from now on.
 
-        Raises
-        ------
-        RunError
-            There is no such run, or it was of another case.
+        Raises `RunError`: there is no such run, or it was of another case.
         """
         run = open_run(path)
         _refuse_links(path)
@@ -256,7 +308,6 @@ class RunWriter:
         self.record[CONTENT] = [new]
 
     def _report(self, text: str, checks: Sequence[Check], notes: Sequence[str]) -> None:
-        """Write the report, and the record."""
         write_text(self.path / REPORT, text)
         self.record |= {"checks": [check.to_dict() for check in checks], "notes": list(notes)}
         self._save_record()
@@ -354,10 +405,7 @@ class Run:
         Data files are named relative to the case, so the copy in the run directory serves only if
         the original is gone or has changed; then the data must be given.
 
-        Raises
-        ------
-        RunError
-            The run was not made from a case (a reproduction), or its case is gone.
+        Raises `RunError`: the run was not made from a case (a reproduction), or its case is gone.
         """
         copy = self.path / CASE
         if not copy.is_file():
@@ -409,10 +457,8 @@ class Run:
 
     def arrivals(self) -> list[Table]:
         """Return the table of rows that were irregular, if any; of a run with a journal."""
-        if not (self.path / JOURNAL).is_file():
-            return []
-        with Journal.open(self.path / JOURNAL) as kept:
-            return arrivals(kept)
+        with self.reading() as journal:
+            return [] if journal is None else arrivals(journal)
 
     def summary(self) -> list[Table]:
         """Return its tables: verdict, estimates ± standard deviation, errors of each channel."""
@@ -483,7 +529,6 @@ def write_dataset(data: xr.Dataset, path: Path) -> None:
 
 
 def _to_netcdf(data: xr.Dataset, path: Path) -> None:
-    """Write a dataset as netCDF 3."""
     # netCDF 3 knows no dimension without members.
     empty = [name for name, size in data.sizes.items() if size == 0 and name != "time"]
     kept = data.drop_dims(empty)
@@ -493,7 +538,6 @@ def _to_netcdf(data: xr.Dataset, path: Path) -> None:
 
 
 def _digest(record: Mapping[str, Any]) -> str:
-    """Return the digest of a record, in whatever order and layout it is written."""
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 

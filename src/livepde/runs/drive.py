@@ -11,8 +11,9 @@ from pathlib import Path
 from types import FrameType
 
 from livepde.errors import DataError
+from livepde.frames import layout_of
 from livepde.identifier import Identifier
-from livepde.result import Result, layout_of
+from livepde.result import Result
 from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import Live

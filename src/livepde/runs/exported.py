@@ -6,29 +6,285 @@ A run's dataset has the names and units of the model. An exported one follows th
 
 from __future__ import annotations
 
+import re
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from tokenize import TokenError
 from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 import xarray as xr
 
-from livepde.dates import instants
+from livepde.dates import instants, since
 from livepde.errors import ConfigurationError, RunError
-from livepde.records import STATUS_CODES
-from livepde.runs.conventions import (
-    DIFFERENCES,
-    bounded,
-    cf,
-    free_names,
-    kinds_of,
-    oriented,
-    udunits,
-)
-from livepde.runs.directory import Run, write_dataset
+from livepde.records import STATUS_CODES, field_names, interval_95, scalars
+from livepde.runs.directory import Run, plain, write_dataset
+
+CONVENTIONS = "CF-1.11"
+BESIDE = {  # end of a name -> what such a variable says of the one without it
+    "_std": "standard deviation of {}",
+    "_low": "lower end of the 95 % interval of {}",
+    "_high": "upper end of the 95 % interval of {}",
+    "_left": "standard deviation of {}, as a share of the prior's",
+    "_modes": "number of modes of {} that the data determine",
+    "_left_out": "share of modes that the law leaves out in the variance of {}",
+}
+LONG_NAMES = {
+    "snapshot": "time of the fields",
+    "x": "x of the vertices",
+    "y": "y of the vertices",
+    "z": "z of the vertices",
+    "sensor": "assimilated channel",
+    "withheld": "withheld channel",
+    "innovation": "measured minus predicted, one step ahead",
+    "withheld_error": "measured minus predicted of withheld channels, one step ahead",
+    "status": "outcome of the step",
+    "correlation": "correlation of the last estimates",
+}
+DIFFERENCES = ("innovation", "withheld_error")
+CLOCKS = ("time", "snapshot")
+SYMBOLS = {  # of pint -> of UDUNITS, where they differ
+    "°C": "degC",
+    "°F": "degF",
+    "Δ°C": "K",
+    "Δ°F": "degR",
+    "Ω": "ohm",
+    "a": "year",
+    "deg": "degree",
+}
+SCALES = ("degC", "degF")  # their zero is not zero
+NOT_A_UNIT = (AssertionError, AttributeError, SyntaxError, TokenError, TypeError, ValueError)
+Writer: TypeAlias = Callable[[Run, Path, float | None], object]
+NEEDS = {
+    ".parquet": ["pyarrow"],
+    ".zarr": ["zarr"],
+    ".xdmf": ["meshio", "h5py"],
+    ".vtu": ["meshio"],
+    ".vtk": ["meshio"],
+}
+AT_ONE_TIME = (".vtu", ".vtk")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of mesh cell."""
+
+    # dimension, role: dimension of the mesh, and name of such a cell in UGRID
+    dimension: int
+    role: str
+    # Corners to which the edges lead from the first one, in an order that turns right-handed
+    edges: tuple[int, ...]
+    turned: tuple[int, ...]  # order of the corners that corrects a cell of the opposite orientation
+
+
+KINDS = {
+    "triangle": Kind(2, "face", (1, 2), (0, 2, 1)),
+    "quad": Kind(2, "face", (1, 3), (0, 3, 2, 1)),
+    "tetra": Kind(3, "volume", (1, 2, 3), (0, 2, 1, 3)),
+    "hexahedron": Kind(3, "volume", (1, 3, 4), (4, 5, 6, 7, 0, 1, 2, 3)),
+}
+
+
+@cache
+def udunits(unit: str) -> str | None:
+    """Return a unit as UDUNITS writes it; None for one that it has not, such as a root.
+
+    >>> udunits("m^2/s"), udunits("J/(m^3 K)"), udunits("degC"), udunits("")
+    ('m2 s-1', 'J m-3 K-1', 'degC', '1')
+    """
+    from pint.util import to_units_container
+
+    try:
+        found = to_units_container(_registry().parse_units(unit))
+    except NOT_A_UNIT:
+        return None
+    parts = {name: float(str(power)) for name, power in found.items()}
+    if not all(power.is_integer() for power in parts.values()):
+        return None
+    words = []
+    # Positive powers come first: m2 s-1.
+    for name, power in sorted(parts.items(), key=lambda part: part[1] < 0.0):
+        symbol = _registry().get_symbol(name)
+        symbol = SYMBOLS.get(symbol, symbol.replace("µ", "u"))
+        words.append(symbol if power == 1 else f"{symbol}{int(power)}")
+    return " ".join(words) or "1"
+
+
+@cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def cf(
+    data: xr.Dataset, *, title: str = "", source: str = "livepde", history: str = ""
+) -> xr.Dataset:
+    """Return a run's dataset with names, units and relations after the CF conventions.
+
+    Parameters
+    ----------
+    data
+        As `Result.to_xarray` gives it.
+    title, source, history
+        Global attributes; a title that the dataset has comes first.
+
+    Returns
+    -------
+    Dataset
+        `time` and `snapshot` count from a date where the run has one, so that xarray opens them as
+        dates; units are as UDUNITS reads them; names consist of letters, digits and underscores,
+        and `long_name` holds the original name; standard deviations and ends of intervals are
+        `ancillary_variables`; a mesh in two or three dimensions follows UGRID. Of standard names
+        only those of the times: the others are of sea and air.
+    """
+    found = bounded(data)
+    names = free_names(str(name) for name in found.variables)
+    clock = _clock_attrs(str(data["time"].attrs.get("units", "")), data.attrs.get("origin"))
+    for name in names:
+        _describe(found, name, clock)
+        beside = [names[other] for end in BESIDE if (other := f"{name}{end}") in found]
+        if beside:
+            found[name].attrs["ancillary_variables"] = " ".join(beside)
+    found.attrs = plain(data.attrs) | _name_lists(data, names)
+    found.attrs |= {"Conventions": CONVENTIONS, "source": source, "history": history}
+    found.attrs["title"] = str(data.attrs.get("title", "")) or title
+    found = found.rename(names)
+    for kind in kinds_of(found):
+        _add_topology(found, kind)
+    return found
+
+
+def bounded(data: xr.Dataset) -> xr.Dataset:
+    """Return a copy with the 95 % interval of each scalar next to its standard deviation."""
+    found = {}
+    for name, variable in data.data_vars.items():
+        found[name] = variable.copy(deep=False)
+        label = str(name).removesuffix("_std")
+        if label != name and label in scalars(data) and f"{label}_low" not in data:
+            unit = {"units": variable.attrs.get("units", "")}
+            for end, values in zip(("_low", "_high"), interval_95(data, label), strict=True):
+                found[f"{label}{end}"] = xr.DataArray(values, dims="time", attrs=unit)
+    return xr.Dataset(found, data.coords, data.attrs)
+
+
+def free_names(wanted: Iterable[str]) -> dict[str, str]:
+    """Return name -> a unique name of letters, digits and underscores."""
+    found: dict[str, str] = {}
+    for name in wanted:
+        stem = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
+        # In CF a name begins with a letter.
+        stem = stem if stem[:1].isalpha() else f"v{stem}"
+        free, number = stem, 2
+        while free in found.values():
+            free, number = f"{stem}_{number}", number + 1
+        found[name] = free
+    return found
+
+
+def _name_lists(data: xr.Dataset, names: Mapping[str, str]) -> dict[str, str]:
+    """Return the attributes that list variables, by their new names."""
+    state = str(data.attrs.get("state", "")).split()
+    lists = {"scalars": scalars(data), "fields": field_names(data), "state": state}
+    return {
+        key: " ".join(names[name] for name in some if name in names) for key, some in lists.items()
+    }
+
+
+def _clock_attrs(clock: str, origin: str | None) -> dict[str, str]:
+    """Return the CF attributes of times in a unit, counted from a date where the run has one.
+
+    Without a date they are no time coordinate of CF, which counts from one: they have a unit only.
+    """
+    counted = since(clock, origin)
+    if not counted:
+        return _unit_attrs("time", clock)
+    return {"standard_name": "time", "axis": "T", **counted, "units_metadata": "leap_seconds: none"}
+
+
+def _unit_attrs(name: str, own: str) -> dict[str, str]:
+    """Return the CF attributes of a variable in this unit."""
+    unit = udunits(own)
+    if unit is None:
+        return {"comment": f"unit: {own}"}
+    if unit not in SCALES:
+        return {"units": unit}
+    # A difference of 5 degC is 5 K, but a temperature of 5 degC is 278.15 K.
+    kind = "difference" if name.endswith("_std") or name in DIFFERENCES else "on_scale"
+    return {"units": unit, "units_metadata": f"temperature: {kind}"}
+
+
+def _describe(data: xr.Dataset, name: str, clock: Mapping[str, str]) -> None:
+    """Set the CF attributes of a variable: long name, unit, axis and type of flags.
+
+    `clock`: attributes of times.
+    """
+    variable = data[name]
+    attrs = variable.attrs
+    attrs.setdefault("long_name", LONG_NAMES.get(name, name))
+    for end, text in BESIDE.items():
+        base = name.removesuffix(end)
+        if base != name and base in data:
+            attrs["long_name"] = text.format(base)
+            attrs.setdefault("units", "")
+    if name in data.coords:
+        variable.encoding["_FillValue"] = None  # a coordinate is never missing
+    own = attrs.pop("units", None)
+    if name in CLOCKS:
+        attrs |= clock
+    elif own is not None:
+        attrs |= _unit_attrs(name, str(own))
+    if "flag_values" in attrs:
+        attrs["flag_values"] = np.array(attrs["flag_values"], dtype=variable.dtype)
+
+
+def kinds_of(data: xr.Dataset) -> list[str]:
+    """Return the kinds of cells that a dataset has."""
+    return [kind for kind in KINDS if kind in data and data[kind].dims == ("cell", "corner")]
+
+
+def oriented(data: xr.Dataset, kind: str) -> Any:
+    """Return the corners of each cell with positive orientation, which other programs expect."""
+    corners = np.array(data[kind].values)
+    about = KINDS[kind]
+    axes = "xyz"[: about.dimension]
+    points = np.column_stack([data[axis].values for axis in axes])
+    edges = [points[corners[:, k]] - points[corners[:, 0]] for k in about.edges]
+    wrong = np.linalg.det(np.stack(edges, axis=1)) < 0.0
+    corners[wrong] = corners[wrong][:, about.turned]
+    return corners
+
+
+def _add_topology(data: xr.Dataset, kind: str) -> None:
+    """Add the mesh topology of vertices and cells after UGRID."""
+    dimension, cell = KINDS[kind].dimension, KINDS[kind].role
+    name = "mesh"
+    while name in data:
+        name += "_"
+    corners = f"{cell}_node_connectivity"
+    axes = [axis for axis in "xyz" if axis in data.coords]
+    data[kind].values = oriented(data, kind)
+    data[kind].attrs |= {"cf_role": corners, "start_index": np.int32(0)}
+    data[kind].attrs["long_name"] = f"vertices of each {kind}"
+    for variable in data.data_vars.values():
+        if variable.dims[-1:] == ("vertex",):
+            variable.attrs |= {"mesh": name, "location": "node"}
+    about = {
+        "cf_role": "mesh_topology",
+        "long_name": "mesh",
+        "topology_dimension": np.int32(dimension),
+        "node_coordinates": " ".join(axes),
+        corners: kind,
+    }
+    if dimension == 2:
+        about["face_dimension"] = "cell"
+    data[name] = ((), np.int32(0), about)
+    data.attrs["Conventions"] = f"{CONVENTIONS} UGRID-1.0"
 
 
 def export(run: Run, target: Path, *, at: float | None = None, force: bool = False) -> None:
@@ -76,18 +332,11 @@ def need(target: Path, packages: Iterable[str], extra: str = "formats") -> None:
             )
 
 
-def into_place(target: Path, write: Callable[[Path], None], *, force: bool = False) -> None:
+def into_place(target: Path, write: Callable[[Path], object], *, force: bool = False) -> None:
     """Write a file or folder next to its target, and move it there when it is complete.
 
-    Parameters
-    ----------
-    write
-        Called with a temporary path of the same name; files written beside it are moved, too.
-
-    Raises
-    ------
-    RunError
-        Something is there already and `force` is not set; it cannot be written.
+    `write`: called with a temporary path of the same name; files written beside it are moved, too.
+    Raises `RunError`: something is there already and `force` is not set; it cannot be written.
     """
     try:
         refuse_file(target, force)
@@ -126,25 +375,6 @@ def _conventional(run: Run) -> xr.Dataset:
         source=f"livepde {record.get('livepde', '')}".strip(),
         history=f"{record.get('started', '')} {command}".strip(),
     )
-
-
-def _netcdf(run: Run, path: Path, at: float | None) -> None:
-    write_dataset(_conventional(run), path)
-
-
-def _zarr(run: Run, path: Path, at: float | None) -> None:
-    # The second format has text of fixed length, which the third has not settled yet.
-    _conventional(run).to_zarr(path, zarr_format=2, consolidated=True)
-
-
-def _csv(run: Run, path: Path, at: float | None) -> None:
-    """Write all variables over time as CSV."""
-    _over_time(run).to_csv(path, index=False)
-
-
-def _parquet(run: Run, path: Path, at: float | None) -> None:
-    """Write all variables over time as Parquet."""
-    _over_time(run).to_parquet(path, index=False)
 
 
 def _over_time(run: Run) -> pd.DataFrame:
@@ -223,21 +453,15 @@ def _fields(data: xr.Dataset, k: int) -> dict[str, Any]:
     return {free: data[name].values[k] for name, free in names.items()}
 
 
-Writer: TypeAlias = Callable[[Run, Path, float | None], None]
 FORMATS: dict[str, Writer] = {
-    ".nc": _netcdf,
-    ".zarr": _zarr,
-    ".csv": _csv,
-    ".parquet": _parquet,
+    ".nc": lambda run, path, at: write_dataset(_conventional(run), path),
+    # The second format has text of fixed length, which the third has not settled yet.
+    ".zarr": lambda run, path, at: _conventional(run).to_zarr(
+        path, zarr_format=2, consolidated=True
+    ),
+    ".csv": lambda run, path, at: _over_time(run).to_csv(path, index=False),
+    ".parquet": lambda run, path, at: _over_time(run).to_parquet(path, index=False),
     ".xdmf": _series,
     ".vtu": _vtk,
     ".vtk": _vtk,
 }
-NEEDS = {
-    ".parquet": ["pyarrow"],
-    ".zarr": ["zarr"],
-    ".xdmf": ["meshio", "h5py"],
-    ".vtu": ["meshio"],
-    ".vtk": ["meshio"],
-}
-AT_ONE_TIME = (".vtu", ".vtk")

@@ -71,10 +71,7 @@ class Feed(Protocol):
 class Gathered(Feed):
     """Samples from the rows of a source, as an `Intake` puts them in order.
 
-    Parameters
-    ----------
-    source, intake
-        Source of rows, and the intake that turns them into samples.
+    `source`, `intake`: source of rows, and the intake that turns them into samples.
     """
 
     def __init__(self, source: RowSource, intake: Intake) -> None:
@@ -175,14 +172,8 @@ def _given(tokens: Iterable[Any]) -> list[Any]:
 class SampleFeed(Feed):
     """Feed of samples that are in order already: a table, or any iterable of samples.
 
-    Parameters
-    ----------
-    samples
-        The samples.
-    names
-        Sensors whose values an array z holds.
-    after
-        Time of the last sample taken before; samples up to it are skipped.
+    `names`: sensors whose values an array z holds.
+    `after`: time of the last sample taken before; samples up to it are skipped.
     """
 
     def __init__(
@@ -213,14 +204,9 @@ class SampleFeed(Feed):
 class Paced(Feed):
     """Samples of the past, replayed at the pace of their times.
 
-    Parameters
-    ----------
-    feed
-        The feed whose samples are replayed.
-    pace
-        Model time that passes in one second.
-    clock, sleep
-        Functions that return the time and wait, both in seconds.
+    `feed`: the feed whose samples are replayed.
+    `pace`: model time that passes in one second.
+    `clock`, `sleep`: functions that return the time and wait, both in seconds.
     """
 
     def __init__(

@@ -6,19 +6,14 @@ identifier from time to time. After a crash at any moment the last checkpoint, t
 and the rows from the last position on give the same numbers as if nothing had happened. One process
 writes; any number of processes may read at the same time.
 
-The journal is append-only: samples and estimates are never changed; only `thin` and withdrawals
-remove them. Freed pages are reused, so that a journal that is thinned stops growing.
-
-A process that is killed loses nothing. A power cut leaves the file intact, but may lose the most
-recent samples: a sync to disk for each sample would cost more than its step. A file that is
-followed delivers them again; a broker to which they were acknowledged does not.
+The journal is append-only: only `thin` and withdrawals remove samples and estimates. A process that
+is killed loses nothing. A power cut leaves the file intact, but may lose the most recent samples: a
+sync to disk for each sample would cost more than its step.
 
 Each record has a checksum, which is verified on each read. SQLite checks the pages of the file when
 a writer opens it, and when estimates are read from the first one on. Damage raises `RunError`.
-
 After a failed write (a full disk) a journal accepts no further records, so that no checkpoint can
-skip lost samples. Records committed before are intact; `reopen`, or a new writer, continues from
-them.
+skip lost samples; `reopen`, or a new writer, continues from those committed before.
 """
 
 from __future__ import annotations
@@ -43,9 +38,11 @@ from livepde.linalg import Array
 from livepde.records import STATUS_CODES, Layout, Record, RecordArrays, Snapshot
 from livepde.runs.database import (
     AGAIN,
+    SCHEMA,
     check_file,
     checksum,
     damaged,
+    fill,
     in_memory,
     locked,
     reader,
@@ -69,24 +66,6 @@ FEW = 64  # samples that are compared to recognise a repeated row
 TOGETHER = 1000  # estimates that are read at once: a slow reader must not hold up the writer
 LONGEST = 2000  # characters of the message of an event
 
-SCHEMA = (
-    "CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, crc INTEGER NOT NULL) "
-    "WITHOUT ROWID",
-    "CREATE TABLE samples (id INTEGER PRIMARY KEY, t REAL NOT NULL, channels BLOB NOT NULL, "
-    "position TEXT NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE estimates (id INTEGER PRIMARY KEY, t REAL NOT NULL, status INTEGER NOT NULL, "
-    "steps INTEGER NOT NULL, numbers BLOB NOT NULL, notes TEXT NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE fields (id INTEGER PRIMARY KEY, last INTEGER NOT NULL, content BLOB NOT NULL, "
-    "crc INTEGER NOT NULL)",
-    "CREATE TABLE checkpoints (id INTEGER PRIMARY KEY, state BLOB NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE events (id INTEGER PRIMARY KEY, t REAL NOT NULL, kind TEXT NOT NULL, "
-    "channel TEXT NOT NULL, message TEXT NOT NULL, crc INTEGER NOT NULL, "
-    "UNIQUE (t, kind, channel, message))",
-    "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
-    "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
-    "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, said TEXT NOT NULL, crc INTEGER NOT NULL)",
-    "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
-)
 ESTIMATES = (
     "SELECT id, t, status, steps, numbers, notes, estimates.crc, last, content, fields.crc "
     "FROM estimates LEFT JOIN fields USING (id) WHERE "
@@ -147,7 +126,9 @@ class Journal:
         self.noise = tuple(map(noise_channel, self.channels))
         self._vertices = max(map(len, self.layout.coordinates.values()), default=0)
         self._thinned = 0
-        self._file = None if path is MEMORY else _identity(path)
+        # Device and inode identify the file, whatever its name.
+        found = None if path is MEMORY else path.stat()
+        self._file = None if found is None else (found.st_dev, found.st_ino)
         self._stand()
 
     def _stand(self) -> None:
@@ -170,7 +151,7 @@ class Journal:
         }
         if path is None:
             connection = in_memory()
-            _fill(connection, meta)
+            fill(connection, meta)
             return cls(MEMORY, connection, None)
         lock = locked(path)
         with released(path, lock):
@@ -181,7 +162,7 @@ class Journal:
                 )
             with replacing(path) as partial, closing(sqlite3.connect(partial)) as new:
                 new.execute("PRAGMA journal_mode = MEMORY")  # no second file beside it
-                _fill(new, meta)
+                fill(new, meta)
             return cls(path, writer(path), lock)
 
     @classmethod
@@ -237,10 +218,7 @@ class Journal:
     def reopen(self) -> None:
         """Continue after a failed write, from the last commit.
 
-        Raises
-        ------
-        RunError
-            The file still cannot be written, or its records are damaged.
+        Raises `RunError`: the file still cannot be written, or its records are damaged.
         """
         with suppress(sqlite3.Error):
             self._db.close()
@@ -281,12 +259,8 @@ class Journal:
     def accept(self, t: float, values: Mapping[str, float], position: str = "") -> Taken:
         """Insert a sample, which survives a kill of the process from the next commit on.
 
-        Parameters
-        ----------
-        t, values
-            Time and values of the channels; NaN or absent: missing.
-        position
-            Position of the source after the sample, to resume from.
+        A value that is NaN or absent is missing. The run resumes from the `position` of the source
+        after the sample.
         """
         # Most samples have no noise; the length of a row tells readers whether it has.
         names = self.channels
@@ -302,7 +276,6 @@ class Journal:
         self._current = self._newest
 
     def _insert(self, table: str, *values: Any, conflict: str = "") -> None:
-        """Write a record with its checksum."""
         places = ", ".join("?" * (len(values) + 1))
         command = f"INSERT INTO {table} VALUES ({places}) {conflict}"
         self._execute(command, *values, checksum(table, *values))
@@ -310,13 +283,7 @@ class Journal:
     def extend(self, rows: Iterable[tuple[Array, Record]], state: bytes) -> None:
         """Insert samples with their estimates and the state after them, in one transaction.
 
-        Parameters
-        ----------
-        rows
-            Values of the channels of each sample, with or without their noise after them, and its
-            estimate.
-        state
-            State of the identifier after the last sample.
+        A row has the values of the channels, with or without their noise after them.
         """
         for row, record in rows:
             self._enter(record.t, row.tobytes(), "")
@@ -393,10 +360,7 @@ class Journal:
     def commit(self, position: str | None = None) -> None:
         """Commit: readers see all records until now, and they survive a kill of the process.
 
-        Parameters
-        ----------
-        position
-            Position of the source now, if it has delivered unusable rows since then.
+        `position` is that of the source now, if it has delivered unusable rows since then.
         """
         if position is not None:
             # With the number of the sample, since the position of any later sample supersedes it.
@@ -610,7 +574,6 @@ class Journal:
                 yield taken
 
     def _samples(self, which: str, *values: Any) -> Iterator[Taken]:
-        """Iterate over samples."""
         rows = self._read(f"SELECT * FROM samples {which}", *values)
         for number, t, channels, _ in self._sound("samples", rows):
             with sound(self.path):
@@ -729,19 +692,3 @@ class Journal:
             self._say("thinned", str(end))
         self._write(self._db.commit)
         self._thinned = max(self._thinned, end)
-
-
-def _identity(path: Path) -> tuple[int, int]:
-    """Return the device and inode numbers, which identify a file whatever its name."""
-    found = path.stat()
-    return found.st_dev, found.st_ino
-
-
-def _fill(connection: sqlite3.Connection, meta: Mapping[str, str]) -> None:
-    """Make the tables of a new journal."""
-    with connection:
-        connection.execute("BEGIN")  # one commit for all
-        for command in SCHEMA:
-            connection.execute(command)
-        rows = [(key, value, checksum("meta", key, value)) for key, value in meta.items()]
-        connection.executemany("INSERT INTO meta VALUES (?, ?, ?)", rows)

@@ -19,9 +19,9 @@ from livepde.errors import DataError, LivepdeError, RunError
 from livepde.identifier import Identifier
 from livepde.laws import numerical
 from livepde.result import Estimate, Result
+from livepde.runs.directory import attempted
 from livepde.runs.feeds import Feed
 from livepde.runs.journal import Event, Journal, Taken
-from livepde.runs.outcome import attempted
 from livepde.stepping import LONG_SUBSTEPS, interruptible
 from livepde.streams.intake import Ready, Remark
 from livepde.verdict import LEVELS, NOT_JUDGED, ModelErrors, Verdict

@@ -1,13 +1,18 @@
-"""A small HTTP endpoint of a run: probes of the process, /health, /metrics for Prometheus."""
+"""What a live run shows others: /health, /metrics for Prometheus, its log, lines of JSON."""
 
 from __future__ import annotations
 
 import json
+import logging
+import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, TextIO
 
 from livepde import __version__
 from livepde.errors import RunError, optional
+from livepde.library_messages import OneLine
 from livepde.readout import unknown_of
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
@@ -20,6 +25,59 @@ if TYPE_CHECKING:
     from prometheus_client.core import Metric
 
 
+def configure(kind: str = "text", level: int = logging.INFO) -> None:
+    """Configure logging to standard error: messages of livepde, and warnings of other libraries.
+
+    The loggers are livepde.run, livepde.mqtt and livepde.opcua. An event of the run has the fields
+    kind, channel and t in JSON.
+
+    `kind`: "text", or "json": one object for each line, with the time in UTC.
+    `level`: lowest level of the messages of livepde.
+    Raises `RunError`: the package python-json-logger is not installed.
+    """
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    if kind == "json":
+        with optional("service", "A log in JSON needs python-json-logger", RunError):
+            from pythonjsonlogger.json import JsonFormatter
+        names = "%(asctime)s %(levelname)s %(name)s %(message)s"
+        renamed = {"asctime": "time", "levelname": "level", "name": "logger"}
+        lines = JsonFormatter(names, datefmt="%Y-%m-%dT%H:%M:%SZ", rename_fields=renamed)
+        lines.converter = time.gmtime
+        handler.setFormatter(lines)
+    handler.addFilter(OneLine())
+    logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
+    logging.getLogger("livepde").setLevel(level)
+    # asyncua logs each lost connection with a traceback; livepde.opcua logs it in one line.
+    logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+
+
+class JsonLinesSink(Sink):
+    """Each estimate as a line of JSON, as `Estimate.to_dict` has it."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def put(self, estimate: Estimate) -> None:
+        """Write one estimate.
+
+        Raises `OSError`: nobody reads the stream any more, or its disk is full.
+        """
+        line = json.dumps(estimate.to_dict(), allow_nan=False)
+        try:
+            print(line, file=self._stream, flush=True)
+        except OSError:
+            self._abandon()
+            raise
+
+    def _abandon(self) -> None:
+        """Redirect the stream to the null device: flushing its buffer at exit would fail again."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        with suppress(OSError):
+            os.dup2(nowhere, self._stream.fileno())
+        os.close(nowhere)
+
+
 class Metrics(Sink):
     """Estimates as Prometheus metrics; a sink of a run.
 
@@ -30,12 +88,8 @@ class Metrics(Sink):
     `livepde_silent`, `livepde_waiting_samples`, `livepde_verdict`, `livepde_step_seconds_total`,
     `livepde_remarks_total{kind, channel}`.
 
-    Parameters
-    ----------
-    sensors
-        Names of the sensors.
-    second
-        One second in the model's unit of time.
+    `sensors`: names of the sensors.
+    `second`: one second in the model's unit of time.
     """
 
     def __init__(self, sensors: Iterable[str], second: float = 1.0) -> None:
@@ -123,20 +177,9 @@ class Monitor:
     else 503. /readyz also answers 503 while a resumed run takes samples again. A verdict changes
     none of these codes: it is in the content of /health, and a metric.
 
-    Parameters
-    ----------
-    address
-        Where to listen.
-    health
-        Returns the content of /health as JSON; its "ok" decides between the codes 200 and 503, and
-        its "why" is what /readyz says.
-    metrics
-        The metrics that /metrics serves.
-
-    Raises
-    ------
-    RunError
-        The port is taken.
+    `health`: returns the content of /health as JSON; its "ok" decides between the codes 200 and
+    503, and its "why" is what /readyz says.
+    Raises `RunError`: the port is taken.
     """
 
     def __init__(

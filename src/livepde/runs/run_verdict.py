@@ -16,7 +16,7 @@ from livepde.laws.equation_tests import rested
 from livepde.laws.filter_state import pauses
 from livepde.laws.verdict import step_findings
 from livepde.linalg import Array
-from livepde.plots.dataset import note, prior_left
+from livepde.plots.style import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars
 from livepde.runs.summary import digits, jumps, shown
 from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor
@@ -71,10 +71,7 @@ def findings_of(data: xr.Dataset, *, judged: bool) -> list[Finding]:
     deviations; a jump; and, if no law has judged the innovations, a mean square of the last 500 of
     more than four times its expected value.
 
-    Parameters
-    ----------
-    judged
-        Whether the law has judged innovations and refused readings itself.
+    `judged`: whether the law has judged innovations and refused readings itself.
     """
     gradient = note(data, "residual") is not None
     own = [] if judged else [*_model_error(data), *_each("refused", "caution", _refused(data))]
@@ -132,10 +129,7 @@ def clock_findings(journal: Journal) -> list[Finding]:
 def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[Finding]:
     """Return what the times of a run show: units that changed, clocks that leapt, and pauses.
 
-    Parameters
-    ----------
-    table
-        The complete record of the run, whose readings tell a clock that leapt from a pause.
+    `table`: the complete record of the run, whose readings tell a clock that leapt from a pause.
     """
     t, found = data["time"].values, list[Finding]()
     leaps = {}
@@ -311,13 +305,6 @@ def _last(data: xr.Dataset, name: str) -> float:
     """Return the last value of a diagnostic, NaN without."""
     values = note(data, name)
     return math.nan if values is None else float(values[-1])
-
-
-def _last_known(data: xr.Dataset, name: str) -> float:
-    """Return the last finite value of a note, NaN without."""
-    values = note(data, name)
-    known = np.empty(0) if values is None else values[np.isfinite(values)]
-    return float(known[-1]) if len(known) else math.nan
 
 
 def _times(data: xr.Dataset, name: str, more: float = 0.0) -> Array:

@@ -1,7 +1,8 @@
-"""Summary of a run: estimates, errors of each channel, checks."""
+"""Summary of a run: estimates, resistance of a wall, errors of each channel, checks."""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +14,16 @@ from livepde.dates import when
 from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.diagnostics.identifiability import TRADED, InformationGain
 from livepde.frames import estimates, model_errors, relative_error
-from livepde.plots.dataset import modes_told, note, prior_left
+from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors
 from livepde.runs.journal import Journal
-from livepde.runs.thermal_resistance import resistance
 
 if TYPE_CHECKING:
     import xarray as xr
 
+# Attributes of a dataset: layers as JSON, label of a conductivity -> thickness in m; and the sum of
+# the surface resistances in m^2 K/W, if they are stated.
+LAYERS, SURFACES = "wall_layers", "surface_resistance"
 MOST_ROWS = 40
 DIGITS = 15  # of a number
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
@@ -37,6 +40,47 @@ STATES = {
 }
 """How well the data determine a number, as `determination` returns it -> words."""
 CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
+
+
+@dataclass(frozen=True)
+class Resistance:
+    """R = sum of thickness/k of a wall, without its surfaces."""
+
+    R: float  # value in m^2 K/W
+    relative: float  # standard deviation of ln R, to first order in those of ln k
+    # Sum of the surface resistances in m^2 K/W; None if they are not stated
+    surfaces: float | None = None
+
+    @property
+    def U(self) -> float:
+        """Transmittance 1/(R + surface resistances) in W/(m^2 K)."""
+        return 1.0 / (self.R + (self.surfaces or 0.0))
+
+    @property
+    def relative_U(self) -> float:
+        """Standard deviation of ln U."""
+        return self.relative * self.R * self.U
+
+
+def resistance(data: xr.Dataset) -> Resistance | None:
+    """Return the resistance of the wall of a run at its end; None if the run is of no wall."""
+    layers: Mapping[str, float] = json.loads(data.attrs.get(LAYERS, "{}"))
+    if not layers or not data.sizes["time"]:
+        return None
+    k = np.array([float(data[label][-1]) for label in layers])
+    relative = np.array([float(data[f"{label}_std"][-1]) for label in layers]) / k
+    parts = np.array([*layers.values()]) / k
+    correlation = np.eye(len(k))
+    if len(k) > 1 and "correlation" in data:
+        names = [str(name) for name in data["unknown"].values]
+        rows = [names.index(label) for label in layers]
+        correlation = data["correlation"].values[np.ix_(rows, rows)]
+    R = float(parts.sum())
+    # d ln R / d ln k_i = -R_i / R.
+    slopes = relative * parts / R
+    variance = float(slopes @ correlation @ slopes)
+    surfaces = data.attrs.get(SURFACES)
+    return Resistance(R, variance**0.5, None if surfaces is None else float(surfaces))
 
 
 def digits(value: float, std: float) -> tuple[str, str]:
@@ -164,7 +208,6 @@ def jumps(data: xr.Dataset) -> list[Jump]:
 
 
 def _interval(low: float, high: float, std: float) -> str:
-    """Return an interval as text, to the second digit of the standard deviation; "–" without."""
     if not math.isfinite(std) or math.isnan(low):
         return "–"
     return f"{digits(low, std)[0]} to {digits(high, std)[0]}"
@@ -375,12 +418,8 @@ def _told(data: xr.Dataset, labels: Sequence[str]) -> Table:
 def determination(attrs: Mapping[Any, Any], value: float, left: float) -> str:
     """Return how well the data determine a number: a verdict of `InformationGain`, or "moves".
 
-    Parameters
-    ----------
-    attrs
-        Attributes of the number in the dataset.
-    value, left
-        Its value, and the share of its prior standard deviation that is left.
+    `attrs`: attributes of the number in the dataset.
+    `value`, `left`: its value, and the share of its prior standard deviation that is left.
     """
     # Laws clip to the bounds, so a number at its bound has exactly the value of the bound.
     bounds = [attrs[end] for end in ("lower_bound", "upper_bound") if attrs.get(end) == value]
@@ -403,7 +442,6 @@ def _traded(data: xr.Dataset, label: str) -> list[str]:
 
 
 def _jumped(data: xr.Dataset) -> Table:
-    """Return the table of jumps: times, and unknowns that moved."""
     rows: list[tuple[Any, ...]] = []
     for jump in jumps(data):
         at = when(data, jump.t)

@@ -134,10 +134,8 @@ class Listener(TcpWSGIServer):  # type: ignore[misc]
 def listener(application: WSGIApplication, place: socket.socket, refusal: Refusal) -> Listener:
     """Return a server that listens at a bound socket; its `run` serves.
 
-    Parameters
-    ----------
-    refusal
-        Function of a header that returns why the application will refuse it; empty if it will not.
+    `refusal`: function of a header that returns why the application will refuse it; empty if it
+    will not.
     """
     server = Listener(
         application,

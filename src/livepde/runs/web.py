@@ -44,19 +44,12 @@ def _loopback(host: str) -> bool:
 class Address:
     """Where to listen, and who may ask.
 
-    Parameters
-    ----------
-    host, port
-        Interface and port; port 0: a free one.
-    token
-        Secret of each visitor: `?token=...` once, or the header `Authorization: Bearer ...`. On a
-        loopback address none is required unless one is given; on any other address one is
-        generated if none is given.
-
-    Raises
-    ------
-    RunError
-        A token that does not fit into an address, or is too short for the world outside.
+    `host`, `port`: interface and port; port 0: a free one.
+    `token`: secret of each visitor: `?token=...` once, or the header `Authorization: Bearer ...`.
+    On a loopback address none is required unless one is given; on any other address one is
+    generated if none is given.
+    Raises `RunError`: a token that does not fit into an address, or is too short for the world
+    outside.
     """
 
     host: str = "127.0.0.1"
@@ -93,23 +86,10 @@ class Address:
 class Server:
     """A WSGI application, served from its own threads.
 
-    Parameters
-    ----------
-    application, address
-        The application, and the address to listen on.
-
-    Attributes
-    ----------
-    url
-        Address of the server, with the token.
-    shown
-        Address to print or log: with the token only if it was generated here, since the user
-        cannot know it otherwise.
-
-    Raises
-    ------
-    RunError
-        The port is taken, or the package that serves it is not installed.
+    `url`: address of the server, with the token.
+    `shown`: address to print or log: with the token only if it was generated here, since the user
+    cannot know it otherwise.
+    Raises `RunError`: the port is taken, or the package that serves it is not installed.
     """
 
     def __init__(self, application: WSGIApplication, address: Address) -> None:

@@ -1,7 +1,6 @@
 """Verdict of a run on itself: its level, with the findings against it."""
 
 from livepde.verdict.assess import REFUSED, Position, assess
-from livepde.verdict.channel_ledgers import InputLedger, WithheldLedger
 from livepde.verdict.directions import Dictionary, ScoreDirection
 from livepde.verdict.findings import (
     FEWEST,
@@ -11,19 +10,22 @@ from livepde.verdict.findings import (
     NOT_JUDGED,
     NUMBERS,
     PROMISES,
+    REFINE,
     Cause,
     Finding,
     Severity,
+    Shifts,
     Verdict,
     at_bound,
     channel_setting,
+    discretised,
     flat,
+    held_inputs,
     too_few,
 )
 from livepde.verdict.judge import Judge, ScoredSample
-from livepde.verdict.ledger import WINDOWS, Ledger
+from livepde.verdict.ledger import WINDOWS, InputLedger, Ledger, WithheldLedger
 from livepde.verdict.model_errors import Allowed, ModelErrors
-from livepde.verdict.shifts import REFINE, Shifts, discretised, held_inputs
 
 __all__ = [
     "FEWEST",

@@ -10,13 +10,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from livepde.linalg import Array
-from livepde.verdict.directions import DRIFT, LAG, OFFSET, Dictionary, ScoreDirection
+from livepde.verdict.directions import (
+    DRIFT,
+    FIXED,
+    LAG,
+    LOSS,
+    OFFSET,
+    REACH,
+    SCALED,
+    Dictionary,
+    ScoreDirection,
+)
 from livepde.verdict.evidence import (
     CAUSES,
     RECORD,
     CauseEvidence,
     causes_of,
-    chance,
     constancy,
     disagreement,
     following,
@@ -35,8 +44,7 @@ from livepde.verdict.findings import (
     channel_setting,
     too_few,
 )
-from livepde.verdict.ledger import Ledger
-from livepde.verdict.missing_terms import FIXED, GAIN, LOSS, REACH
+from livepde.verdict.ledger import Ledger, chance
 from livepde.verdict.sentences import (
     ESTIMATED,
     FINDINGS,
@@ -67,50 +75,29 @@ UNSEEN = 3  # sentences on what is not seen
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Data on the estimates of one member, for its verdict.
+    """Data on the estimates of one member, for its verdict."""
 
-    Attributes
-    ----------
-    ledger
-        The ledger of the member: see `Ledger.of_member`.
-    moved
-        Shift of the estimate from the truth by each direction of each window, in reported standard
-        deviations: unknown -> (windows, directions).
-    distance
-        Squared distance of the estimate from the prior mean, chi-square under the model, and its
-        degrees of freedom.
-    sensors
-        Names of the sensors.
-    noise
-        Standard deviation of each, as stated.
-    unit, time_unit
-        Of the sensors and of the time.
-    unknowns
-        Label of each reduced unknown that stays.
-    moving
-        Whether unknowns move.
-    start_uncertain
-        Whether the initial state has an uncertainty of its own.
-    aside
-        Sensors that are set aside: name -> (since when, last reading minus prediction).
-    apart, strain
-        How many sensors correct the state but not the unknowns, and the number of readings of one
-        sensor that did so, since a disturbance began.
-    """
-
-    ledger: Ledger
+    ledger: Ledger  # the ledger of the member: see `Ledger.of_member`
+    # Shift of the estimate from the truth by each direction of each window, in reported standard
+    # deviations: unknown -> (windows, directions)
     moved: dict[str, Array]
+    # Squared distance of the estimate from the prior mean, chi-square under the model, and its
+    # degrees of freedom
     distance: tuple[float, int]
-    sensors: Sequence[str]
-    noise: Array
+    sensors: Sequence[str]  # names of the sensors
+    noise: Array  # standard deviation of each, as stated
+    # unit, time_unit: of the sensors and of the time
     unit: str
     time_unit: str
-    unknowns: Sequence[str]
-    moving: bool
+    unknowns: Sequence[str]  # label of each reduced unknown that stays
+    moving: bool  # whether unknowns move
+    # Sensors that are set aside: name -> (since when, last reading minus prediction)
     aside: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    # apart, strain: how many sensors correct the state but not the unknowns, and the number of
+    # readings of one sensor that did so, since a disturbance began
     apart: int = 0
     strain: int = 0
-    start_uncertain: bool = False
+    start_uncertain: bool = False  # whether the initial state has an uncertainty of its own
 
 
 def assess(dictionary: Dictionary, at: Position) -> Verdict:
@@ -166,7 +153,9 @@ def _misfit(dictionary: Dictionary, at: Position, evidence: CauseEvidence) -> It
         return
     order = _ranked(evidence)
     if recent and _recovered(at, evidence, order):
-        yield _past(at)
+        count = int(at.ledger.age[-1])
+        text, _ = FINDINGS["past"].filled(count=count)
+        yield Finding("past", "note", text, evidence=float(count))
         return
     # Slow noise alone would look so: no cause may be named, but the intervals have to be wider.
     if evidence.whitened < limit:
@@ -233,12 +222,6 @@ def _recovered(at: Position, evidence: CauseEvidence, order: Sequence[tuple[int,
     )
 
 
-def _past(at: Position) -> Finding:
-    count = int(at.ledger.age[-1])
-    text, _ = FINDINGS["past"].filled(count=count)
-    return Finding("past", "note", text, evidence=float(count))
-
-
 def _ranked(evidence: CauseEvidence) -> list[tuple[int, int]]:
     """Return window and number of the directions with evidence, the best first, each once.
 
@@ -291,7 +274,7 @@ def _amount(direction: ScoreDirection, size: float, at: Position) -> float:
         "loss": LOSS / (REACH * interval),
         "boundary": -OFFSET * typical,
         "initial": OFFSET * typical,
-        "channel": -GAIN,
+        "channel": -SCALED,
         "lag": LAG * interval,
     }
     if direction.kind in process:

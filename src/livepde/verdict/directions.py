@@ -1,19 +1,36 @@
-"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks."""
+"""Dictionary of causes of misfit: errors of sensors and of the process that the model lacks.
+
+The free response p of the state to a term that the model lacks (a source, a loss, a boundary
+value), M p' + (B + A q)' p = load, is computed by implicit Euler steps over several samples, and
+its effect on the sensors is interpolated between these steps. The response is needed to a tenth of
+its size, to distinguish causes, and so costs a fraction of a step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ObservationError
+from livepde.fem import Inputs, Moment, On
 from livepde.linalg import Array, IntArray, RowProduct, row_product
 from livepde.model import Model
 from livepde.observation import Observed, Points
-from livepde.verdict.missing_terms import Process
+from livepde.stepping import ForwardStage
 
+FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
+
+REACH = 64.0  # samples in which a source of amplitude one moves the state by three times the noise
+DEVIATIONS = 3.0
+SCALED = 0.1  # of a channel of a source or flux
+LOSS = 0.1  # in `REACH` samples
+MOST_STRIDE = 16  # samples of one step
+MOST_ENDS = 4  # boundaries of the mesh that are looked at
 OFFSET = 3.0  # standard deviations of the noise: a direction of amplitude one, for ...
 DRIFT = 64.0  # ... a drift in so many samples
 GAIN = 0.1  # of the change of a sensor since the start
@@ -24,52 +41,200 @@ MOST_JUMPS = 8  # coordinates of unknowns that may jump
 MOST_SUMS = 12_000  # numbers in one kind of sum
 
 
-@dataclass(frozen=True)
-class ScoreDirection:
-    """A possible cause with an amplitude of one.
+class Now(NamedTuple):
+    """Point of a response: state, latent parameter, inputs, usual interval and rest state."""
 
-    Attributes
-    ----------
-    kind
-        "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`.
-    subject
-        Name of the sensor, channel, boundary or unknown.
-    size
-        The amplitude in its unit; NaN where that is not known beforehand.
-    unit
-        Of the size.
-    axis
-        Coordinate of a position.
-    least, most
-        Bounds of the amount in its unit: a sensor is inside the body, and not beyond the next one.
-    at
-        Coordinate of the sensor along the axis; NaN if it is not a position.
+    # u, q, moment, unit: the state, the latent parameter, time and inputs, and the usual time
+    # between samples
+    u: Array
+    q: Array
+    moment: Moment
+    unit: float
+    # Value at which the state has nothing to lose: the mean of the sensors at the start
+    rest: float
+
+
+Load: TypeAlias = Callable[[Now], Array]
+
+
+class Term(NamedTuple):
+    """A term that a model may lack or have wrong, with an amplitude of one."""
+
+    kind: str  # "boundary", "source", "loss", "flux", "channel" (its gain), or "initial" state
+    subject: str = ""  # boundary or channel; empty for the whole domain
+    # load, lift: function that returns its load, and boundary values of its response, (n,); None
+    # for zero
+    load: Load | None = None
+    lift: Array | None = None
+
+
+class Process:
+    """Responses of a model of one component to the terms that it may lack.
+
+    `model`, `observed`, `level`: the process, its sensors, and their noise, by which amplitudes are
+    counted.
     """
 
-    kind: str
-    subject: str = ""
-    size: float = np.nan
-    unit: str = ""
-    axis: int = 0
+    def __init__(self, model: Model, observed: Observed, level: float) -> None:
+        self.model = model
+        self.observed = observed
+        self.level = DEVIATIONS * level
+        self.stage = ForwardStage(model)
+        self.terms: list[Term] = []
+        if not self.refused(model):
+            lifts = boundary_lifts(model).items()
+            self.terms += [Term("boundary", name, lift=self.level * lift) for name, lift in lifts]
+            self.terms += [*self._domain(), *self._fluxes()]
+            # A gain of each channel that drives the model other than as a boundary value.
+            taken = {term.subject for term in self.terms}
+            others = [name for name in model.channels if name not in taken]
+            self.terms += [Term("channel", name, load=_gain(model, name)) for name in others]
+        zero = np.zeros(model.X.dim)
+        self._lifts = np.array([zero if term.lift is None else term.lift for term in self.terms])
+
+    @staticmethod
+    def refused(model: Model) -> str:
+        """Return why a model has no such terms; empty if it has."""
+        if not model.state_space.single or len(model.algebraic):
+            return "the state has several components"
+        block = next(iter(model.state_space.fields.values()))
+        return "the state is a vector" if block.vector else ""
+
+    @cached_property
+    def _whole(self) -> Array:
+        """Load of a source of one in the whole domain."""
+        return np.asarray(self.model.mass @ self.model.state_space.interpolate(1.0))
+
+    def _domain(self) -> Iterator[Term]:
+        mass = self.model.mass
+
+        def loss(now: Now) -> Array:
+            found: Array = -LOSS / (REACH * now.unit) * (mass @ (now.u - now.rest))
+            return found
+
+        yield Term("source", load=_constant(self._whole, self.level))
+        yield Term("loss", load=loss)
+        yield Term("initial")
+
+    def _fluxes(self) -> Iterator[Term]:
+        """Iterate over a flux through each boundary where the model states no value."""
+        # Each costs a solve with every answer of the process.
+        for name, load in flux_loads(self.model, MOST_ENDS).items():
+            # As much as the source of amplitude one brings into the whole domain.
+            shape = load * (self._whole.sum() / load.sum())
+            yield Term("flux", name, load=_constant(shape, self.level))
+
+    def start(self) -> Array:
+        """Return the responses at the start, (terms, n): that to another initial state."""
+        p: Array = self._lifts.copy()
+        p[[term.kind == "initial" for term in self.terms]] = self.level * self.model.X.free
+        return p
+
+    def advance(self, p: Array, now: Now, h: float) -> Array:
+        """Return the responses a time h later, shape (terms, n)."""
+        # M (p+ - p)/h + S_u p+ = load, with p+ = lift on the boundary.
+        factor, rows = self.stage.linearised(now.u, now.q, h, now.moment)
+        known = (self.model.mass @ p.T).T / h - (rows @ self._lifts.T).T
+        for k, term in enumerate(self.terms):
+            if term.load is not None:
+                known[k] += term.load(now)
+        free = self.model.X.free
+        solved: Array = factor.solve((known * free).T).T
+        found: Array = solved * free + self._lifts
+        return found
+
+    def readings(self, p: Array, now: Now) -> Array:
+        """Return the readings of the responses, shape (terms, sensors)."""
+        physical = self.model.latent.value(now.q)
+        H, _ = self.observed.jacobian(now.u, physical, now.moment)
+        return np.asarray((H @ p.T).T)
+
+
+def _constant(shape: Array, level: float) -> Load:
+    """Return a load that is constant but for the usual interval between samples."""
+    return lambda now: level / (REACH * now.unit) * shape
+
+
+def _gain(model: Model, name: str) -> Load:
+    """Return the load of a channel that is larger by `SCALED` than the model takes it for."""
+    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, SCALED)
+
+
+def boundary_lifts(model: Model) -> dict[str, Array]:
+    """Return channel -> change of the boundary values by a unit of it, (n,), if it drives any.
+
+    Boundary values that no channel moves are one more, of size one.
+    """
+    # Boundary values are affine in the inputs: the difference of two states is a lift.
+    zero, known = np.zeros(model.X.dim), dict.fromkeys(model.channels, 0.0)
+    rest, fixed = model.impose(zero, Moment(0.0, Inputs(known))), model.X.free == 0.0
+    found = {}
+    for name in model.channels:
+        moved = Moment(0.0, Inputs({**known, name: 1.0}))
+        lift = model.impose(zero, moved) - rest
+        if lift.any():
+            fixed &= lift == 0.0
+            found[name] = lift
+    return found | ({FIXED: fixed.astype(float)} if fixed.any() else {})
+
+
+def flux_loads(model: Model, most: int | None = None) -> dict[str, Array]:
+    """Return boundary -> load of a flux of one through it, (n,), where no value is stated.
+
+    Of the first `most` boundaries of the mesh.
+    """
+    ones, found = model.state_space.interpolate(1.0), {}
+    for name in [str(one) for one in model.mesh.boundaries or {}][:most]:
+        form: Any = On(name, lambda u, v, x: u * v)
+        load = model.bilinear(form) @ ones
+        if load.sum() > 0.0 and not load[model.X.free == 0.0].any():
+            found[name] = load
+    return found
+
+
+def force(model: Model, u: Array, q: Array, moment: Moment) -> Array:
+    """Return F - B(u) - A(u) q, (n,), of a latent parameter q."""
+    driven = model.physical_A.vector("v", moment, q=model.latent.value(q), u=u)
+    found: Array = model.F(moment) - model.B(u, moment) - driven
+    return found
+
+
+def scaled_channel(
+    model: Model, name: str, u: Array, q: Array, moment: Moment, share: float
+) -> Array:
+    """Return the change of the force with a channel that is larger by a share of it, (n,)."""
+    more = Inputs({**moment.inputs, name: (1.0 + share) * moment.inputs[name]})
+    return force(model, u, q, Moment(moment.t, more)) - force(model, u, q, moment)
+
+
+def stride(seen: int) -> int:
+    """Return over how many samples a step goes: short ones while the process is young."""
+    return min(max(seen // 8, 1), MOST_STRIDE)
+
+
+@dataclass(frozen=True)
+class ScoreDirection:
+    """A possible cause with an amplitude of one."""
+
+    kind: str  # "offset", "drift", "gain", "lag", "position", "jump", or that of a `Term`
+    subject: str = ""  # name of the sensor, channel, boundary or unknown
+    size: float = np.nan  # the amplitude in its unit; NaN where that is not known beforehand
+    unit: str = ""  # of the size
+    axis: int = 0  # coordinate of a position
+    # least, most: bounds of the amount in its unit: a sensor is inside the body, and not beyond the
+    # next one
     least: float = -np.inf
     most: float = np.inf
-    at: float = np.nan
+    at: float = np.nan  # coordinate of the sensor along the axis; NaN if it is not a position
 
 
 @dataclass(frozen=True, eq=False)
 class ForwardShifts:
-    """How readings change if sensors are shifted, as a matrix on the coefficients that matter.
+    """How readings change if sensors are shifted, as a matrix on the coefficients that matter."""
 
-    Attributes
-    ----------
-    axes
-        Number of axes.
-    used, product
-        Coefficients of the state, (m,), and the product of the matrix of all axes one after the
-        other, (axes * sensors, m), with rows of them.
-    """
-
-    axes: int
+    axes: int  # number of axes
+    # used, product: coefficients of the state, (m,), and the product of the matrix of all axes one
+    # after the other, (axes * sensors, m), with rows of them
     used: IntArray
     product: RowProduct
 
@@ -91,16 +256,10 @@ class Dictionary:
     Those of the sensors come first, each seen by its own sensor only; then jumps of unknowns, and
     missing terms of the process.
 
-    Parameters
-    ----------
-    noise
-        Standard deviation of each sensor.
-    unknowns
-        Labels of the coordinates that may jump, each with its place.
-    dearer
-        With the directions that cost solves: terms that the process may lack.
-    windows
-        In how many windows sums are kept.
+    `noise`: standard deviation of each sensor.
+    `unknowns`: labels of the coordinates that may jump, each with its place.
+    `dearer`: with the directions that cost solves: terms that the process may lack.
+    `windows`: in how many windows sums are kept.
     """
 
     def __init__(
@@ -183,17 +342,11 @@ class Dictionary:
 
         Shape (members, samples, sensors, directions). That of a drift is its slope.
 
-        Parameters
-        ----------
-        noise
-            Shape (members, samples, sensors).
-        change, late
-            Predictions less the first ones, and predictions a sample earlier less those of now,
-            (members, samples, sensors).
-        moved
-            Changes by shifts of the sensors, (members, samples, axes * sensors).
-        answers
-            Readings due to missing terms, (members, samples, terms, sensors).
+        `noise`: shape (members, samples, sensors).
+        `change`, `late`: predictions less the first ones, and predictions a sample earlier less
+        those of now, (members, samples, sensors).
+        `moved`: changes by shifts of the sensors, (members, samples, axes * sensors).
+        `answers`: readings due to missing terms, (members, samples, terms, sensors).
         """
         found = np.empty((*noise.shape, len(self)))
         found[...] = self._constant

@@ -1,11 +1,13 @@
-"""Verdict: its level, and findings with evidence, causes, remedy and consequence."""
+"""Verdict: its level, and findings with evidence, causes, remedy and consequence; shifts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias
+from typing import Any, Generic, Literal, TypeAlias, TypeVar
+
+import numpy as np
 
 from livepde.verdict.model_errors import ModelErrors
 from livepde.verdict.sentences import FINDINGS, percent, quoted
@@ -42,6 +44,25 @@ CANDIDATES = 3  # causes that are named where none explains half of a misfit
 GROSS = ("unit", "exchange")  # kinds of causes
 ONCE = ("discretisation", "hold")  # findings on the run as a whole of which there is one at most
 LARGEST = 1e99  # evidence beyond is written as that
+SHIFTED = 2.0  # standard deviations by which discretisation has shifted an unknown
+DECIDES = 5.0  # the same, from which the interval is little else
+GUESSED = 2.0  # the same by input lines alone: where inputs jump, a guess of even the wrong sign
+SHARED = 1.0  # the same by one kind of error, from which it is named
+SETTING = 1.0  # the same if inputs are readings: no interval holds that
+HOLD = "hold"
+LISTED = 5  # unknowns in a sentence
+REFINE = {
+    "step": (
+        "the time step",
+        "Reduce `steps.dt_max`, or use a second-order scheme.",
+    ),
+    "mesh": ("the mesh", "Refine the mesh (`mesh.cells`) where the state varies most."),
+    "input": ("the linear interpolation of inputs", "Sample these inputs more often."),
+}
+"""Kind of a discretisation error -> its name, and the remedy."""
+NOT_KNOWN: Any = math.nan
+Number = TypeVar("Number")
+Other = TypeVar("Other")
 
 
 @dataclass(frozen=True)
@@ -79,22 +100,14 @@ class Cause:
 
     @classmethod
     def from_dict(cls, stored: Mapping[str, Any]) -> Cause:
-        """Return the cause that `to_dict` has written; earlier versions stored no size."""
-        numbers = {name: _number(stored.get(name)) for name in ("share", "size")}
-        return cls(**{**stored, **numbers})
+        """Return the cause that `to_dict` has written."""
+        return cls(**{**stored, **{name: _number(stored[name]) for name in ("share", "size")}})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the cause as JSON can hold it."""
-        share = None if math.isnan(self.share) else self.share
-        return {
-            "kind": self.kind,
-            "subject": self.subject,
-            "text": self.text,
-            "share": share,
-            "remedy": self.remedy,
-            "setting": self.setting,
-            "size": None if math.isnan(self.size) else self.size,
-        }
+        numbers = {"share": self.share, "size": self.size}
+        plain = {name: None if math.isnan(value) else value for name, value in numbers.items()}
+        return {**vars(self), **plain}
 
 
 @dataclass(frozen=True)
@@ -153,7 +166,9 @@ class Finding:
         if first.share < HALF:
             each = [f"{one.text}{_shown(one.share)}" for one in self.causes[:CANDIDATES]]
             return [f"No single cause explains this. Candidates: {'; '.join(each)}."]
-        text = first.text if first.text.startswith(first.subject or " ") else _capital(first.text)
+        text = first.text
+        if not text.startswith(first.subject or " "):
+            text = text[:1].upper() + text[1:]
         found = [f"{text}{_shown(first.share, 'explains {}')}."]
         found += [f"Alternatively, {one.text}{_shown(one.share)}." for one in others[:1]]
         return found
@@ -168,27 +183,15 @@ class Finding:
     def to_dict(self) -> dict[str, Any]:
         """Return the finding as JSON can hold it."""
         evidence = None if math.isnan(self.evidence) else min(self.evidence, LARGEST)
-        return {
-            "what": self.what,
-            "severity": self.severity,
-            "subject": self.subject,
-            "text": self.text,
-            "evidence": evidence,
-            "measure": self.measure,
-            "causes": [cause.to_dict() for cause in self.causes],
-            "remedy": self.remedy,
-            "shift": {name: float(size) for name, size in self.shift.items()},
-            "sentence": self.sentence,
-        }
+        shift = {name: float(size) for name, size in self.shift.items()}
+        causes = [cause.to_dict() for cause in self.causes]
+        changed = {"evidence": evidence, "causes": causes, "shift": shift}
+        return {**vars(self), **changed, "sentence": self.sentence}
 
 
 def _shown(share: float, words: str = "{}") -> str:
     """Return a share in parentheses; empty if it is not known."""
     return "" if math.isnan(share) else f" ({words.format(percent(share))})"
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _number(value: float | None) -> float:
@@ -304,12 +307,7 @@ class Verdict:
     def from_dict(cls, stored: Mapping[str, Any]) -> Verdict:
         """Return the verdict that `to_dict` has written."""
         findings = [Finding.from_dict(item) for item in stored["findings"]]
-        # Earlier versions stored no "judged", but listed in `untested` that nothing was.
-        untested = any(
-            text.startswith(("innovations", "everything")) for text in stored["untested"]
-        )
-        judged = stored.get("judged", not untested)
-        errors = ModelErrors.from_dict(stored.get("errors"))
+        errors, judged = ModelErrors.from_dict(stored.get("errors")), bool(stored["judged"])
         return cls.of(findings, stored["untested"], stored["unseen"], judged=judged, errors=errors)
 
     @classmethod
@@ -320,8 +318,8 @@ class Verdict:
     def with_findings(self, more: Iterable[Finding]) -> Verdict:
         """Return the verdict with more findings, each of them once.
 
-        One on the same unknown or sensor as an earlier one replaces it: it is of later data. So
-        does one on the discretisation, which an earlier version may have put in other words.
+        One on the same unknown or sensor as an earlier one, or on the run as a whole (`ONCE`),
+        replaces it: it is of later data.
         """
         texts = {finding.text for finding in self.findings}
         new = [finding for finding in more if finding.text not in texts]
@@ -361,8 +359,8 @@ class Verdict:
         # What frees a cause is known where the run has named it already. A key that corrects a
         # column has the size that was fitted.
         causes = [
-            replace(one, remedy=known.remedy, setting=known.setting)
-            if not one.setting and (known := before.get((one.kind, one.subject)))
+            replace(one, remedy=named.remedy, setting=named.setting)
+            if not one.setting and (named := before.get((one.kind, one.subject)))
             else one
             for one in causes
         ]
@@ -389,12 +387,9 @@ class Verdict:
     @property
     def every_sentence(self) -> list[str]:
         """Whether the run is not judged, and all findings: a sentence each, the worst first."""
-        first = [] if self.judged else [self._not_judged()]
-        return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
-
-    def _not_judged(self) -> str:
         why = f" ({self.untested[0]})" if self.untested else ""
-        return f"Not judged: the model was not tested{why}."
+        first = [] if self.judged else [f"Not judged: the model was not tested{why}."]
+        return list(dict.fromkeys([*first, *(finding.sentence for finding in self.findings)]))
 
     @property
     def sentences(self) -> list[str]:
@@ -403,14 +398,87 @@ class Verdict:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict as JSON can hold it."""
-        return {
-            "level": self.level,
-            "findings": [finding.to_dict() for finding in self.findings],
-            "untested": list(self.untested),
-            "unseen": list(self.unseen),
-            "judged": self.judged,
-            "errors": None if self.errors is None else self.errors.to_dict(),
-        }
+        findings = [finding.to_dict() for finding in self.findings]
+        errors = None if self.errors is None else self.errors.to_dict()
+        lists = {"untested": list(self.untested), "unseen": list(self.unseen)}
+        return {**vars(self), **lists, "findings": findings, "errors": errors}
 
     def __str__(self) -> str:
         return "\n".join([self.level, *(f"- {text}" for text in self.sentences)])
+
+
+@dataclass(frozen=True, eq=False)
+class Shifts(Generic[Number]):
+    """Shifts of the unknown numbers by errors that are estimated online.
+
+    Kinds of errors are "step", "mesh", "input" and so on. A number is a float, or an array over
+    members.
+    """
+
+    # Largest shift of an unknown by all kinds together, in standard deviations; NaN: not known
+    largest: Number = NOT_KNOWN
+    # Kind -> shift of that unknown, in standard deviations
+    sizes: Mapping[str, Number] = field(default_factory=dict)
+    # (Label of an unknown, kind) -> its shift, in the unit of the unknown
+    unknowns: Mapping[tuple[str, str], Number] = field(default_factory=dict)
+
+    def by(self, kind: str) -> dict[str, Number]:
+        """Return label -> shift by one kind of error."""
+        return {label: shift for (label, of), shift in self.unknowns.items() if of == kind}
+
+    def named(self) -> dict[str, Number]:
+        """Return the numbers by their names in tables and files, NaN among them."""
+        sizes = {f"{kind}_shift": size for kind, size in self.sizes.items()}
+        shifts = {f"{label}_{kind}_shift": shift for (label, kind), shift in self.unknowns.items()}
+        return {"discretisation_shift": self.largest, **sizes, **shifts}
+
+    def each(self, change: Callable[[Number], Other]) -> Shifts[Other]:
+        """Return the shifts with a function of each number that is known."""
+        return Shifts(
+            change(self.largest) if known(self.largest) else NOT_KNOWN,
+            {kind: change(size) for kind, size in self.sizes.items()},
+            {pair: change(shift) for pair, shift in self.unknowns.items()},
+        )
+
+
+def known(number: Any) -> bool:
+    """Return whether a number, or an array over members, is known: that is not NaN alone."""
+    if isinstance(number, float):  # as most are: without a call of NumPy
+        return not math.isnan(number)
+    return bool(np.ndim(number)) or not math.isnan(number)
+
+
+def discretised(shifts: Shifts[float]) -> Iterator[Finding]:
+    """Return the finding that the discretisation has shifted the unknowns, if it has."""
+    total = shifts.largest
+    sizes = {kind: abs(shifts.sizes[kind]) for kind in REFINE if kind in shifts.sizes}
+    if not total > SHIFTED or not sizes:
+        return
+    # Shares may cancel in the total: the largest is named, and each from `SHARED` on.
+    largest = max(sizes.values())
+    parts = sorted(sizes, key=lambda kind: -sizes[kind])
+    parts = [kind for kind in parts if sizes[kind] >= min(largest, SHARED)]
+    each = [f"{REFINE[kind][0]} by {sizes[kind]:.1f}{_listed(shifts.by(kind))}" for kind in parts]
+    text, _ = FINDINGS["discretisation"].filled(total=total, each=", ".join(each))
+    remedy = " ".join(REFINE[kind][1] for kind in parts)
+    # Shifts are part of the reported variance. Beyond five deviations the interval is little else,
+    # and depends more on the mesh and the step than on the data.
+    unsure = total > DECIDES or sizes.get("input", 0.0) > GUESSED
+    severity: Severity = "caution" if unsure else "note"  # the interval holds it
+    yield Finding("discretisation", severity, text, evidence=total, remedy=remedy)
+
+
+def held_inputs(shifts: Shifts[float]) -> Iterator[Finding]:
+    """Return whether inputs that are constant between readings would matter as straight lines."""
+    total = abs(shifts.sizes.get(HOLD, math.nan))
+    if not total > SETTING:
+        return
+    moved = {label: -shift for label, shift in shifts.by(HOLD).items()}
+    text, remedy = FINDINGS["hold"].filled(total=total, each=_listed(moved))
+    yield Finding("hold", "caution", text, evidence=total, remedy=remedy)
+
+
+def _listed(shifts: Mapping[str, float]) -> str:
+    """Return the shifts of the first unknowns in parentheses."""
+    parts = [f"{label} by {shift:+.2g}" for label, shift in shifts.items() if math.isfinite(shift)]
+    return f" ({', '.join(parts[:LISTED])})" if parts else ""

@@ -33,10 +33,9 @@ import numpy as np
 
 from livepde.linalg import Array, Mask, nonfinite_allowed
 from livepde.stepping import Moments
-from livepde.verdict.directions import JUMP, Dictionary
+from livepde.verdict.directions import JUMP, Dictionary, Now, stride
 from livepde.verdict.evidence import causes_of, quiet
 from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, summed
-from livepde.verdict.missing_terms import Now, stride
 
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
@@ -44,53 +43,36 @@ SAME = 1e-12  # relative difference of readings that are the same
 
 
 class ScoredSample(NamedTuple):
-    """Prior of a filter at a sample, with the sample; in units of the noise.
+    """Prior of a filter at a sample, with the sample; in units of the noise."""
 
-    Attributes
-    ----------
-    C, M
-        Square root of the covariance of the unknowns, (members, r, k), and the product of the
-        matrices that have moved its rows since the last sample, (members, r, rank).
-    a, q
-        Functions that return the estimated reduced and latent unknowns: not every judge asks.
-    u
-        The estimated state.
-    Y, d, used
-        Observed square root, (members, r, sensors), innovations less their shift by the estimated
-        discretisation error, and the mask of the values that are used.
-    z, predicted, noise
-        Readings, their predictions, and the noise, (members or 1, sensors).
-    at
-        Time and inputs.
-    """
-
+    # C, M: square root of the covariance of the unknowns, (members, r, k), and the product of the
+    # matrices that have moved its rows since the last sample, (members, r, rank)
     C: Array
     M: Array
+    # a, q: functions that return the estimated reduced and latent unknowns: not every judge asks
     a: Callable[[], Array]
     q: Callable[[], Array]
-    u: Array
+    u: Array  # the estimated state
+    # Y, d, used: observed square root, (members, r, sensors), innovations less their shift by the
+    # estimated discretisation error, and the mask of the values that are used
     Y: Array
     d: Array
     used: Mask
+    # z, predicted, noise: readings, their predictions, and the noise, (members or 1, sensors)
     z: Array
     predicted: Array
     noise: Array
-    at: Moments
+    at: Moments  # time and inputs
 
 
 class Judge:
     """Configuration of a ledger: it adds samples to it, and sums them.
 
-    Parameters
-    ----------
-    dictionary
-        The directions.
-    sensors, unknowns, n
-        Number of sensors, of reduced unknowns and of coefficients of the state.
-    rank
-        Rows of the square root at most when samples come.
-    still
-        Whether all unknowns stay as they are, so that their record can be kept.
+    `dictionary`: the directions.
+    `sensors`, `unknowns`, `n`: number of sensors, of reduced unknowns and of coefficients of the
+    state.
+    `rank`: rows of the square root at most when samples come.
+    `still`: whether all unknowns stay as they are, so that their record can be kept.
     """
 
     def __init__(
@@ -184,15 +166,8 @@ class Judge:
     def summed_up(self, ledger: Ledger, M: Array) -> tuple[Array, Ledger]:
         """Return w and the ledger after all samples that wait are summed.
 
-        Parameters
-        ----------
-        M
-            As it is now, (members, r, rank).
-
-        Returns
-        -------
-        w
-            Shape (members, r, windows times directions).
+        `M`: as it is now, (members, r, rank).
+        `w`: shape (members, r, windows times directions).
         """
         members, at, due = len(ledger.seen), self._at, ledger.due
         # Only as many rows as some member has waiting are summed.

@@ -8,12 +8,19 @@ theta g_k, and the sums of g r and g g hold all that the samples tell of theta (
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+import math
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 
 from livepde.linalg import Array, IntArray, Mask
+from livepde.verdict.findings import FEWEST, Cause, Finding, Severity, Shifts, channel_setting
+from livepde.verdict.model_errors import FAILED, OF_SIGNAL
+from livepde.verdict.sentences import FINDINGS, LIKELY, table_of
 
 WINDOWS = (0, 64, 512)
 """Samples after which a window begins anew; 0: the window of all samples. The faults of a window
@@ -24,80 +31,66 @@ BATCH = 16  # samples at most that wait until they are summed together
 ROOM = 2**16  # numbers at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
 CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
+HELD = 0.02  # share of the samples in which the last value of an input was held
+CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
+SIMILAR = 0.05  # relative difference of a slope to that of a unit
+UNITS = (
+    ("degF", "degC", 1.8, 32.0),
+    ("degC", "degF", 1.0 / 1.8, -32.0 / 1.8),
+    ("K", "degC", 1.0, 273.15),
+    ("degC", "K", 1.0, -273.15),
+)
+"""Unit that a sensor may have, the one that it is taken for, slope and intercept of that."""
 
 
 @dataclass(frozen=True, eq=False)
 class Ledger:
-    """Running sums of each member over the samples so far.
+    """Running sums of each member over the samples so far."""
 
-    Attributes
-    ----------
-    seen, waiting
-        Number of samples, and of those that wait to be summed, shape (members,).
-    rows
-        Samples that wait, (members, batch, numbers); see `livepde.verdict.judge`.
-    w
-        Coordinates of all directions in all windows on the rows of the square root as they were
-        when the first of these came, (members, rank, windows times directions).
-    times
-        Time of the last sample that was summed, and the usual interval, (members, 2).
-    first, last
-        First prediction of each sensor, and the last that was summed, (members, sensors); NaN
-        before.
-    age, epoch
-        Samples in each window, and how often it has begun anew, (members, windows).
-    sums
-        Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) of each window, direction and
-        sensor, shape (members, 4, windows, directions, sensors).
-    noise
-        Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window
-        and sensor, shape (members, 5, windows, sensors).
-    before
-        Whitened innovation and responses of the last sample, (members, 1 + windows times
-        directions, sensors).
-    present
-        1 where the last sample had a value, shape (members, sensors).
-    score, information
-        Of each block and sensor, about the prior mean: sums of Y r, (members, blocks, sensors, k),
-        and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not kept.
-    length
-        Samples in a block, shape (members,).
-    process
-        States by which the process answers a missing term, (members, terms, n).
-    readings, reached
-        Readings due to those states at the first of two times, and their change per unit of time up
-        to the second one, (members, 2, terms, sensors), and these times, (members, 2).
-    sound
-        Whether nothing spoke against the model in the longest window that ended last, (members,).
-    shown
-        How many readings each sensor has shown, and how many of them a gate has refused, (members,
-        2, sensors).
-    stuck, value
-        How often in a row each sensor has shown the same value, and that value, shapes (members,
-        sensors).
-    """
-
+    # seen, waiting: number of samples, and of those that wait to be summed, shape (members,)
     seen: IntArray
     waiting: IntArray
-    rows: Array
+    rows: Array  # samples that wait, (members, batch, numbers); see `livepde.verdict.judge`
+    # Coordinates of all directions in all windows on the rows of the square root as they were when
+    # the first of these came, (members, rank, windows times directions)
     w: Array
-    times: Array
+    times: Array  # time of the last sample that was summed, and the usual interval, (members, 2)
+    # first, last: first prediction of each sensor, and the last that was summed, (members,
+    # sensors); NaN before
     first: Array
     last: Array
+    # age, epoch: samples in each window, and how often it has begun anew, (members, windows)
     age: IntArray
     epoch: IntArray
+    # Sums of g r, g g, g_k r_(k-1) + g_(k-1) r_k and g_k g_(k-1) of each window, direction and
+    # sensor, shape (members, 4, windows, directions, sensors)
     sums: Array
+    # Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window and
+    # sensor, shape (members, 5, windows, sensors)
     noise: Array
+    # Whitened innovation and responses of the last sample, (members, 1 + windows times directions,
+    # sensors)
     before: Array
-    present: Array
+    present: Array  # 1 where the last sample had a value, shape (members, sensors)
+    # score, information: of each block and sensor, about the prior mean: sums of Y r, (members,
+    # blocks, sensors, k), and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not
+    # kept
     score: Array
     information: Array
-    length: IntArray
-    process: Array
+    length: IntArray  # samples in a block, shape (members,)
+    process: Array  # states by which the process answers a missing term, (members, terms, n)
+    # readings, reached: readings due to those states at the first of two times, and their change
+    # per unit of time up to the second one, (members, 2, terms, sensors), and these times,
+    # (members, 2)
     readings: Array
     reached: Array
+    # Whether nothing spoke against the model in the longest window that ended last, (members,)
     sound: Mask
+    # How many readings each sensor has shown, and how many of them a gate has refused, (members, 2,
+    # sensors)
     shown: IntArray
+    # stuck, value: how often in a row each sensor has shown the same value, and that value, shapes
+    # (members, sensors)
     stuck: IntArray
     value: Array
 
@@ -116,14 +109,10 @@ class Ledger:
     ) -> Ledger:
         """Return the value of one member before any sample.
 
-        Parameters
-        ----------
-        followed
-            Number k of unknown coordinates of which the record is kept.
-        terms, n
-            Number of missing terms, and of coefficients of the state.
-        rank, batch, numbers
-            Rows of the square root, samples that are summed together, and numbers of each.
+        `followed`: number k of unknown coordinates of which the record is kept.
+        `terms`, `n`: number of missing terms, and of coefficients of the state.
+        `rank`, `batch`, `numbers`: rows of the square root, samples that are summed together, and
+        numbers of each.
         """
         never, zero = np.full((1, sensors), np.nan), np.zeros(1, dtype=np.int64)
         return cls(
@@ -190,15 +179,10 @@ def changed(ledger: Ledger, **parts: Any) -> Ledger:
 def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Array]:
     """Return `sums`, `noise`, `before` and `present` after a batch of samples.
 
-    Parameters
-    ----------
-    due
-        Windows that begin with this batch, (members, windows).
-    whitened
-        Innovations r, and responses g of each direction in each window, (members, batch, sensors, 1
-        + windows * directions); zero where no value is.
-    used
-        1 where there is a value, (members, batch, sensors).
+    `due`: windows that begin with this batch, (members, windows).
+    `whitened`: innovations r, and responses g of each direction in each window, (members, batch,
+    sensors, 1 + windows * directions); zero where no value is.
+    `used`: 1 where there is a value, (members, batch, sensors).
     """
     members, _, sensors, _ = whitened.shape
     windows, directions = old.sums.shape[2:4]
@@ -236,11 +220,8 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
 def blocked(old: Ledger, Y: Array, r: Array) -> dict[str, Any]:
     """Return `score`, `information` and `length` after a batch of samples.
 
-    Parameters
-    ----------
-    Y, r
-        Sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at the
-        prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
+    `Y`, `r`: sensitivities to the followed unknowns, (members, batch, k, sensors), and residuals at
+    the prior mean, (members, batch, sensors), in units of the noise; zero where no value is.
     """
     score, information, length = old.score, old.information, old.length
     # All blocks are in use: neighbours merge, and each holds twice as many samples from now on.
@@ -263,3 +244,169 @@ def _merged(values: Array, full: Mask) -> Array:
     merged[:, : BLOCKS // 2] = values[:, ::2] + values[:, 1::2]
     chosen = full.reshape(-1, *(1,) * (values.ndim - 1))
     return np.where(chosen, merged, values)
+
+
+@dataclass(frozen=True, eq=False)
+class InputLedger:
+    """Gaps of the input channels so far."""
+
+    # Number of samples, and of those in which each channel was held, shape (1 + channels,)
+    counts: IntArray
+    # Time for which each channel has been held by now, shape (channels,); 0 if it has a value
+    held: Array
+    # 1 for each channel without a value at the initial time, whose first one was held over the
+    # first interval, shape (channels,)
+    unstated: Array
+
+    @classmethod
+    def start(cls, channels: int) -> InputLedger:
+        """Return the value before any sample."""
+        none = np.zeros(channels)
+        return cls(counts=np.zeros(1 + channels, dtype=np.int64), held=none, unstated=none)
+
+    def add(self, length: float, missing: Array) -> InputLedger:
+        """Return the value after an interval; `missing`: 1 for channels that are held at its end.
+
+        The interval in which a channel has a value again is no gap: there the value changes.
+        """
+        counts = self.counts.copy()
+        counts[0] += 1  # of all samples
+        held = self.held
+        if np.count_nonzero(missing) or np.count_nonzero(held):
+            counts[1:] += missing > 0.0
+            held = (held + length) * missing
+        return InputLedger(counts, held, self.unstated)
+
+    @property
+    def silent(self) -> bool:
+        """True if no channel was ever held."""
+        return not (any(self.counts.tolist()[1:]) or any(self.unstated.tolist()))
+
+    def gaps(self, names: Sequence[str], missing: Array) -> dict[str, tuple[float, bool]]:
+        """Return for how long channels were held by now, and whether they are once more."""
+        each = zip(names, self.held.tolist(), (missing > 0.0).tolist(), strict=True)
+        return {name: (held, again) for name, held, again in each if held or again}
+
+    def findings(self, names: Sequence[str], shifts: Shifts[float]) -> Iterator[Finding]:
+        """Return which channels were held in more than 2 % of the samples, and which at the start.
+
+        `shifts`: of the estimate, with the shift of each unknown by its inputs.
+        """
+        samples = max(int(self.counts[0]), 1)
+        each = shifts.by("input").items()
+        by = ", ".join(f"{label} by {-shift:+.2g}" for label, shift in each)
+        for name in itertools.compress(names, self.unstated.tolist()):
+            text, remedy = FINDINGS["input, start"].filled(name=name)
+            yield Finding("input", "note", text, name, remedy=remedy)
+        for name, count in zip(names, self.counts[1:].tolist(), strict=True):
+            share = count / samples
+            if share <= HELD:
+                continue
+            sentence = FINDINGS["input, gaps" if by else "input, gaps, unknown shift"]
+            text, remedy = sentence.filled(name=name, count=count, samples=samples, shifts=by)
+            yield Finding("input", "caution", text, name, share, remedy=remedy)
+
+
+@dataclass(frozen=True, eq=False)
+class WithheldLedger:
+    """Sums over the values of each withheld sensor, in constant memory."""
+
+    # Shape (9, sensors): number of values and of successive pairs; sums of half the squared
+    # difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
+    # that is predicted
+    sums: Array
+    last: Array  # last error of each sensor, shape (sensors,); NaN before
+
+    @classmethod
+    def start(cls, sensors: int) -> WithheldLedger:
+        """Return the value before any sample."""
+        return cls(np.zeros((9, sensors)), np.full(sensors, np.nan))
+
+    def add(self, z: Array, predicted: Array, variance: Array) -> WithheldLedger:
+        """Return the value after a sample; z is NaN where missing.
+
+        `variance`: of the prediction, without noise, shape (sensors,).
+        """
+        error = z - predicted
+        seen = np.isfinite(error)
+        if not seen.any():
+            return replace(self, last=np.full_like(self.last, np.nan))
+        step = error - self.last
+        pair = np.isfinite(step)
+        rows = np.array(
+            [
+                np.ones_like(z),
+                pair,
+                np.where(pair, 0.5 * step**2, 0.0),
+                error**2,
+                error,
+                predicted,
+                predicted**2,
+                predicted * z,
+                variance,
+            ],
+            dtype=float,
+        )
+        return WithheldLedger(self.sums + np.where(seen, rows, 0.0), np.where(seen, error, np.nan))
+
+    def findings(self, names: Sequence[str], ignored: Collection[str] = ()) -> Iterator[Finding]:
+        """Return which sensors, but ignored ones, are missed by more than is allowed.
+
+        That is prediction and noise.
+
+        The errors of one sensor are correlated as far as they come from the unknowns: so their mean
+        square over its expected value counts as one draw of chi-square. The noise is estimated from
+        successive differences.
+        """
+        scored = len(names) - len(ignored)
+        for k, name in enumerate(names):
+            if name in ignored:
+                continue
+            count, pairs, differences, squares, errors, *_, variance = self.sums[:, k]
+            if count < FEWEST:
+                continue
+            noise = differences / max(pairs, 1.0)
+            expected = noise + variance / count
+            ratio = squares / count / max(expected, 1e-300)
+            p = min(1.0, chance(ratio, 1) * scored)
+            if p > CHANCE:
+                continue
+            size, mean = math.sqrt(squares / count), errors / count
+            text, _ = FINDINGS["withheld"].filled(
+                name=name, size=size, mean=mean, ratio=math.sqrt(ratio)
+            )
+            likely, remedy = LIKELY["withheld"].filled(name=name)
+            cause = self._unit(k, name) or Cause("withheld", name, likely, remedy=remedy)
+            # A small error shows that the model is not exact, a gross one that it is wrong.
+            gross = size > FAILED * math.sqrt(noise) and size > OF_SIGNAL * self._scatter(k)
+            severity: Severity = "do not trust" if gross or cause.kind == "unit" else "caution"
+            yield Finding("withheld", severity, text, name, p, "p-value", (cause,))
+
+    def _scatter(self, k: int) -> float:
+        count, _, _, squares, errors, p, pp, pz, _ = self.sums[:, k]
+        mean = (errors + p) / count
+        return math.sqrt(max((squares + 2.0 * pz - pp) / count - mean**2, 0.0))
+
+    def _unit(self, k: int, name: str) -> Cause | None:
+        """Return the cause that a sensor has another unit, if its values indicate that."""
+        count, _, _, _, errors, p, pp, pz, _ = self.sums[:, k]
+        mean_p, mean_z = p / count, (errors + p) / count
+        spread = pp / count - mean_p**2
+        if not spread > 0.0:
+            return None
+        slope = (pz / count - mean_p * mean_z) / spread
+        rest = max(math.sqrt(spread), 1e-300)
+        for unit, taken, scale, origin in UNITS:
+            off = abs(mean_z - (scale * mean_p + origin))
+            if abs(slope / scale - 1.0) < 4.0 * SIMILAR and off < rest:
+                text, remedy = LIKELY["unit"].filled(
+                    name=name, unit=unit, expected=taken, table=table_of(name)
+                )
+                setting = channel_setting(name, "unit", f'"{unit}"')
+                return Cause("unit", name, text, remedy=remedy, setting=setting)
+        return None
+
+
+def chance(statistic: float, freedom: int) -> float:
+    """Return the probability of a larger value of the chi-square distribution."""
+    return float(scipy.special.gammaincc(0.5 * freedom, 0.5 * statistic))

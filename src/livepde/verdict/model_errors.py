@@ -21,32 +21,20 @@ MOST = 3  # unknowns in a sentence
 
 @dataclass(frozen=True)
 class Allowed:
-    """An unknown with an interval that allows for errors of the model.
+    """An unknown with an interval that allows for errors of the model."""
 
-    Attributes
-    ----------
-    label, unit
-        The unknown; of a field the root mean square over the domain.
-    value
-        The estimate.
-    low, high
-        The 95 % interval that allows for errors of the model.
-    plain_low, plain_high
-        The 95 % interval if the model is exact.
-    wider
-        Width over that of the noise alone.
-    of_sensor
-        Whether it is an error of a sensor, such as an offset, or a correction of an input.
-    """
-
+    # label, unit: the unknown; of a field the root mean square over the domain
     label: str
     unit: str
-    value: float
+    value: float  # the estimate
+    # low, high: the 95 % interval that allows for errors of the model
     low: float
     high: float
+    # plain_low, plain_high: the 95 % interval if the model is exact
     plain_low: float
     plain_high: float
-    wider: float
+    wider: float  # width over that of the noise alone
+    # Whether it is an error of a sensor, such as an offset, or a correction of an input
     of_sensor: bool = False
 
     @classmethod
@@ -145,10 +133,7 @@ class ModelErrors:
     def level(self, *, doubted: bool) -> Rank:
         """Return the level of a run.
 
-        Parameters
-        ----------
-        doubted
-            Whether a test speaks against the model.
+        `doubted`: whether a test speaks against the model.
         """
         if self.failed:
             return "do not trust"
