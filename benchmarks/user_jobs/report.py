@@ -20,7 +20,7 @@ from benchmarks import ROOT
 from benchmarks.user_jobs.data import JOBS, Job, true_field
 from livepde import runs
 from livepde.diagnostics.check_report import Check, Table
-from livepde.runs.outcome import Outcome
+from livepde.runs import Outcome
 
 QUICK = ("rod", "column")
 FEW = 12  # rows of a run that has imports, figure and report, and little else
