@@ -29,9 +29,8 @@ from livepde.streams.csvfile import read_csv
 from livepde.streams.gaps import fill_table, find_spikes
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.join import join_tables
-from livepde.streams.sentinels import sentinels
+from livepde.streams.oddities import sentinels, switches
 from livepde.streams.sources import Rows
-from livepde.streams.switches import switches
 from livepde.streams.table import Column, JsonLines, tabulated
 from livepde.streams.thinned import Thinned
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from livepde.errors import ConfigurationError
 from livepde.fem import FieldBlock, FunctionSpace, Normal, cells
 from livepde.frames import (
+    ScalarReadout,
     covariance_of,
     draws,
     estimates,
@@ -30,7 +31,6 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import ScalarReadout, unknown_of
 from livepde.records import (
     STATUS_CODES,
     Layout,
@@ -176,7 +176,7 @@ class Estimate(Shown):
     def _shown(self) -> tuple[str, Mapping[str, str]]:
         rows = {}
         for label in self.space.labels:
-            unit = unknown_of(self.space, label).unit
+            unit = self.space.unknown_of(label).unit
             rows[label] = f"{self[label]} {unit}".rstrip()
         for name in self.space.fields:
             values, std = self[name].median, self[name].deviation
@@ -272,15 +272,15 @@ class Estimate(Shown):
         std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
         if name in space.labels:
             k = space.labels[name]
-            return Marginal(float(self.q[k]), float(std[k]), unknown_of(space, name))
+            return Marginal(float(self.q[k]), float(std[k]), space.unknown_of(name))
         if name in space.fields:
             part = space.part(name)
-            known = unknown_of(space, name)
+            known = space.unknown_of(name)
             return Marginal(self.q[part], std[part], known, partial(self._at, name))
         if self.state_space is not None and name in self.state_space.fields:
             part = self.state_space.part(name)
             u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
-            known = unknown_of(self.state_space, name)
+            known = self.state_space.unknown_of(name)
             return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
         components = () if self.state_space is None else self.state_space.fields
         raise ConfigurationError(
@@ -312,8 +312,8 @@ class Estimate(Shown):
             values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
             shape = (*shape, values.shape[1])
         if not shape:
-            return Marginal(float(values[0]), float(std[0]), unknown_of(space, name))
-        return Marginal(values.reshape(shape), std.reshape(shape), unknown_of(space, name))
+            return Marginal(float(values[0]), float(std[0]), space.unknown_of(name))
+        return Marginal(values.reshape(shape), std.reshape(shape), space.unknown_of(name))
 
 
 def _coordinates(points: ArrayLike, axes: int, name: str) -> tuple[Array, bool]:
@@ -425,7 +425,7 @@ class Marginal:
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
     """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
     for label, row in space.labels.items():
-        unknown, value = unknown_of(space, label), float(belief.q[row])
+        unknown, value = space.unknown_of(label), float(belief.q[row])
         lower, upper = map(float, unknown.prior.bounds)
         if value in (lower, upper):
             yield at_bound(label, value)
@@ -661,7 +661,7 @@ class Result(Shown):
         last, model = self._last("sample"), self.model
         q, u = draws(last.belief, last.space, n, seed)
         numbers = {
-            label: ("draw", q[:, k], {"units": unknown_of(last.space, label).unit})
+            label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
             for label, k in last.space.labels.items()
         }
         fields: dict[str, Any] = {}
@@ -887,7 +887,7 @@ def layout_of(
     """
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
-        unknown = unknown_of(model.parameter_space, label)
+        unknown = model.parameter_space.unknown_of(label)
         unit: dict[str, Any] = {"units": unknown.unit}
         plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
         numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}

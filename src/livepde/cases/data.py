@@ -16,8 +16,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from livepde.cases.case_content import CaseContent
-from livepde.cases.equations import check_options, load_code, own_code
+from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.dates import since_1970
 from livepde.linalg import Mask
@@ -32,10 +31,10 @@ from livepde.streams import (
     tabulated,
 )
 from livepde.streams.csvfile import header_of
-from livepde.streams.first_rows import wild_first_rows
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
+from livepde.streams.oddities import wild_first_rows
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 from livepde.units import conversion

@@ -34,9 +34,9 @@ from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.samples import Sample
-from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
+from livepde.streams.oddities import FEWEST_FOLLOWING
 
 LOG = logging.getLogger("livepde.run")
 
@@ -249,12 +249,12 @@ class LiveCase:
 
     def _too_few(self, found: Sequence[Ready]) -> bool:
         """Return whether more rows have to show if the first one is wild, as it looks."""
-        few = not self._feed.done and len(found) <= FEWEST
+        few = not self._feed.done and len(found) <= FEWEST_FOLLOWING
         return few and suspect_start(self.case, found[0].values)
 
     def _without_wild(self, found: list[Ready]) -> list[Remark]:
         """Blank wild values of the first rows, and return remarks on them."""
-        if len(found) <= FEWEST:
+        if len(found) <= FEWEST_FOLLOWING:
             return []
         remarks = []
         for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):

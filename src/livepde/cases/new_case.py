@@ -21,8 +21,7 @@ from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
-from livepde.streams.sentinels import sentinels
-from livepde.streams.switches import switches
+from livepde.streams.oddities import sentinels, switches
 
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")

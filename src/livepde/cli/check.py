@@ -13,8 +13,7 @@ from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
-from livepde.streams.sentinels import sentinels
-from livepde.streams.switches import switches
+from livepde.streams.oddities import sentinels, switches
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared

@@ -15,7 +15,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.readout import unknown_of
 
 # Probability of the interval of an unknown number whose ends define the responses in the basis.
 LIKELY = 0.95
@@ -198,6 +197,6 @@ class GalerkinReduction:
 
 def likely(space: Any, label: str) -> tuple[float, float]:
     """Return the ends of the prior's 95 % interval of an unknown number."""
-    unknown = unknown_of(space, label)
+    unknown = space.unknown_of(label)
     low, high = unknown.interval(unknown.prior.centre, unknown.prior.std, LIKELY)
     return float(low), float(high)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.cases.equations import load_code
+from livepde.cases.case_content import load_code
 from livepde.errors import ConfigurationError
 from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
 from livepde.streams import DataTable

@@ -12,7 +12,6 @@ from livepde.fleet.engines import Beliefs, Factors
 from livepde.fleet.estimate import FleetEstimate
 from livepde.linalg import Array
 from livepde.model import Model
-from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES, Record, Snapshot
 from livepde.result import interval_ends, vertex_order
 
@@ -118,7 +117,7 @@ class FleetRecords:
         shares = after / np.where(before > 0.0, before, np.nan)
         for label, k in space.labels.items():
             value, std = beliefs.q[:, k], after[:, k]
-            ends = interval_ends(label, unknown_of(space, label), value, std)
+            ends = interval_ends(label, space.unknown_of(label), value, std)
             columns += [value, std, *ends.values(), shares[:, k]]
         return np.stack(columns, axis=1)
 
