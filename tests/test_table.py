@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from contextlib import closing
@@ -71,7 +70,7 @@ def test_what_counts_as_missing(csv, missing):
         ("t;a;b\n0;1;1\n", "3 with ';': set separator = ';'."),
         ("t;a;b\n0;1,5;1\n", "3 with ';': set separator = ';' and decimal = ','."),
         ("t,a,b\n", "no rows"),
-        ("", "cannot be read"),
+        ("", "cannot be read as a CSV file: it is empty"),
     ],
 )
 def test_bad_tables_name_file_row_and_column(csv, text, named):
@@ -166,11 +165,6 @@ def test_quotes_and_what_looks_like_an_end(csv):
     assert table.values[:, 0].tolist() == [1.0, 2.0]
 
 
-def test_an_empty_file(csv):
-    with pytest.raises(DataError, match="cannot be read as a CSV file: it is empty"):
-        read_csv(csv(""), COLUMNS, Clock("t"))
-
-
 def test_a_point_in_times_is_none_of_decimals(csv):
     with pytest.raises(DataError, match=r"row 3, column 't': got '0\.5'; with decimal = ','"):
         read_csv(csv("t,a,b\n0,1,1\n0.5,1,1\n"), COMMAS, Clock("t", decimal=","))
@@ -233,42 +227,12 @@ def test_time_has_to_increase(csv, times):
 NIGHT = datetime(2025, 10, 25, 22, tzinfo=UTC)  # in Berlin the day begins on which 3:00 is 2:00
 
 
-@pytest.fixture
-def night(csv):
-    def write(minutes, offset):
-        moments = [NIGHT + timedelta(minutes=minutes * k) for k in range(26 * 60 // minutes)]
-        local = [moment.astimezone(GERMAN.zone) for moment in moments]
-        texts = [f"{t if offset else t.replace(tzinfo=None)},1,1\n" for t in local]
-        return csv("t,a,b\n" + "".join(texts))
-
-    return write
-
-
 @pytest.mark.parametrize("stop", ["2025-10-26", date(2025, 10, 26)])
-def test_a_day_includes_its_hours_also_if_it_has_25(night, stop):
+def test_a_day_includes_its_hours_also_if_it_has_25(csv, stop):
+    local = [(NIGHT + timedelta(minutes=30 * k)).astimezone(GERMAN.zone) for k in range(52)]
     clock = Clock("t", start="2025-10-26", stop=stop, zone=GERMAN.zone)
-    table = read_csv(night(30, offset=True), COLUMNS, clock)
+    table = read_csv(csv("t,a,b\n" + "".join(f"{t},1,1\n" for t in local)), COLUMNS, clock)
     assert table.t.tolist() == [1800.0 * k for k in range(50)]
-
-
-@pytest.mark.parametrize("minutes", [30, 60])
-def test_an_hour_that_comes_twice_is_told(night, minutes):
-    path = night(minutes, offset=False)
-    told = "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30"
-    with pytest.raises(TimeOrderError, match=told):
-        read_csv(path, COLUMNS, Clock("t", zone=GERMAN.zone))
-    header, *rows = path.read_text().splitlines()
-    texts = [json.dumps(dict(zip(header.split(","), r.split(","), strict=True))) for r in rows]
-    with pytest.raises(TimeOrderError, match=told):
-        list(JsonLines(texts, COLUMNS, Clock("t", zone=GERMAN.zone)))
-
-
-def test_missing_file(tmp_path):
-    (tmp_path / "nine.csv").touch()
-    with pytest.raises(
-        DataError, match=r"there is no file .*none\.csv'; did you mean 'nine\.csv'\?"
-    ):
-        read_csv(tmp_path / "none.csv", COLUMNS, Clock("t"))
 
 
 def dates(csv, **options):

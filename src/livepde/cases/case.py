@@ -454,27 +454,21 @@ def law_of(case: CaseContent) -> AnyLaw:
     """Return the law; raises `CaseError`."""
     spec = case.spec.law
     with case.located("law", LawError):
-        if isinstance(spec, GradientSpec):
-            return _gradient(spec)
-        return _sensitivity(case, spec)
-
-
-def _gradient(spec: GradientSpec) -> GradientLaw:
-    damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
-    if spec.mu is not None:
-        damping = ConstantDamping(spec.mu)
-    return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
+        if not isinstance(spec, GradientSpec):
+            return _sensitivity(case, spec)
+        damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+        if spec.mu is not None:
+            damping = ConstantDamping(spec.mu)
+        return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
 
 def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
     time = case.equation.time_unit
-    memory = case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory)
-    drift = case.convert(spec.drift, f"1/{time}" if time else "", "law.drift")
     return SensitivityLaw(
         modes=spec.modes,
         noise=_noise(case, spec),
-        drift=drift,
-        memory=memory,
+        drift=case.convert(spec.drift, f"1/{time}" if time else "", "law.drift"),
+        memory=case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory),
         refit=_chosen(Refit, spec.refit),
         rank=spec.rank,
         gate=spec.gate,
@@ -507,7 +501,7 @@ def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
 def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
     """Return the noise of the law, which needs it here or from every sensor."""
     if spec.noise is not None and spec.noise != "auto":
-        return _level(case, spec.noise)
+        return case.positive(spec.noise, case.equation.state.unit, "law.noise")
     if noise_of(case, "sensor") is None:
         if spec.noise == "auto":
             text = "got 'auto', which begins with a guess: give every sensor its noise."
@@ -518,7 +512,3 @@ def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
             "give it here or with every sensor.",
         )
     return None if spec.noise is None else "auto"
-
-
-def _level(case: CaseContent, noise: float | str) -> float:
-    return case.positive(noise, case.equation.state.unit, "law.noise")

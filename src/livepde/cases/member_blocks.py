@@ -80,16 +80,13 @@ def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], 
             continue
         # Members often share one case, whose text takes longer to write than a look-up.
         if one.case not in settings:
-            settings[one.case] = _settings(one.case)
+            unread = {"channels": {"__all__": READ}}
+            settings[one.case] = one.case.spec.model_dump_json(
+                exclude={**dict.fromkeys(TOLD, True), **unread}
+            )
         key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
         groups.setdefault(key, {})[name] = one
     return list(groups.values()), apart
-
-
-def _settings(case: Case) -> str:
-    """Return the common settings of members that step together, as text."""
-    unread = {"channels": {"__all__": READ}}
-    return case.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
 
 
 def _refuses(one: Prepared) -> str:

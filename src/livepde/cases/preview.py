@@ -35,17 +35,9 @@ NOTHING = "advice on sensors: the data contain no measurement."
 
 @dataclass(frozen=True)
 class Identified:
-    """One unknown in the preview.
+    """One unknown in the preview: its standard deviations before and after the samples."""
 
-    Attributes
-    ----------
-    name
-        Label of a number; of a field its name, with the vertices known best and worst.
-    prior, posterior
-        Standard deviations before and after the samples.
-    """
-
-    name: str
+    name: str  # label of a number; of a field its name, with the vertices known best and worst
     prior: float
     posterior: float
     unit: str
@@ -264,7 +256,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
         raise ConfigurationError(
             "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
         )
-    if _moves(case.model, law):
+    if law.drift or case.model.latent.random:  # an unknown moves
         return _advise_moving(prepared, law, list(samples))
     here, each, factor = _information(prepared, law, samples)
     if factor is None:
@@ -280,11 +272,6 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     )
     _, positions, _ = _candidates(prepared)
     return Advice(positions[:, best], now, then, len(after))
-
-
-def _moves(model: Model, law: SensitivityLaw) -> bool:
-    """Return whether an unknown changes in time, by the law or by its own evolution."""
-    return bool(law.drift or model.latent.random)
 
 
 def _information(

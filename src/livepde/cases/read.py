@@ -111,12 +111,9 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
     _check_text(text, where)
     try:
         document = tomllib.loads(text)
-    except RecursionError as error:
-        raise CaseError(f"{where}: is not valid TOML: {error}.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
-    except ValueError as error:  # a number or a date that Python cannot hold
-        raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+    except (RecursionError, ValueError) as error:  # or a number or a date that Python cannot hold
+        line = _line(text, str(error)) if isinstance(error, tomllib.TOMLDecodeError) else ""
+        raise CaseError(f"{where}: is not valid TOML: {error}{line}.") from None
     _check_document(document, where)
     return document
 
@@ -434,13 +431,10 @@ def _check_document(document: Mapping[str, Any], where: str) -> None:
         name = key.rpartition(".")[2]
         if isinstance(value, int) and abs(value) > COUNTS.get(name, OTHER):
             most = COUNTS.get(name, OTHER)
-            raise CaseError(f"{where}: {key}: got {_digits(value)}; expected at most {most}.")
+            got = value if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
+            raise CaseError(f"{where}: {key}: got {got}; expected at most {most}.")
         if isinstance(value, float) and LARGEST < abs(value) < float("inf"):
             raise CaseError(f"{where}: {key}: got {value:g}; expected less than {LARGEST:g}.")
-
-
-def _digits(value: int) -> str:
-    return str(value) if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
 
 
 def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
@@ -462,33 +456,20 @@ def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
 
 
 def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
-    """Return the text of a case with other values: `read.apply`, and the comments stay.
-
-    Parameters
-    ----------
-    settings
-        Key -> value; None takes the key away.
-    where
-        For messages.
-
-    Raises
-    ------
-    CaseError
-        A key that cannot be set.
-    """
+    """Return the text of a case with settings applied as by `apply`, and its comments."""
     for key, value in settings.items():
         expected = apply(read_toml(text, where), {key: value}, where)
         text = _with(text, key_path(key, where), value)
-        if _without_empty(read_toml(text, where)) != _without_empty(expected):
+        # Empty tables consist of a head only.
+        found, wanted = (
+            {name: item for name, item in document.items() if item != {}}
+            for document in (read_toml(text, where), expected)
+        )
+        if found != wanted:
             raise CaseError(f"{where}: {key}: cannot be set here; edit the file instead.")
     if settings:
         spec_of(read_toml(text, where), where)
     return text
-
-
-def _without_empty(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a document without its empty tables, which consist of a head only."""
-    return {name: value for name, value in document.items() if value != {}}
 
 
 def _with(text: str, path: Sequence[str], value: Any) -> str:

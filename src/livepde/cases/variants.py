@@ -40,16 +40,10 @@ WORSE = 0.02  # share by which the error of withheld sensors may grow: about its
 
 @dataclass(frozen=True)
 class Variant:
-    """A case with other values.
-
-    Attributes
-    ----------
-    name, settings
-        Its name, and texts "key=value" as `--set` takes them.
-    """
+    """A case with other values."""
 
     name: str
-    settings: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()  # "key=value" as for `--set`
 
 
 @dataclass(frozen=True)
@@ -76,8 +70,6 @@ class VariantRun:
 
     Attributes
     ----------
-    variant
-        The variant.
     error
         Why it failed; empty if it did not.
     verdict
@@ -252,7 +244,10 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
         return math.nan
-    apart = _seconds_between(known, table) * clock_of(stated.case).second
+    apart = 0.0  # of times that are numbers
+    if known.origin is not None and table.origin is not None:
+        apart = since_1970(known.origin) - since_1970(table.origin)
+        apart *= clock_of(stated.case).second
     before, after = delays(late.case), delays(stated.case)
     values = table.values.copy()
     for name in found.readings:
@@ -270,13 +265,6 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
     run = _run(stated, replace(table, values=values), columns=False)
     own = _ended(Variant(AS_STATED), stated, run.to_xarray())
     return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan
-
-
-def _seconds_between(one: DataTable, other: DataTable) -> float:
-    """Return the seconds from the origin of another table to that of one; 0 of numbers."""
-    if one.origin is None or other.origin is None:
-        return 0.0
-    return since_1970(one.origin) - since_1970(other.origin)
 
 
 def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun:
@@ -468,18 +456,19 @@ def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Var
         The run of the case itself.
     """
     found: dict[frozenset[str], Variant] = {}
-    for variant in (*_of_causes(base), *_usual(prepared, base)):
+    likely = [
+        Variant(
+            NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject),
+            settings_in(cause.setting),
+        )
+        for cause in base.causes
+    ]
+    for variant in (*likely, *_usual(prepared, base)):
         if variant.settings:
             # The same keys with another prior are no other variant.
             keys = frozenset(setting.partition("=")[0] for setting in variant.settings)
             found.setdefault(keys, variant)
     return list(found.values())[:most]
-
-
-def _of_causes(base: VariantRun) -> Iterator[Variant]:
-    for cause in base.causes:
-        name = NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject)
-        yield Variant(name, settings_in(cause.setting))
 
 
 def _usual(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:

@@ -29,8 +29,6 @@ from livepde.errors import ConfigurationError
 if TYPE_CHECKING:
     from xarray import Dataset
 
-    from livepde.runs.web import Server
-
 
 def report(
     folder: RunArgument,
@@ -269,13 +267,13 @@ def watch(
     server = serve(folder, Address.read(address, PORT, token))
     try:
         if attached:  # to a run that may be killed at any time
-            Thread(target=_end_with_input, args=(server,), daemon=True).start()
+
+            def end_with_input() -> None:
+                sys.stdin.read()
+                server.close()
+
+            Thread(target=end_with_input, daemon=True).start()
         terminal().print(f"Open {escape(server.shown)}  (Ctrl-C ends it)", soft_wrap=True)
         server.wait()
     except KeyboardInterrupt:
         server.close()
-
-
-def _end_with_input(server: Server) -> None:
-    sys.stdin.read()
-    server.close()

@@ -126,7 +126,12 @@ def show(
     """Print tables, checks and notes."""
     for table in shown:
         print_table(console, table)
-    _print_checks(console, list(checks))
+    grid = RichTable.grid(padding=(0, 2))
+    for item in checks:
+        mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
+        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
+    if grid.row_count:
+        console.print(grid)
     for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
 
@@ -158,7 +163,10 @@ def print_table(console: Console, table: Table) -> None:
     for k, column in enumerate(table.columns):
         values = [row[k] for row in table.rows]
         numbers = k > 0 and all(map(_numeric, values))
-        width = _least_width(column, values, numbers)
+        # The title and text can be folded between words.
+        cells = list(map(_cell, values))
+        words = [*(cells if numbers else " ".join(cells).split()), *column.split()]
+        width = max(map(len, words), default=0)
         needed += width + 2  # two blanks between columns
         grid.add_column(
             escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
@@ -166,13 +174,6 @@ def print_table(console: Console, table: Table) -> None:
     for row in table.rows:
         grid.add_row(*(escape(_cell(value)) for value in row))
     console.print(grid, width=max(console.width, needed), crop=False)
-
-
-def _least_width(column: str, values: Iterable[Any], numbers: bool) -> int:
-    """Return the width that a column needs: the title and text can be folded between words."""
-    cells = [_cell(value) for value in values]
-    words = cells if numbers else " ".join(cells).split()
-    return max(map(len, [*words, *column.split()]), default=0)
 
 
 def _numeric(value: Any) -> bool:
@@ -184,13 +185,3 @@ def _numeric(value: Any) -> bool:
 
 def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _print_checks(console: Console, checks: Sequence[Check]) -> None:
-    if not checks:
-        return
-    grid = RichTable.grid(padding=(0, 2))
-    for item in checks:
-        mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
-        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
-    console.print(grid)

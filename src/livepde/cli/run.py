@@ -156,17 +156,9 @@ def run(
         raise driven.error
     if not estimates:  # which are all that standard output is for then
         _report(loaded.title, folder, driven, found, as_json)
-    _exit(driven, found.checks, live, as_json)
-
-
-def _exit(driven: Driven, checks: Sequence[Check], live: bool, as_json: bool) -> None:
-    """End the command with an exit code if the run was interrupted or, with JSON, a check failed.
-
-    A live run usually ends by a signal, which is not an interruption then.
-    """
-    if driven.status == "interrupted" and not live:
+    if driven.status == "interrupted" and not live:  # a live run usually ends by a signal
         raise typer.Exit(INTERRUPTED)
-    if as_json and not all(item.ok for item in checks):
+    if as_json and not all(item.ok for item in found.checks):
         raise typer.Exit(CHECK_FAILED)
 
 
@@ -224,24 +216,16 @@ def writer_of(
     """Return the writer of the run directory, a new or a resumed one."""
     from livepde.runs import RECORD, RunWriter
 
+    about: dict[str, Any] = {
+        "version": __version__,
+        "command": command,
+        "case": loaded.text,
+        "settings": settings,
+        "original": loaded.original,
+    }
     if resume and (folder / RECORD).exists():
-        return RunWriter.reopen(
-            folder,
-            version=__version__,
-            command=command,
-            case=loaded.text,
-            settings=settings,
-            original=loaded.original,
-        )
-    return RunWriter.create(
-        folder,
-        version=__version__,
-        command=command,
-        title=loaded.title,
-        case=loaded.text,
-        settings=settings,
-        original=loaded.original,
-    )
+        return RunWriter.reopen(folder, **about)
+    return RunWriter.create(folder, title=loaded.title, **about)
 
 
 def run_batch(
@@ -293,13 +277,7 @@ def concluded(
     *,
     draw: bool = True,
 ) -> Conclusion:
-    """Write the results of a run, and return them.
-
-    Parameters
-    ----------
-    draw
-        Whether to draw figures.
-    """
+    """Write the results of a run, with figures if `draw`, and return them."""
     from livepde.cases.remedies import with_settings
     from livepde.runs import (
         arrivals,
@@ -399,29 +377,10 @@ METRICS_PORT = 9100
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Options of a live run.
+    """Options of a live run, as given to the command."""
 
-    Attributes
-    ----------
-    data
-        A file, or lines of JSON, instead of the case's own source.
-    goes_on
-        Whether the source goes on by itself, at its own pace.
-    speed
-        Speed of the replay of a finished file, relative to real time; None: that of the option's
-        default.
-    listen, page
-        Addresses of /health and /metrics, and of the page; None: not served.
-    token
-        Secret that visitors need.
-    estimates
-        Print each estimate as a line of JSON.
-    allow_env
-        Environment variables that the case may use as passwords.
-    """
-
-    data: str | Iterable[str] | None = None
-    goes_on: bool = False
+    data: str | Iterable[str] | None = None  # instead of the case's own source
+    goes_on: bool = False  # whether the source continues by itself, at its own pace
     speed: float | None = None
     listen: str | None = None
     page: str | None = None
@@ -448,16 +407,6 @@ def run_live(
         Makes the run directory; called when the source is connected.
     stack
         Closes all opened resources, among them the journal, from which the result reads.
-
-    Returns
-    -------
-    writer, taken
-        Writer of the run directory; the case with its result.
-
-    Raises
-    ------
-    Exit
-        The run was interrupted before the first sample.
     """
     from livepde.cases.live_case import LiveCase
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
@@ -486,16 +435,13 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
     """Return the content of /health, also before the first sample."""
     if wiring.running is not None:
         return wiring.running.health
-    status = "waiting for the first sample"
-    silent, why = wiring.silent, wiring.why
-    ailment = "silent" if silent else "start" if why else ""
     return {
-        "ok": not why,
-        "why": why,
-        "ailment": ailment,
+        "ok": not wiring.why,
+        "why": wiring.why,
+        "ailment": "silent" if wiring.silent else "start" if wiring.why else "",
         "samples": 0,
-        "silent": silent,
-        "status": status,
+        "silent": wiring.silent,
+        "status": "waiting for the first sample",
     }
 
 
