@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import repeat
@@ -100,12 +101,7 @@ def check_noise(name: str, value: Any) -> float:
 def by_name(z: Any, names: Sequence[str]) -> dict[str, Any]:
     """Return readings as channel -> number, with noise under a separate name.
 
-    Parameters
-    ----------
-    z
-        Readings of a sample.
-    names
-        Sensors whose values an array holds.
+    `names` are the sensors whose values an array contains.
     """
     if not isinstance(z, Mapping):
         z = dict(zip(names, np.atleast_1d(z).tolist(), strict=True))
@@ -167,14 +163,6 @@ def plan(name: str, values: Any, count: int) -> Array:
     return np.broadcast_to(found, (count,))
 
 
-def _are_pairs(z: Any, size: int) -> bool:
-    """Return whether z holds a pair for each of so many sensors."""
-    try:
-        return bool(np.shape(z) == (size, 2))
-    except ValueError:  # rows of several lengths
-        return False
-
-
 def _array(z: Any) -> Array:
     """Return an array of floats; refuses text and truth values, which NumPy would convert."""
     if isinstance(z, list | tuple):
@@ -195,7 +183,10 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
     usual = type(z) is np.ndarray and z.dtype == float and z.shape == (observed.size,)
     if usual and np.count_nonzero(np.isfinite(z)) == z.size:
         return np.array(z), None
-    if _are_pairs(z, observed.size):
+    pairs = False
+    with suppress(ValueError):  # rows of several lengths
+        pairs = np.shape(z) == (observed.size, 2)
+    if pairs:
         values, stds = np.array(z, dtype=object).T.tolist()
         noise = own_noise(list(map(check_noise, observed.names, stds)))
         return readings(values, observed)[0], noise
@@ -385,12 +376,8 @@ class Channels:
     ) -> list[Inputs]:
         """Return all inputs at each of several future times.
 
-        Parameters
-        ----------
-        inputs
-            Mapping from channel to a value, or to one value for each time.
-        t, known
-            Time and inputs of the last sample.
+        `inputs` has one value for each channel or for each time, `t` and `known` are time and
+        inputs of the last sample.
         """
         times, planned, last = list(times), [], known
         plans = {name: plan(name, values, len(times)) for name, values in inputs.items()}

@@ -36,24 +36,12 @@ CELLS = 2_000_000  # of a mesh that a case describes itself
 
 @dataclass(frozen=True, eq=False)
 class CaseContent:
-    """A case file's specification and its equation.
-
-    Attributes
-    ----------
-    path
-        The case file.
-    spec
-        Its content, checked key by key.
-    equation
-        The PDE it names.
-    reader
-        The function that reads its data, if it names one.
-    """
+    """A case file's specification, checked key by key, and its equation."""
 
     path: Path
     spec: CaseSpec
     equation: Equation
-    reader: Callable[..., Any] | None
+    reader: Callable[..., Any] | None  # of its data, if it names one
 
     @property
     def name(self) -> str:
@@ -430,18 +418,9 @@ def own_code(what: str) -> Iterator[None]:
 
 
 def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool) -> Any:
-    """Import the object that a case names, from a module or a file in the folder of the case.
+    """Import the object that a case names: 'module:name', or 'file.py:name' in its folder.
 
-    Parameters
-    ----------
-    name
-        'module:name', or 'file.py:name' relative to `folder`.
-    where
-        File and key, for the message.
-    expected
-        Description of the expected function, for the message.
-    allowed
-        Whether the user passed --allow-code.
+    `where` and `expected` are for messages: file and key, and the signature of the function.
 
     Raises
     ------

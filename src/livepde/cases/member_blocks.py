@@ -46,11 +46,6 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
 
     A block has members whose cases differ only in data, initial state and descriptions, and whose
     samples have the same times, if `Fleet` can step their model and law together.
-
-    Parameters
-    ----------
-    members
-        Name -> case with its data.
     """
     groups, apart = _alike(members)
     found = []
@@ -103,13 +98,7 @@ def _refuses(one: Prepared) -> str:
 
 
 class MemberBlock:
-    """Members that are stepped together.
-
-    Parameters
-    ----------
-    members
-        Name -> case with its data, at least one; of one model, with tables of the same times.
-    """
+    """Members of one model that are stepped together; their tables have the same times."""
 
     def __init__(self, members: Mapping[str, Prepared]) -> None:
         self.members = dict(members)
@@ -143,16 +132,8 @@ class MemberBlock:
     def run(self, paths: Sequence[Path]) -> None:
         """Take all samples; estimates so far are kept also if the run ends early.
 
-        Parameters
-        ----------
-        paths
-            Paths of new journals, one for each member. They are written at intervals; `ended`
-            writes the rest.
-
-        Raises
-        ------
-        RunError
-            A journal cannot be written.
+        The new journals at `paths`, one for each member, are written at intervals; `ended` writes
+        the rest.
         """
         self._paths = list(paths)
         table, stopping = self._tables[0], threading.Event()

@@ -313,14 +313,10 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
 
     Parameters
     ----------
-    document
-        The parsed case.
     settings
         Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
         sets the keys in it and leaves the others; None takes the key away. A table for an unknown
         or a channel that the case has not adds it.
-    where
-        For messages.
 
     Raises
     ------

@@ -70,10 +70,6 @@ class VariantRun:
 
     Attributes
     ----------
-    error
-        Why it failed; empty if it did not.
-    verdict
-        Its verdict, as `Verdict.to_dict` gives it.
     log_evidence
         `Result.log_evidence` of all readings that it assimilates, as a density in the unit of the
         data: variants with another unit of a sensor are comparable.
@@ -88,15 +84,13 @@ class VariantRun:
     errors, withheld
         Assimilated and withheld sensor -> root mean square of its errors one step ahead, second
         half of the samples.
-    estimates
-        Unknown number -> its last estimate.
     unknowns
         How many numbers were unknown; of a field the number of modes.
     """
 
     variant: Variant
-    error: str = ""
-    verdict: Mapping[str, Any] = field(default_factory=dict)
+    error: str = ""  # why it failed; empty if it did not
+    verdict: Mapping[str, Any] = field(default_factory=dict)  # of `Verdict.to_dict`
     log_evidence: float = math.nan
     readings: Mapping[str, int] = field(default_factory=dict)
     same_readings: float | None = None
@@ -181,13 +175,7 @@ def _pooled(values: Iterable[float]) -> float:
 
 
 def variant_of(text: str) -> Variant:
-    """Return the variant in a text: 'name: key=value; key=value', the name may be missing.
-
-    Raises
-    ------
-    CaseError
-        Without a setting, or with one that is none.
-    """
+    """Return the variant in a text: 'name: key=value; key=value', the name may be missing."""
     head, colon, rest = text.partition(":")
     named = bool(colon) and "=" not in head
     settings = settings_in(rest if named else text)
@@ -448,13 +436,7 @@ NAMES = {  # kind of cause -> name of the variant
 
 
 def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:
-    """Return variants of a case, the likely causes of its verdict first, each once.
-
-    Parameters
-    ----------
-    base
-        The run of the case itself.
-    """
+    """Return variants of a case, the likely causes of the verdict of its run first, each once."""
     found: dict[frozenset[str], Variant] = {}
     likely = [
         Variant(

@@ -477,19 +477,8 @@ def in_parts(
 ) -> Iterator[Found]:
     """Run rows in parts of bounded size, and iterate over their results, in any order.
 
-    A part whose worker died is run again; `run` has to resume from its run directories.
-
-    Parameters
-    ----------
-    run
-        Function of the rows of a part; both are sent to workers, where their paths must be valid.
-    jobs
-        Number of parallel processes; -1 for one on each processor. Dask uses all workers of its
-        cluster.
-    backend
-        Backend of joblib; None: that of the surrounding `joblib.parallel_config`, else loky.
-    told
-        List that receives a sentence for each loss of a worker.
+    A part whose worker died is run again; `run` has to resume from its run directories. Dask uses
+    all workers of its cluster. `told` receives a sentence for each loss of a worker.
 
     Raises
     ------

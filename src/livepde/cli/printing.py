@@ -50,11 +50,7 @@ def can_draw(console: Console) -> bool:
 def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict[str, Any]:
     """Return the figures of a run: name -> function that draws.
 
-    Parameters
-    ----------
-    journal
-        Has the readings, for the first panels of `overview`, and the figure `curves`, of runs that
-        are not too long.
+    A journal has the readings for the first panels of `overview`, and for the figure `curves`.
     """
     from livepde import plots
 
@@ -92,12 +88,8 @@ def present(
 ) -> None:
     """Print results as text, or as one JSON object.
 
-    Parameters
-    ----------
-    title, lines
-        Of the text, before and after the results; with markup.
-    dataset, facts
-        Of the object: the run whose measures and verdict it has, and further entries.
+    The text has a title before the results and lines after them, with markup. The object has
+    measures and verdict of the run in `dataset`, and further facts.
     """
     console = terminal()
     if not as_json:

@@ -49,18 +49,10 @@ Series = Sequence[tuple[float, float]]
 
 
 class _Residuals(NamedTuple):
-    """Residuals of values to the cubic through two neighbours on each side.
+    """Residuals of values to the cubic through two neighbours on each side."""
 
-    Attributes
-    ----------
-    size
-        Residuals, shape (values - 4,), reduced where the neighbours are far away.
-    weights
-        Weights of the five values in each residual, shape (values - 4, 5).
-    """
-
-    size: Array
-    weights: Array
+    size: Array  # shape (values - 4,), reduced where the neighbours are far away
+    weights: Array  # of the five values in each residual, shape (values - 4, 5)
 
 
 def _residuals(t: Array, x: Array) -> _Residuals:
@@ -250,14 +242,8 @@ def fill_table(
     """Return a finished record without gaps between known values, and without spikes.
 
     Its remarks count interpolated values as "interpolated", refused ones as "spike" and remaining
-    gaps as "missing".
-
-    Parameters
-    ----------
-    interpolated, screened
-        Channels whose gaps are filled, and those whose spikes are refused.
-    means
-        Channels whose readings are means since the last one: a gap is part of the next mean.
+    gaps as "missing". Readings of the channels `means` are means since the last one: a gap is part
+    of the next mean.
     """
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
@@ -429,16 +415,7 @@ def decided(
 ) -> tuple[float, tuple[str, ...]]:
     """Return the value of a channel for a sample, and the kinds of remarks on it.
 
-    Parameters
-    ----------
-    t, value
-        Time of the sample and its value, NaN if it is missing.
-    past, later
-        Known values before and after.
-    beyond
-        As for `find_spikes`; infinity: spikes stay.
-    between
-        How the channel behaves between two readings.
+    `past` and `later` are known values before and after. If `beyond` is infinite, spikes stay.
     """
     kinds: tuple[str, ...] = ()
     if between == "hold":

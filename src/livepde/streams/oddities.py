@@ -96,13 +96,6 @@ def switches(t: Array, x: Array) -> bool:
     Jumps of one size between many levels are the resolution of a measured value. A jump between
     two rows that are a moment apart is stated by the rows themselves.
 
-    Parameters
-    ----------
-    t, x
-        Times and values, NaN where missing, shape (rows,).
-
-    Examples
-    --------
     >>> t = np.arange(8.0)
     >>> switches(t, np.array([0.0, 0, 8, 8, 8, 8, 0, 0]))
     True
@@ -135,34 +128,20 @@ BEFORE = 20  # rows before a leap, and differences over its length
 
 @dataclass(frozen=True)
 class ClockLeap:
-    """A step of time after which the readings continue as if almost no time had passed.
+    """A step of time after which the readings continue as if almost no time had passed."""
 
-    Attributes
-    ----------
-    row
-        Number of the first sample after it.
-    t, length, usual
-        Its time, the step, and the usual step before.
-    """
-
-    row: int
+    row: int  # first sample after it
     t: float
     length: float
-    usual: float
+    usual: float  # step before
 
 
 def unit_factor(before: float, after: float, usual: float, later: float) -> float:
     """Return by which factor times count in another unit since a sample; 0: they do not.
 
     Divided by the factor, the later time follows the earlier one, and the later steps are as long
-    as those before. A pause changes no later step.
-
-    Parameters
-    ----------
-    before, after
-        Times before and after a pause.
-    usual, later
-        Usual steps of time before and after it; NaN where none is known.
+    as those before. A pause changes no later step. `usual` and `later` are the usual steps of time
+    before and after the pause, NaN where none is known.
 
     >>> unit_factor(2990.0, 3.0e6, 10.0, 1e4), unit_factor(2990.0, 3.0e6, 10.0, 10.0)
     (1000.0, 0.0)
@@ -179,13 +158,7 @@ def clock_leaps(t: Array, values: Array, rows: list[int]) -> list[ClockLeap]:
 
     The change of each channel across the step is compared with changes over one usual step, and
     over as many usual steps as the time says. If it is much likelier as the former, no time passed.
-
-    Parameters
-    ----------
-    t, values
-        Times, and values of the channels, shapes (samples,) and (samples, channels).
-    rows
-        Samples that end a pause: `livepde.laws.pauses.pauses`.
+    `rows` are the samples that end a pause, `values` have the shape (samples, channels).
     """
     found = []
     for k in rows:
@@ -227,13 +200,7 @@ def wild_first_rows(t: Array, values: Array, groups: Sequence[Sequence[int]]) ->
     made. The first values of a channel are wild if the step to the next one is `STEEPER` times as
     steep as any in the `FOLLOWING` values, and if they lie outside the range of these and of the
     first values of the other channels of the group by more than that range.
-
-    Parameters
-    ----------
-    t, values
-        Times, shape (rows,), and values, NaN where missing, shape (rows, channels).
-    groups
-        Channels that measure the same quantity in the same unit; others are not judged.
+    Each group has the channels of one quantity in one unit; others are not judged.
     """
     wild = np.zeros(values.shape, dtype=bool)
     # Wild values may be as large as numbers are: differences of them are infinite then, and
