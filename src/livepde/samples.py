@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -57,6 +57,20 @@ def sample_of(item: Any) -> Sample:
         f"a stream gives (t, z), (t, z, inputs) or livepde.Sample; got {item!r:.60}. Give a pandas "
         "table as a whole, as in run(table)."
     )
+
+
+def in_order(stream: Iterable[Any], who: str) -> Iterator[Sample]:
+    """Iterate over a stream as samples, each later than the one before; `who` asks for it."""
+    before = -math.inf
+    for item in stream:
+        sample = sample_of(item)
+        if not sample.t > before:
+            raise SampleError(
+                f"{who}: the sample at t = {sample.t!r} is not later than the one before at "
+                f"t = {before!r}; sort the stream and drop repeated samples."
+            )
+        before = sample.t
+        yield sample
 
 
 def is_frame(data: Any) -> bool:

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
 
-from livepde.errors import ConfigurationError, SampleError
+from livepde.errors import ConfigurationError
 from livepde.linalg import Array, IntArray, Mask
-from livepde.samples import Sample, number, sample_of
+from livepde.samples import Sample, in_order, number
 from livepde.stepping import Between, Held
 from livepde.streams.table import DataTable
 
@@ -342,15 +342,7 @@ class Filled(Iterable[Sample]):
             name: deque(maxlen=RECENT) for name in self.stage.channels
         }
         waiting: deque[tuple[Sample, dict[str, float]]] = deque()
-        before = -math.inf
-        for item in self.stream:
-            sample = sample_of(item)
-            if not sample.t > before:
-                raise SampleError(
-                    f"FillGaps: the sample at t = {sample.t!r} is not later than the one before at "
-                    f"t = {before!r}; sort the stream and drop repeated samples."
-                )
-            before = sample.t
+        for sample in in_order(self.stream, "FillGaps"):
             waiting.append((sample, self._values(sample)))
             while waiting and self._decided(waiting):
                 yield self._released(waiting, recent)

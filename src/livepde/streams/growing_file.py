@@ -100,11 +100,6 @@ class _Content:
     def stat(self) -> os.stat_result:
         return os.fstat(self.file.fileno())
 
-    @property
-    def identity(self) -> tuple[int, int]:
-        found = self.stat
-        return found.st_dev, found.st_ino
-
     def _written(self) -> tuple[int, int]:
         """Return when the file was written last, and its size."""
         found = self.stat
@@ -407,7 +402,7 @@ class GrowingFile:
             named = self.path.stat()
         except FileNotFoundError:
             return False
-        if (named.st_dev, named.st_ino) == now.identity:
+        if os.path.samestat(named, now.stat):
             return False
         if not self._next:
             self._remember(now)

@@ -12,19 +12,8 @@ from livepde.linalg import Array, IntArray, Mask
 from livepde.streams.gaps import SHORT
 
 # DS18B20: 85 at power-on, -127 where nothing answers; loggers and databases: nines, ends of types.
-KNOWN: tuple[float, ...] = (
-    -127.0,
-    85.0,
-    -999.0,
-    -9999.0,
-    -99999.0,
-    -99.9,
-    -999.9,
-    -9999.9,
-    -6999.0,
-    -7999.0,
-)
-KNOWN += (999.0, 9999.0, 99999.0, 99.9, 999.9, 9999.9, 6999.0, 7999.0, 32767.0, -32768.0, 65535.0)
+NINES = (999.0, 9999.0, 99999.0, 99.9, 999.9, 9999.9, 6999.0, 7999.0)
+KNOWN = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, *NINES, *(-x for x in NINES)}
 REPEATED = 3  # times that another constant occurs
 NEAR_KNOWN = 0.5  # of the range of the rest: a known sentinel lies farther outside
 FAR_OTHER = 1.0  # another constant lies farther outside than this
