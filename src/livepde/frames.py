@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 STATISTICS = ("value", "std", "low", "high")
 ERRORS = (("innovation", "sensor"), ("withheld_error", "withheld"))
+LEVEL = 0.95
+Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
 
 def model_errors(data: xr.Dataset) -> ModelErrors | None:
@@ -225,11 +227,6 @@ def _factor(belief: Belief) -> Array:
     if belief.q_factor is None:
         raise LawError("this law has no covariance: use SensitivityLaw.")
     return belief.q_factor
-
-
-LEVEL = 0.95
-
-Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
 
 class ScalarReadout:

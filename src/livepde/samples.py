@@ -21,6 +21,8 @@ from livepde.observation import Observed
 from livepde.stepping import own_noise
 
 Readings: TypeAlias = ArrayLike | Mapping[str, Any]
+# Values of the withheld sensors if there are none.
+NOTHING = np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -217,10 +219,6 @@ def readings(z: Any, observed: Observed) -> tuple[Array, Array | None]:
         where = observed.names[int(np.flatnonzero(np.isinf(array))[0])]
         raise SampleError(f"channel '{where}' is infinite; send NaN for a missing sample.")
     return array.copy(), None
-
-
-# Values of the withheld sensors if there are none.
-NOTHING = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,6 +59,8 @@ from livepde.samples import Sample
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, DataTable
 
+Options = TypeVar("Options")
+
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
@@ -445,9 +447,6 @@ class Case(CaseContent):
         prepared = Prepared(self, first, (), start, origin, live=live)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared
-
-
-Options = TypeVar("Options")
 
 
 def law_of(case: CaseContent) -> AnyLaw:

@@ -35,6 +35,8 @@ HEAD = """\
 # A case of livepde: equation, unknowns, and the role of each channel.
 #   livepde check {case}     check this case, and which unknowns its sensors can identify
 #   livepde run {case}       estimate the unknowns, and write a run directory
+"""
+OPEN = """\
 # Replace each '?': the table has no value for it. 'livepde check' lists those that remain.
 """
 VALUES = """\
@@ -45,10 +47,6 @@ ENDS = """\
 TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
 NOISE = 0.05
 CASE = """\
-#:schema ./livepde.schema.json
-# A case of livepde: equation, unknowns, and the role of each channel.
-#   livepde check {0}     check this case, and which unknowns its sensors can identify
-#   livepde run {0}       estimate the unknowns, and write a run directory
 # Numbers are in the model's units (m, s, degC). Text such as "40 cm" is converted.
 # For your own data: 'livepde init DIR --data FILE.csv' writes a case from the table.
 title = "A metal rod, heated and cooled at its left end"
@@ -133,7 +131,7 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_channels(equation, found),
     ]
     text = "\n".join(lines)
-    return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
+    return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
 
 
 def _open(unit: str, number: str = BLANK) -> str:
@@ -438,7 +436,7 @@ def write_template(
     """
     if table is None:
         check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
-        text = CASE.format(folder / "case.toml")
+        text = (HEAD + CASE).format(case=folder / "case.toml")
         write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])

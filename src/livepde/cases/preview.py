@@ -231,7 +231,7 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     case, law = prepared.case, linearised(prepared.case.law)
     if law is None:
         raise ConfigurationError(
-            "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
+            "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
         )
     if law.drift or case.model.latent.random:  # an unknown moves
         return _advise_moving(prepared, law, list(samples))

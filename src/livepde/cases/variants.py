@@ -36,6 +36,23 @@ AS_STATED = "as stated"
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of withheld sensors may grow: about its own error
+MOST = 12  # variants that the program chooses
+PLACE = 0.01  # of the length of the domain: how far off a sensor may be
+SAMPLES = 64  # in which a source moves the state by the usual error
+NAMES = {  # kind of cause -> name of the variant
+    "offset": "offset of {}",
+    "gain": "gain of {}",
+    "position": "position of {}",
+    "jump": "jumps of {}",
+    "source": "source",
+    "loss": "loss",
+    "flux": "flux at {}",
+    "boundary": "offset of {}",
+    "initial": "uncertain start",
+    "sensor": "without {}",
+    "stuck": "without {}",
+    "unit": "unit of {}",
+}
 
 
 @dataclass(frozen=True)
@@ -414,25 +431,6 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
         yield f"{name} depends on the variant: its interval in {listed} does not overlap."
     if shared and not found:
         yield "All variants agree: their intervals overlap with that of the recommended one."
-
-
-MOST = 12  # variants that the program chooses
-PLACE = 0.01  # of the length of the domain: how far off a sensor may be
-SAMPLES = 64  # in which a source moves the state by the usual error
-NAMES = {  # kind of cause -> name of the variant
-    "offset": "offset of {}",
-    "gain": "gain of {}",
-    "position": "position of {}",
-    "jump": "jumps of {}",
-    "source": "source",
-    "loss": "loss",
-    "flux": "flux at {}",
-    "boundary": "offset of {}",
-    "initial": "uncertain start",
-    "sensor": "without {}",
-    "stuck": "without {}",
-    "unit": "unit of {}",
-}
 
 
 def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:

@@ -21,6 +21,32 @@ if TYPE_CHECKING:
 
     from livepde.runs import Outcome, RunWriter
 
+# The facts are those of CITATION.cff, as a test checks; the year is that of the release.
+BIBTEX = """\
+@misc{{livepde{year},
+  author = {{{{The livepde authors}}}},
+  title = {{{{livepde}}}},
+{year_line}\
+  note = {{Computer software, version {version}}},
+}}
+
+@article{{Boiger2016,
+  author = {{Boiger, R. and Kaltenbacher, B.}},
+  title = {{{{An online parameter identification method for time dependent partial \
+differential equations}}}},
+  journal = {{Inverse Problems}},
+  volume = {{32}},
+  pages = {{045006}},
+  year = {{2016}},
+  doi = {{10.1088/0266-5611/32/4/045006}},
+}}"""
+APA = """\
+The livepde authors. ({year}). livepde (Version {version}) [Computer software].
+
+Boiger, R., & Kaltenbacher, B. (2016). An online parameter identification method for time \
+dependent partial differential equations. Inverse Problems, 32, Article 045006. \
+https://doi.org/10.1088/0266-5611/32/4/045006"""
+
 
 def demo(out: OutOption = None) -> None:
     """Watch the paper's method find q(x) and u(t, x) online.
@@ -119,33 +145,6 @@ def reproduce(
         lambda: experiment.run(truth, progress=not as_json), out, command, experiment.summary
     )
     report_outcome(outcome, command, as_json)
-
-
-# The facts are those of CITATION.cff, as a test checks; the year is that of the release.
-BIBTEX = """\
-@misc{{livepde{year},
-  author = {{{{The livepde authors}}}},
-  title = {{{{livepde}}}},
-{year_line}\
-  note = {{Computer software, version {version}}},
-}}
-
-@article{{Boiger2016,
-  author = {{Boiger, R. and Kaltenbacher, B.}},
-  title = {{{{An online parameter identification method for time dependent partial \
-differential equations}}}},
-  journal = {{Inverse Problems}},
-  volume = {{32}},
-  pages = {{045006}},
-  year = {{2016}},
-  doi = {{10.1088/0266-5611/32/4/045006}},
-}}"""
-APA = """\
-The livepde authors. ({year}). livepde (Version {version}) [Computer software].
-
-Boiger, R., & Kaltenbacher, B. (2016). An online parameter identification method for time \
-dependent partial differential equations. Inverse Problems, 32, Article 045006. \
-https://doi.org/10.1088/0266-5611/32/4/045006"""
 
 
 class CitationForm(StrEnum):

@@ -28,6 +28,8 @@ from livepde.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from xarray import Dataset
+REPORT = ".html"
+PORT = 8050
 
 
 def report(
@@ -102,9 +104,6 @@ def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: boo
     title, page = f"[bold]{escape(opened.title)}[/]  theory", f"Page: {escape(str(target))}"
     where = {"run": str(opened.path), "theory": str(target)}
     present(found.tables, [], found.notes, as_json=as_json, title=title, lines=[page], **where)
-
-
-REPORT = ".html"
 
 
 def export(
@@ -223,9 +222,6 @@ def fmu(
     inside = f"{len(process.inputs)} inputs, {len(process.outputs()) + 1} outputs"
     lines = [escape(f"Written: {path} ({inside})")]
     present([], [], process.notes, as_json=as_json, lines=lines, unit=str(path))
-
-
-PORT = 8050
 
 
 def watch(

@@ -33,6 +33,11 @@ SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
 ASKED, GOES_ON = "--separately", "resumed runs"
 UNFIT = frozenset('/\\:*?"<>|')  # what names of folders do without
+Row = TypeVar("Row")
+Found = TypeVar("Found")
+LARGEST = 256  # members of a part: so many runs are interrupted if a worker dies
+ATTEMPTS = 5  # without a part that comes back in between
+DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # what Dask and Ray call it
 
 
 @dataclass(frozen=True)
@@ -450,14 +455,6 @@ def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
         own = {NAME: item.name, "status": item.status, "samples": item.samples}
         rows.append({**own, "verdict": item.level, **found})
     return pd.DataFrame(rows)
-
-
-Row = TypeVar("Row")
-Found = TypeVar("Found")
-
-LARGEST = 256  # members of a part: so many runs are interrupted if a worker dies
-ATTEMPTS = 5  # without a part that comes back in between
-DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # what Dask and Ray call it
 
 
 class Backend(StrEnum):

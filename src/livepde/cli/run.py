@@ -51,6 +51,9 @@ if TYPE_CHECKING:
     from livepde.result import Estimate
     from livepde.runs import Check, Driven, RunWriter, Table
     from livepde.runs.live_loop import Sink
+LOG = logging.getLogger("livepde.run")
+BEAT = 60.0  # seconds between two lines of the log that say how far a run is
+METRICS_PORT = 9100
 
 
 class LogKind(StrEnum):
@@ -368,11 +371,6 @@ def _traded(loaded: Case, identifier: Identifier) -> list[str]:
     if not isinstance(loaded.law, SensitivityLaw):
         return []
     return identifiability(loaded.model, identifier.latent_belief()).sentences
-
-
-LOG = logging.getLogger("livepde.run")
-BEAT = 60.0  # seconds between two lines of the log that say how far a run is
-METRICS_PORT = 9100
 
 
 @dataclass(frozen=True)

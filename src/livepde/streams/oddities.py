@@ -11,7 +11,7 @@ import numpy as np
 from livepde.linalg import Array, IntArray, Mask
 from livepde.streams.gaps import SHORT
 
-# DS18B20: 85 at power-on, -127 where nothing answers; loggers and databases: nines, ends of types.
+# Sentinels. DS18B20: 85 at power-on, -127 where nothing answers; databases: nines, ends of types.
 NINES = (999.0, 9999.0, 99999.0, 99.9, 999.9, 9999.9, 6999.0, 7999.0)
 KNOWN = {-127.0, 85.0, 32767.0, -32768.0, 65535.0, *NINES, *(-x for x in NINES)}
 REPEATED = 3  # times that another constant occurs
@@ -19,6 +19,23 @@ NEAR_KNOWN = 0.5  # of the range of the rest: a known sentinel lies farther outs
 FAR_OTHER = 1.0  # another constant lies farther outside than this
 OTHERS = 8  # other values that show the range, and other levels of a constant
 MOST_SENTINELS = 4  # sentinels of a column
+# Switches:
+SWITCHED = 4  # known values that are judged
+LEVELS = 3  # so many different values are states of a switch
+STAYS = 0.75  # share of the values that repeat the one before
+UNEVEN = 2.0  # largest over smallest jump: those of a coarse reading are all alike
+# Leaps of the clock:
+FACTORS = {1000.0: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 60.0: "sixtieths"}
+"""Factor of later times -> their likely unit, where those before are seconds."""
+ALIKE = 3.0  # usual intervals between times before and after, once the unit is the same
+SURE = 5.0  # logarithm of the odds that readings continue as after one usual interval
+EACH = 0.7  # of it, at least, per channel
+BEFORE = 20  # rows before a leap, and differences over its length
+# First rows:
+BEGINNING = 3  # rows at the start that may be wild
+FOLLOWING = 20  # values that show how a channel usually changes
+FEWEST_FOLLOWING = 3  # following values without which nothing is judged
+STEEPER = 10.0  # times the largest rate of change of the values that follow
 
 
 class Sentinel(NamedTuple):
@@ -73,12 +90,6 @@ def _at(values: Array, end: float) -> Sentinel | None:
     return Sentinel(end, count, low, high)
 
 
-SWITCHED = 4  # known values that are judged
-LEVELS = 3  # so many different values are states of a switch
-STAYS = 0.75  # share of the values that repeat the one before
-UNEVEN = 2.0  # largest over smallest jump: those of a coarse reading are all alike
-
-
 def switches(t: Array, x: Array) -> bool:
     """Return whether a column has constant stretches with jumps that no two near rows write.
 
@@ -105,14 +116,6 @@ def switches(t: Array, x: Array) -> bool:
     changes = repeats == 0.0 and levels < len(x) <= (1.0 - STAYS) * rows
     few = levels <= LEVELS and (repeats >= STAYS or len(x) >= SWITCHED * levels or changes)
     return few or (repeats >= STAYS and float(sizes.max()) > UNEVEN * float(sizes.min()))
-
-
-FACTORS = {1000.0: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds", 60.0: "sixtieths"}
-"""Factor of later times -> their likely unit, where those before are seconds."""
-ALIKE = 3.0  # usual intervals between times before and after, once the unit is the same
-SURE = 5.0  # logarithm of the odds that readings continue as after one usual interval
-EACH = 0.7  # of it, at least, per channel
-BEFORE = 20  # rows before a leap, and differences over its length
 
 
 @dataclass(frozen=True)
@@ -174,12 +177,6 @@ def _odds(x: Array, k: int, lag: int) -> float:
         return 0.0
     d = float(x[k] - x[k - 1]) ** 2
     return 0.5 * float(np.log(many / one) - d / one + d / many)
-
-
-BEGINNING = 3  # rows at the start that may be wild
-FOLLOWING = 20  # values that show how a channel usually changes
-FEWEST_FOLLOWING = 3  # following values without which nothing is judged
-STEEPER = 10.0  # times the largest rate of change of the values that follow
 
 
 def wild_first_rows(t: Array, values: Array, groups: Sequence[Sequence[int]]) -> Mask:
