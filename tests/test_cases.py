@@ -59,11 +59,9 @@ def result_of(path, **options):
         (3, "m", 3.0),
         ("20 h", "s", 72000.0),
         ("6e-7 m^2/s", "m^2/s", 6e-7),
-        ("18.3 m", "m", 18.3),
         ("2.55 MJ/m^3/K", "J/(m^3 K)", 2.55e6),
         ("2.5 W/(m*degC)", "W/(m K)", 2.5),
         ("295.25 K", "degC", 22.1),
-        ("-5 degC", "degC", -5.0),
         ("10 %", "", 0.1),
         ("0.01 1/day", "1/s", 0.01 / 86400),
     ],
@@ -276,7 +274,6 @@ left = {{ role = "boundary", column = "left", at = "left" }}
             '{ norm = "X", tau = 1.5 }',
             lp.observation.Tikhonov("X", lp.observation.Discrepancy(1.5)),
         ),
-        ("{ alpha = 1e-3 }", lp.observation.Tikhonov("V", 1e-3)),
         ("false", lp.observation.Pseudoinverse()),
     ],
 )
@@ -948,15 +945,12 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     ("old", "new", "named"),
     [
         ("noise=0.0", "noize=0.0", "has no option 'noise'; did you mean 'noize'?"),
-        ("def read(", "def raed(", "has no function 'read'"),
         ("return ", "return 3 #", "returned int; expected times and a mapping"),
         ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
         ("rod.csv", "none.csv", "there is no file"),
         ('frame["time_s"]', "[]", "contains no samples"),
         ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is earlier"),
-        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (91,); there are 90 times"),
         ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
-        ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
         ("frame[key] + noise * rng", "['a'] * 91 or rng", "must contain numbers only"),
     ],
 )
@@ -1052,11 +1046,9 @@ def test_keys_are_taken_away(rod):
     [
         ("law.kidn", None, "there is no key 'law.kidn' to remove; did you mean 'kind'?"),
         ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
-        ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
         ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
         ("law..noise", 1, "'law..noise' is not a key"),
-        ("law.noise", "2 m", "law.noise: 'm' cannot be converted"),
     ],
 )
 def test_settings_that_are_refused(rod, key, value, named):
