@@ -352,11 +352,7 @@ class Case(CaseContent):
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
-        found = [
-            *drive_notes(self, self.model),
-            *process_notes(self),
-            *sensor_notes(self),
-        ]
+        found = [*drive_notes(self, self.model), *process_notes(self), *sensor_notes(self)]
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
