@@ -71,9 +71,7 @@ def test_what_counts_as_missing(csv, missing):
 )
 def test_bad_tables_name_file_row_and_column(csv, text, named):
     path = csv(text)
-    clock = Clock("time" if text.startswith("t,a,b\n0,1,1\n5") else "t")
-    if "did you mean" in named:
-        clock = Clock("tim")
+    clock = Clock("tim" if "did you mean" in named else "t")
     with pytest.raises(DataError) as error:
         read_csv(path, COLUMNS, clock)
     assert named in str(error.value)

@@ -433,12 +433,13 @@ def _health(wiring: LiveCase) -> Mapping[str, Any]:
     """Return the content of /health, also before the first sample."""
     if wiring.running is not None:
         return wiring.running.health
+    silent, why = wiring.silent, wiring.why  # read once: another thread sets them
     return {
-        "ok": not wiring.why,
-        "why": wiring.why,
-        "ailment": "silent" if wiring.silent else "start" if wiring.why else "",
+        "ok": not why,
+        "why": why,
+        "ailment": "silent" if silent else "start" if why else "",
         "samples": 0,
-        "silent": wiring.silent,
+        "silent": silent,
         "status": "waiting for the first sample",
     }
 
