@@ -461,9 +461,9 @@ def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
     time = case.equation.time_unit
     return SensitivityLaw(
         modes=spec.modes,
-        noise=_noise(case, spec),
-        drift=case.convert(spec.drift, f"1/{time}" if time else "", "law.drift"),
         memory=case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory),
+        drift=case.convert(spec.drift, f"1/{time}" if time else "", "law.drift"),
+        noise=_noise(case, spec),
         refit=_chosen(Refit, spec.refit),
         rank=spec.rank,
         gate=spec.gate,
