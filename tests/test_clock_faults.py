@@ -7,12 +7,12 @@ later than all used ones are used, each at the time that it states, and once.
 from __future__ import annotations
 
 import math
-from datetime import datetime, timedelta
 from zoneinfo import ZoneInfo
 
 import numpy as np
 import pytest
 from live_rod import COLUMNS, OPENED, live, rows
+from test_logger_files import local
 
 from livepde.runs import clock_findings
 from livepde.runs.feeds import Gathered
@@ -395,18 +395,10 @@ def test_a_clock_that_was_ahead_for_long_comes_back(tmp_path):
 # --- hours that are shown twice ------------------------------------------------------------------
 
 
-def berlin(count: int) -> list[str]:
-    """Return local times of the night in which clocks are set back, each minute."""
-    zone = ZoneInfo("Europe/Berlin")
-    start = datetime(2026, 10, 24, 23, tzinfo=ZoneInfo("UTC"))
-    moments = [start + timedelta(minutes=k) for k in range(count)]
-    return [str(moment.astimezone(zone).replace(tzinfo=None)) for moment in moments]
-
-
 @pytest.mark.parametrize("again", [(), range(100, 110), range(70, 120), range(130, 200)])
 def test_the_hour_that_clocks_show_twice(again):
     """Local times without a zone of their own, in the zone of the case; also with rows again."""
-    texts = berlin(240)
+    texts = local(1, 240)
     assert len(set(texts)) == 180
     given = [{**row, "t": text} for text, row in zip(texts, rows(240), strict=True)]
     columns = {name: COLUMNS[name] for name in ("a", "b", "left")}
