@@ -11,7 +11,7 @@ import typer
 
 from benchmarks.commands import Count, Program, Workers, chosen, several
 from livepde.cli import main
-from livepde.cli.export import Standard
+from livepde.cli.finished import Standard
 from livepde.cli.options import CodeOption, SetOption, load_case
 from livepde.cli.printing import can_draw, named, terminal
 from livepde.runs import Outcome

@@ -28,7 +28,6 @@ from livepde.errors import CaseError, LivepdeError
 from livepde.laws import Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.progress import watched
-from livepde.readout import unknown_of
 from livepde.result import Result
 from livepde.runs import Check, Outcome, Table, measures, verdict
 from livepde.runs.directory import markdown
@@ -236,7 +235,7 @@ def run_job(job: Job) -> Run:
         source=case.source,
         numbers=measures(data),
         unknowns={
-            label: (unknown_of(space, label).unit, case.references.get(label, math.nan))
+            label: (space.unknown_of(label).unit, case.references.get(label, math.nan))
             for label in space.labels
         },
         expected=variants[job.variant] if job.variant else case.expected,

@@ -19,7 +19,7 @@ from livepde.cases.live_case import LiveCase
 from livepde.cases.measured import measured
 from livepde.cases.member_blocks import MemberBlock
 from livepde.cases.new_case import files_for
-from livepde.errors import CaseError, ConfigurationError, DataError, RunError
+from livepde.errors import ConfigurationError, DataError, RunError
 from livepde.fleet import Fleet
 from livepde.laws import shadow_kinds
 from livepde.models import EQUATIONS
@@ -29,9 +29,8 @@ from livepde.streams.csvfile import read_csv
 from livepde.streams.gaps import fill_table, find_spikes
 from livepde.streams.intake import Habit, Intake, Policy
 from livepde.streams.join import join_tables
-from livepde.streams.sentinels import sentinels
+from livepde.streams.oddities import sentinels, switches
 from livepde.streams.sources import Rows
-from livepde.streams.switches import switches
 from livepde.streams.table import Column, JsonLines, tabulated
 from livepde.streams.thinned import Thinned
 
@@ -113,20 +112,6 @@ def test_held_inputs_equal_dense_rows_that_repeat_the_value(law: str) -> None:
         close(expected, found)
     low, high = found["k"].interval()
     assert low < 0.5 < high
-
-
-def test_a_held_value_is_that_of_two_rows_with_lines() -> None:
-    """The step of the other spelling: the old value a moment before the new one."""
-    held = identifier(between=dict.fromkeys(CHANNELS, "hold"), scheme=lp.Alexander2())
-    lines = identifier(scheme=lp.Alexander2())
-    z, values, last = readings(), drives(TIMES), drives(np.zeros(1))[0]
-    for who in (held, lines):
-        who.step(0.0, np.full(2, NAN), row(last))
-    for k, t in enumerate(TIMES.tolist()):
-        expected = held.step(t, z[k], row(values[k]))
-        lines.step(t - 1e-9, np.full(2, NAN), row(last))
-        found, last = lines.step(t, z[k], row(values[k])), values[k]
-    assert found.q == pytest.approx(expected.q, rel=1e-6)
 
 
 @pytest.mark.parametrize("law", LAWS)
@@ -511,26 +496,6 @@ def pumping(tmp_path: Path, more: str = "", data: str = "pumping_steps.csv") -> 
     return path
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (', between = "step"', "channels.Q.between"),
-        (', between = "hold", missing = "interpolate"', "is never missing"),
-        (', between = "next", spikes = "refuse"', 'requires between = "line"'),
-    ],
-)
-def test_keys_that_contradict_each_other_are_refused(tmp_path: Path, more: str, message: str):
-    with pytest.raises(CaseError, match=message):
-        cases.load(pumping(tmp_path, more))
-
-
-def test_a_sensor_has_nothing_between_its_readings(tmp_path: Path) -> None:
-    path = pumping(tmp_path)
-    path.write_text(path.read_text().replace('at = "18 m"', 'at = "18 m", between = "hold"'))
-    with pytest.raises(CaseError, match="between requires a boundary or input channel"):
-        cases.load(path)
-
-
 def switched(tmp_path: Path, name: str = "case.toml", factor: float = 1.0) -> Path:
     """Write a case of a column whose inlet is logged at its changes only."""
     lines = (REPORTS / "column_pulse.csv").read_text().splitlines()
@@ -570,38 +535,6 @@ def test_a_live_run_of_a_log_of_changes_is_the_batch_run(tmp_path: Path) -> None
     assert found.t == expected.t
     np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
     assert not any(finding.what == "input" for finding in expected.verdict.findings)
-
-
-HEATED = """
-equation = "conduction"
-initial = "interpolate"
-mesh = { from = 0, to = "10 cm", cells = 10 }
-data = { file = "rows.csv", time = "t", time_unit = "s" }
-boundary.left = { flux = "heater" }
-unknowns.k = { prior = "0.8 W/(m K)", std = "0.4 W/(m K)", transform = "log" }
-options.C = "1.4e6 J/(m^3 K)"
-[channels]
-T = { role = "sensor", column = "T", at = "3 cm", noise = "0.2 K" }
-heater = { role = "input", column = "h", between = "hold" }
-"""
-
-
-@pytest.mark.long
-def test_a_live_run_begins_with_what_rows_before_it_stated(tmp_path: Path) -> None:
-    """The heater is logged once, before the first reading that the initial state is made of."""
-    (tmp_path / "case.toml").write_text(HEATED)
-    rows = [{"t": 0.0, "h": 800.0}, *({"t": 60.0 * k, "T": 20.0 + k} for k in range(1, 4))]
-    case = cases.load(tmp_path / "case.toml")
-    with LiveCase(case, Rows(rows), path=tmp_path / "journal.sqlite") as wiring:
-        live = wiring.live()
-        assert wiring.prepared.first.z == {"T": 21.0, "heater": 800.0}
-        live.run()
-        found = live.identifier.estimate()
-    one = cases.load(tmp_path / "case.toml").begin(wiring.prepared.first).identifier
-    for row in rows[1:]:
-        expected = one.step(row["t"], {"T": row["T"], "heater": 800.0})
-    assert found.t == expected.t
-    np.testing.assert_allclose(found.q, expected.q, rtol=1e-9)
 
 
 @pytest.mark.slow

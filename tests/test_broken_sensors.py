@@ -16,8 +16,7 @@ from livepde.cli import app
 from livepde.laws.gate import Gate, Screened
 from livepde.models import heat
 from livepde.runs.summary import channel_errors, tables
-from livepde.streams.first_rows import wild_first_rows
-from livepde.streams.sentinels import sentinels
+from livepde.streams.oddities import sentinels, wild_first_rows
 
 FIRST = 100  # row of the first broken reading
 NAMES = ("T_1", "T_2", "T_3")

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import tomlkit
 from factories import short_rod
 
 import livepde as lp
@@ -21,7 +20,6 @@ from livepde.cases.preview import Preview, preview
 from livepde.cases.read import parse
 from livepde.cases.schema import SensitivitySpec
 from livepde.runs import checks_of, drive, measures, tables
-from livepde.streams import Twin
 from livepde.units import convert
 
 SHIPPED = Path(__file__).resolve().parents[1] / "cases"
@@ -60,11 +58,9 @@ def result_of(path, **options):
         (3, "m", 3.0),
         ("20 h", "s", 72000.0),
         ("6e-7 m^2/s", "m^2/s", 6e-7),
-        ("18.3 m", "m", 18.3),
         ("2.55 MJ/m^3/K", "J/(m^3 K)", 2.55e6),
         ("2.5 W/(m*degC)", "W/(m K)", 2.5),
         ("295.25 K", "degC", 22.1),
-        ("-5 degC", "degC", -5.0),
         ("10 %", "", 0.1),
         ("0.01 1/day", "1/s", 0.01 / 86400),
     ],
@@ -178,13 +174,6 @@ DRIFT = '# drift = "0.1 1/h"'  # a comment of the template, to be replaced by an
 
 
 @pytest.mark.slow
-def test_layers(rod):
-    prepared, data = result_of(rod(LAYERS))
-    assert {"alpha[a]", "alpha[b]"} <= set(measures(data))
-    assert len(preview(prepared, prepared.stream).unknowns) == 2
-
-
-@pytest.mark.slow
 def test_layers_with_priors_of_their_own(rod):
     own = """{ over = ["20 cm", "40 cm"], prior = 0.8, std = "3e-5 m^2/s",
         evolution = { kind = "mean-reverting", time = "1 h" } }"""
@@ -197,22 +186,6 @@ def test_layers_with_priors_of_their_own(rod):
     assert (a.evolution.moves, b.evolution) == (False, lp.MeanReverting(3600.0))
     assert b.prior.bounds == a.prior.bounds
     assert len(preview(case.prepare(), case.prepare().stream).unknowns) == 2
-
-
-@pytest.mark.parametrize(
-    ("region", "named"),
-    [
-        ("{ prior = 1 }", "the key '{}.over' is missing"),
-        ("{ over = [0, 1], priro = 1 }", "no key '{}.priro'; did you mean 'prior'"),
-        ('{ over = [0, 1], prior = "1 m" }', "{}.prior: 'm' cannot be converted"),
-        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', "{}: the prior 0.01 is outside"),
-        ("3", "{}: got 3"),
-    ],
-)  # fmt: skip
-def test_layers_that_are_refused(rod, region, named):
-    with pytest.raises(lp.errors.CaseError) as error:
-        cases.load(rod((LAYERS[0], f"regions = {{ a = {region} }}\nbounds = [")))
-    assert named.replace("{}", "unknowns.alpha.regions.a") in str(error.value)
 
 
 @pytest.mark.parametrize("spacing", ["uniform", "geometric"])
@@ -232,8 +205,7 @@ def test_nodes_move_to_the_ends_of_layers_and_sources(rod, spacing):
 
 
 def test_layers_that_end_inside_of_a_cell_get_one_note(rod):
-    mesh = 'from = 0\nto = "40 cm"\ncells = 40'
-    path = rod(LAYERS, (mesh, "nodes = [0, 0.1, 0.19, 0.3, 0.4]\n#"))
+    path = rod(LAYERS, (MESH, "nodes = [0, 0.1, 0.19, 0.3, 0.4]\n#"))
     notes = [note for note in cases.load(path).notes if "inside a cell" in note]
     assert notes == [
         "Layer 'a' of alpha, layer 'b' of alpha end inside a cell. Add the ends to `mesh.nodes`."
@@ -261,36 +233,15 @@ def test_gradient_law_on_averages(rod):
     assert (data.status == 0).all()
 
 
-@pytest.mark.slow
-def test_gradient_law_that_tunes_itself_refuses_a_diffusivity_from_means(tmp_path):
+def test_gradient_law_that_tunes_itself_refuses_a_diffusivity_from_means():
     """A rod of 1 m, warmed and cooled at its left end, seen as means over its tenths."""
-    mesh, times = lp.interval(0, 1, 40), 0.05 * np.arange(201)
-    rod = lp.models.heat(mesh, lp.Normal(0.1), {"left": lambda x, t: np.sin(2 * t) + 0 * x[0]})
-    parts = {f"T{k}": (k / 10, (k + 1) / 10) for k in range(10)}
+    ends = {"left": lp.Channel("left")}
+    rod = lp.models.heat(lp.interval(0, 1, 40), lp.Normal(0.05, std=0.05), ends)
     means = lp.Averages(
-        {k: (lambda x, a=a, b=b: (x[0] > a) & (x[0] < b)) for k, (a, b) in parts.items()}
+        {f"T{k}": (lambda x, k=k: (x[0] > k / 10) & (x[0] < (k + 1) / 10)) for k in range(10)}
     )
-    twin = Twin(model=rod, observation=means, q_true=[0.1], u0=0.0, times=times)
-    rows = [[t, np.sin(2 * t), *z] for t, z in zip(times, twin.exact_data, strict=True)]
-    lines = [",".join(["t", "left", *parts]), *(",".join(map(str, row)) for row in rows)]
-    (tmp_path / "data.csv").write_text("\n".join(lines))
-    channels = "\n".join(
-        f'{k} = {{ role = "sensor", column = "{k}", over = [{a}, {b}] }}'
-        for k, (a, b) in parts.items()
-    )
-    (tmp_path / "case.toml").write_text(f"""
-equation = "heat"
-initial = 0.0
-mesh = {{ from = 0, to = 1, cells = 40 }}
-data = {{ file = "data.csv", time = "t", time_unit = "s" }}
-unknowns.alpha = {{ prior = 0.05, std = 0.05 }}
-law = {{ kind = "gradient", gain = "auto" }}
-[channels]
-left = {{ role = "boundary", column = "left", at = "left" }}
-{channels}
-""")
     with pytest.raises(lp.LivepdeError, match="use SensitivityLaw"):
-        cases.load(tmp_path / "case.toml").prepare()
+        lp.Identifier(rod, means, lp.GradientLaw(gain="auto"), u0=0.0)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +252,6 @@ left = {{ role = "boundary", column = "left", at = "left" }}
             '{ norm = "X", tau = 1.5 }',
             lp.observation.Tikhonov("X", lp.observation.Discrepancy(1.5)),
         ),
-        ("{ alpha = 1e-3 }", lp.observation.Tikhonov("V", 1e-3)),
         ("false", lp.observation.Pseudoinverse()),
     ],
 )
@@ -330,11 +280,6 @@ def test_gradient_law_on_points_gets_a_note(rod):
     )
 
 
-def test_two_damping_rules(rod):
-    with pytest.raises(lp.errors.CaseError, match="c1 and mu are two damping rules"):
-        cases.load(rod(GRADIENT, ("gain = 1e-12", "c1 = 1\nmu = 1")))
-
-
 def test_sensitivity_options(rod):
     law = cases.load(rod((DRIFT, 'drift = "0.1 1/h"\nmemory = "1 h"\nnoise = "0.1 K"\n#'))).law
     assert (law.modes, law.noise, law.memory) == ("auto", 0.1, 3600.0)
@@ -343,13 +288,6 @@ def test_sensitivity_options(rod):
     some = cases.load(rod(('drift = "0.1 1/h"', "refit = {start = 16}"), ('memory = "1 h"', "")))
     assert some.law.refit == lp.Refit(start=16)
     assert cases.load(rod(("{start = 16}", "false"))).law.refit is None
-
-
-def test_guards(rod):
-    assert cases.load(rod((DRIFT, "guards = true"))).law.guards == lp.laws.Guards()
-    assert cases.load(rod(("guards = true", "guards = false"))).law.guards is None
-    some = cases.load(rod(("guards = false", "guards = { reach = 2 }")))
-    assert some.law.guards == lp.laws.Guards(reach=2.0)
 
 
 @pytest.mark.slow
@@ -413,34 +351,19 @@ b = { role = "withheld", column = "b", at = [0.5, 0.75] }
     assert {"x", "y"} <= set(data.coords)
 
 
-OWN = """
-import livepde as lp
-from livepde.models import HEAT if False else EQUATIONS
-"""
-
-
-def own_code(rod, body: str) -> Path:
+def own_code(rod, body: str, *, plain: bool = False) -> Path:
     path = rod(('equation = "heat"  ', 'equation = "own.py:build"  '))
+    if plain:  # a function has no units
+        path.write_text(re.sub(r'"([-.\de]+) (?:m\^2/s|K)"', r"\1", path.read_text()))
     (path.parent / "own.py").write_text(body)
     return path
-
-
-def test_own_equation_needs_permission(rod):
-    path = own_code(rod, "raise SystemExit(3)\n")
-    with pytest.raises(lp.errors.CaseError, match="--allow-code"):
-        cases.load(path)
 
 
 @pytest.mark.slow
 def test_own_function_runs(rod):
     body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet):\n"
     body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
-    path = own_code(rod, body)
-    text = path.read_text().replace(" m^2/s", "").replace('"5e-5"', "5e-5")
-    for number in ("3e-5", "1e-6", "1e-3"):
-        text = text.replace(f'"{number}"', number)
-    path.write_text(text.replace(f'"{0.05} K"', "0.05"))
-    _, data = result_of(path, allow_code=True)
+    _, data = result_of(own_code(rod, body, plain=True), allow_code=True)
     assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
 
 
@@ -467,11 +390,7 @@ def test_own_equation_object_keeps_units(rod):
     ],
 )
 def test_own_code_that_fails(rod, body, named):
-    path = own_code(rod, body)
-    text = path.read_text().replace(" m^2/s", "").replace(' K"', '"')
-    for number in ("5e-5", "3e-5", "1e-6", "1e-3", "0.05"):
-        text = text.replace(f'"{number}"', number)
-    path.write_text(text)
+    path = own_code(rod, body, plain=True)
     with pytest.raises(lp.LivepdeError, match=named):
         cases.load(path, allow_code=True)
 
@@ -511,18 +430,26 @@ def test_a_unit_where_a_function_has_none(rod):
 
 # --- what is refused -------------------------------------------------------------------------
 
+MESH = 'from = 0\nto = "40 cm"\ncells = 40'
+REFERENCE = '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"\n[expect]'
+VARIANTS = """
+[[variants]]
+name = "noisier"
+set = { law.noise = "1 K", "data.every" = 2 }
+seeds = 3
+expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
+
+[expect]"""
+
 REFUSED = [
     ("cells = 40", "cels = 40", "no key 'mesh.cels'; did you mean 'cells'?"),
     ("cells = 40", 'cells = "many"', "mesh.cells: got 'many'; expected a whole number"),
-    ("cells = 40", "cells = -3", "expected a number greater than 0"),
     ("cells = 40", "cells = [4, 4]", "one number for an interval"),
     ("cells = 40 ", "x = [0, 1]\ncells = 3 #", "mesh: expected from and to"),
     ("cells = 40 ", 'spacing = "geometric"\ncells = 40 #', "needs from > 0"),
     ('to = "40 cm"', 'to = "40 s"', "mesh.to: 's' cannot be converted to 'm'"),
     ('to = "40 cm"', 'to = "40 cmm"', "'cmm' is not a unit"),
     ('to = "40 cm"', "to = -1", "needs from < to"),
-    ('to = "40 cm"', "to = [1]", "mesh.to: got [1]"),
-    ('prior = "5e-5 m^2/s"', 'prior = "5e-5 m/s"', "unknowns.alpha.prior"),
     ("bounds = [", 'transform = "log"\nbounds = [', "alpha: transform='log' has no upper bound"),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', 'transform = "logit"', "needs two finite bounds"),
     (
@@ -540,20 +467,11 @@ REFUSED = [
     ('time_unit = "s"', 'decimal = ";"', "data.decimal: got ';'"),
     ('time_unit = "s"', 'encoding = "utf-9"', "expected the name of an encoding, as 'utf-8'"),
     ('time_unit = "s"', 'time_format = "%H:%M"', "data.time_format: got '%H:%M'; expected year"),
-    ('time_unit = "s"', 'time_format = "%d.%m.%Y %"', "expected year, month, day and time"),
-    (DRIFT, "guards = { reech = 1 }", "no key 'law.guards.reech'; did you mean 'reach'?"),
     (DRIFT, "guards = { reach = 0 }", "law.guards: reach must be a positive number; got"),
     (DRIFT, "shadows = { mesh = 1 }", "law.shadows: mesh must be true or false; got 1"),
-    (DRIFT, "shadows = { largest = 0 }", "law.shadows: largest must be at least 1; got"),
-    (DRIFT, "shadows = { largest = true }", "law.shadows: largest must be a number; got"),
-    (DRIFT, "refit = { start = true }", "law.refit: start must be a number; got True"),
-    (DRIFT, "guards = { reach = true }", "law.guards: reach must be a number; got True"),
     (DRIFT, "jumps = { size = true }", "law.jumps: size must be a number; got True"),
     (DRIFT, "gate = true", "law.gate: got True; expected a number"),
-    (DRIFT, "modes = true", "law.modes: got True; expected a number"),
-    (DRIFT, "refit = { window = -3 }", "law.refit: window must be at least 2; got -3"),
     (DRIFT, 'jumps = { unknowns = "k" }', "law.jumps.unknowns: got 'k'; expected a list"),
-    (DRIFT, "jumps = { unknowns = { a = 1 } }", "got {'a': 1}; expected a list."),
     ('bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]', "bounds = [3]", "bounds: got [3]; expected more ent"),
     ('std = "3e-5 m^2/s"', "std = 0.0", "unknowns.alpha.std: got 0.0; expected more than 0"),
     ('bounds = ["1e-6', 'field = true\nbounds = ["1e-6', "a field has no regions"),
@@ -561,20 +479,14 @@ REFUSED = [
     ("bounds = [", "regions = { a = [0, 0.3] }\nbounds = [", "lies in 0 layers"),
     ("bounds = [", "regions = { a = [0, 0.3], b = [0.2, 0.4] }\nbounds = [", "lies in 2 layers"),
     ("bounds = [", "regions = { a = [3, 4] }\nbounds = [", "contains no cell"),
-    ("bounds = [", "regions = { a = [4, 3] }\nbounds = [", "needs the lower one first"),
-    ("[unknowns.alpha]", "[unknowns.alhpa]", "did you mean 'alpha'?"),
     ('equation = "heat"', 'equation = "heet"', "did you mean 'heat'?"),
     ("[law]", "[options]\nD = 1\n[law]", "has no 'D' here; leave it out"),
     ('kind = "sensitivity"', 'kind = "sensitive"', "law.kind: got 'sensitive'; did you mean"),
-    (DRIFT, "refti = true", "no key 'law.refti'; did you mean 'refit'?"),
     (DRIFT, "refit = {strat = 3}", "did you mean 'start'?"),
-    (DRIFT, "replay = true", "no key 'law.replay'"),
-    ('kind = "sensitivity"', 'kind = "auto"', "law.kind: got 'auto'"),
     (DRIFT, "noise = -1", "law.noise: got -1"),
-    ('kind = "sensitivity"', 'kind = "gradient"\nc1 = 1\nmu = 1\n[more]', "no key 'more'"),
+    ('kind = "sensitivity" ', 'kind = "gradient"\nc1 = 1\nmu = 1 #', "are two damping rules"),
     ('scheme = "alexander2"', 'scheme = "rk4"', "steps.scheme: got 'rk4'"),
     ('dt_max = "20 s"', 'dt_max = "-20 s"', "steps.dt_max: got '-20 s'"),
-    ('role = "withheld"', 'role = "witheld"', "did you mean 'withheld'?"),
     ('column = "T_20"', 'colunm = "T_20"', "did you mean 'column'?"),
     ('column = "T_20"', 'column = "T_20", columns = ["T_10"]', "expected column = name"),
     ('at = "20 cm"', 'at = "20 m"', "20 m lies outside the mesh"),
@@ -584,14 +496,12 @@ REFUSED = [
     ('at = "left"', 'at = "lft"', "did you mean 'left'?"),
     ('at = "left"', "at = 0.0", "needs at = the name of a boundary"),
     ('at = "left"', 'at = "right"', "has a value already"),
-    ('at = "left"', 'at = "left", noise = "0 K"', "T_left.noise: got '0 K'"),
     ('role = "boundary", column = "T_left", at = "left"', 'role = "input", column = "T_left"',
      "has no 'T_left' here"),
     ('role = "boundary", column = "T_left", at = "left"',
      'role = "input", column = "T_left", at = 1', "role input has no place"),
     ('at = "10 cm", noise = "0.05 K"', 'at = "10 cm"', "T_10.noise is missing"),
     (', noise = "0.05 K"', "", "law.noise is missing"),
-    ('noise = "0.05 K"', 'noise = "0.05 m"', "T_10.noise: 'm' cannot"),
     ('noise = "0.05 K"', 'noise = "0 K"', "T_10.noise: got '0 K'"),
     ('at = "10 cm"', 'over = "lft"', "the mesh has no part 'lft'; did you mean 'left'?"),
     ('at = "20 cm"', 'at = 0.2, offset = 1', "offset requires role = 'sensor'"),
@@ -601,11 +511,42 @@ REFUSED = [
     ('role = "sensor"', 'role = "withheld"', "there is no sensor. Add"),
     ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
     ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
-    ('rmse = "<= 0.15"', 'rmse = "<= 1-2"', "expect.rmse"),
     ("title =", "titel =", "no key 'titel'; did you mean 'title'?"),
     ("title =", "title = 3 #", "title: got 3; expected text"),
     ("[mesh]", "[mesh", "is not valid TOML"),
     ("T_20 = {", "T_21 = 3 #", "channels.T_21: got 3; expected a table"),
+    ('at = "20 cm"', 'at = 0.2, spikes = "keep"', "require a boundary or input channel"),
+    ('at = "20 cm"', 'at = 0.2, between = "hold"', "between requires a boundary or input channel"),
+    ('at = "left"', 'at = "left", between = "step"', "channels.T_left.between: got 'step'"),
+    ('at = "left"', 'at = "left", between = "hold", missing = "skip"', "is never missing"),
+    ('at = "left"', 'at = "left", between = "next", spikes = "refuse"', 'between = "line"'),
+    (MESH, "nodes = [0, 0.4, 0.3] #", "mesh.nodes: line: needs at least two increasing nodes"),
+    (MESH, "nodes = [0, 0.4]\ncells = 3 #", "mesh: expected from and to"),
+    (MESH, 'nodes = [0, 0.4]\nspacing = "geometric" #', "spacing requires an interval with cells"),
+    (MESH, 'nodes = [0, 0.4]\nunit = "mm" #', "unit requires file"),
+    (MESH, "x = [0, 1, 2]\ny = [0, 1]\ncells = [2, 2] #", "x and y: expected [from, to] each; or"),
+    (MESH, "x = [0, 2, 1]\ny = [0, 1] #", "mesh: grid: needs at least two increasing nodes"),
+    *(("bounds = [", f"regions = {{ a = {region} }}\nbounds = [", f"alpha.regions.a{named}")
+      for region, named in (
+        ("{ prior = 1 }", ".over' is missing"),
+        ("{ over = [0, 1], priro = 1 }", ".priro'; did you mean 'prior'"),
+        ('{ over = [0, 1], prior = "1 m" }', ".prior: 'm' cannot be converted"),
+        ('{ over = [0, 1], prior = "1e-2 m^2/s" }', ": the prior 0.01 is outside"),
+        ("3", ": got 3"))),
+    ("bounds = [", 'evolution = { kind = "random-walk" } #', "'random-walk' takes rate"),
+    ("bounds = [", 'evolution = { kind = "periodic", rate = 1 } #', "takes harmonics and period"),
+    ("bounds = [", 'evolution = { kind = "periodic", perod = 1 } #', "did you mean 'period'?"),
+    ("bounds = [", 'evolution = { kind = "mean-reverting", time = "2 m" } #', "time: 'm'"),
+    ('time = "time_s"', "", "time is missing"),
+    ("time_unit", "options = { a = 1 }\ntime_unit", "options require a reader"),
+    ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
+    ("[expect]", REFERENCE.replace("alpha", "alhpa"), "there is no unknown number 'alhpa'; did"),
+    ("[expect]", REFERENCE.replace("cm^2", "cm"), "reference.alpha: 'cm/s' cannot be converted"),
+    *(("[expect]", VARIANTS.replace(old, new), named) for old, new, named in (
+        ("seeds", "sedes", "there is no key 'variants[0].sedes'; did you mean 'seeds'?"),
+        ("seeds = 3", 'seeds = 3\n[[variants]]\nname = "noisier"', "two have the name 'noisier'"),
+        ('name = "noisier"', "", "the key 'variants[0].name' is missing"),
+        ('rmse = "<= 1"', "rmse = 1", "variants[0].expect.rmse: got 1"))),
 ]  # fmt: skip
 
 
@@ -726,33 +667,10 @@ def test_borehole_needs_its_options_and_input(tmp_path):
 
 
 def test_nodes(rod):
-    path = rod(('from = 0\nto = "40 cm"\ncells = 40', 'nodes = [0, "10 cm", 0.2, 0.3, "400 mm"] #'))
+    path = rod((MESH, 'nodes = [0, "10 cm", 0.2, 0.3, "400 mm"] #'))
     mesh = cases.load(path).mesh
     np.testing.assert_allclose(mesh.p[0], [0.0, 0.1, 0.2, 0.3, 0.4])
     assert set(mesh.boundaries) == {"left", "right"}
-
-
-@pytest.mark.parametrize(
-    ("mesh", "named"),
-    [
-        ("nodes = [0, 0.4, 0.3]", "mesh.nodes: line: needs at least two increasing nodes"),
-        ("nodes = [0]", "mesh.nodes"),
-        ("nodes = [0, 0.4]\ncells = 3", "mesh: expected from and to"),
-        ('nodes = [0, 0.4]\nspacing = "geometric"', "spacing requires an interval with cells"),
-        ('nodes = [0, 0.4]\nunit = "mm"', "unit requires file"),
-        ("from = 0\nto = 1", "mesh: expected from and to"),
-        (
-            "x = [0, 1, 2]\ny = [0, 1]\ncells = [2, 2]",
-            "x and y: expected [from, to] each; or nodes",
-        ),
-        ("x = [0, 2, 1]\ny = [0, 1]", "mesh: grid: needs at least two increasing nodes"),
-    ],
-)
-def test_meshes_that_are_refused(rod, mesh, named):
-    path = rod(('from = 0\nto = "40 cm"\ncells = 40', f"{mesh} #"))
-    with pytest.raises(lp.errors.CaseError) as error:
-        cases.load(path)
-    assert named in str(error.value)
 
 
 PLANE = """
@@ -816,28 +734,6 @@ def test_positive_unknowns(rod):
     assert row.left < 0.05
     case = cases.load(rod(('transform = "log"', 'transform = "log"\nfield = true')))
     assert case.model.parameter_space.unknowns["alpha"].prior == lp.LogNormal(5e-5, 3e-5)
-
-
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ('evolution = { kind = "random-walk" }', "'random-walk' takes rate"),
-        ('evolution = { kind = "periodic", rate = 1 }', "takes harmonics and period"),
-        ('evolution = { kind = "perodic" }', "did you mean 'periodic'?"),
-        ('evolution = { kind = "periodic", perod = 1 }', "did you mean 'period'?"),
-        ('evolution = { kind = "mean-reverting", time = "2 m" }', "evolution.time: 'm' cannot"),
-        ('transform = "lg"', "did you mean 'log'?"),
-        ('transform = "logit"\n#', "unknowns.alpha: "),
-    ],
-)
-def test_evolutions_that_are_refused(rod, text, named):
-    with pytest.raises(lp.errors.CaseError) as error:
-        cases.load(rod(("bounds = [", f"{text}\nbounds = [" if "#" not in text else f"{text}[")))
-    assert named in str(error.value)
-
-
-def test_gate(rod):
-    assert cases.load(rod((DRIFT, "gate = 5"))).law.gate == 5.0
 
 
 def test_the_initial_state_is_said_once(rod):
@@ -952,15 +848,6 @@ def test_an_unknown_offset_is_found(rod):
 
 
 @pytest.mark.slow
-def test_points_and_averages_together(rod):
-    path = rod(('at = "30 cm", noise = "0.05 K"', 'over = ["28 cm", "32 cm"], noise = "0.07 K"'))
-    prepared, data = result_of(path)
-    assert prepared.identifier.observed.names == ("T_10", "T_30")
-    np.testing.assert_allclose(prepared.identifier.observed.noise, [0.05, 0.07])
-    assert float(data.alpha[-1]) == pytest.approx(9.7e-5, rel=0.03)
-
-
-@pytest.mark.slow
 def test_means_along_a_line(rod):
     path = rod(('at = "30 cm", noise = "0.05 K"', 'along = ["28 cm", 0.32], noise = "0.07 K"'))
     prepared, data = result_of(path)
@@ -1029,15 +916,12 @@ def test_reader_gives_what_the_file_gives(rod, monkeypatch):
     ("old", "new", "named"),
     [
         ("noise=0.0", "noize=0.0", "has no option 'noise'; did you mean 'noize'?"),
-        ("def read(", "def raed(", "has no function 'read'"),
         ("return ", "return 3 #", "returned int; expected times and a mapping"),
         ("return ", "raise ValueError('bad') #", "failed with ValueError: bad"),
         ("rod.csv", "none.csv", "there is no file"),
         ('frame["time_s"]', "[]", "contains no samples"),
         ('frame["time_s"]', 'frame["time_s"][::-1].to_numpy()', "sample 1: the time is earlier"),
-        ('frame["time_s"]', 'frame["time_s"][1:]', "has shape (91,); there are 90 times"),
         ("{key:", "{key + '_': ", "there is no column 'T_left'; did you mean 'T_left_'?"),
-        ("+ noise", "+ np.inf + noise", "is infinite in sample 0"),
         ("frame[key] + noise * rng", "['a'] * 91 or rng", "must contain numbers only"),
     ],
 )
@@ -1051,30 +935,6 @@ def test_readers_that_fail(rod, monkeypatch, old, new, named):
     assert named in message
     assert str(path) in message
     assert "\n" not in message
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [
-        ('time = "time_s"', "", "time is missing"),
-        ("time_unit", "options = { a = 1 }\ntime_unit", "options require a reader"),
-        ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
-        ("time_unit", 'separator = "::"\ntime_unit', "data.separator"),
-    ],
-)
-def test_one_source_of_data(rod, old, new, named):
-    with pytest.raises(lp.errors.CaseError, match=named):
-        cases.load(rod((old, new)))
-
-
-def test_semicolons(rod):
-    path = rod()
-    data = path.with_name("rod.csv")
-    data.write_text(data.read_text().replace(",", ";"))
-    with pytest.raises(lp.errors.DataError, match="set separator = ';'"):
-        cases.load(path).prepare()
-    prepared = cases.load(rod(("time_unit", 'separator = ";"\ntime_unit'))).prepare()
-    assert len(prepared.stream) == 91
 
 
 def test_options_that_are_text_or_booleans(rod):
@@ -1111,11 +971,8 @@ def test_text_for_a_bare_function(rod):
     body = "from livepde.models import heat\n\ndef build(mesh, unknowns, dirichlet, *, a, b, c):\n"
     body += "    assert (a, b, c) == (2.0, 'x', True)\n"
     body += "    return heat(mesh, unknowns['alpha'], dirichlet)\n"
-    path = own_code(rod, body)
-    text = path.read_text().replace(" m^2/s", "").replace(' K"', '"')
-    for number in ("5e-5", "3e-5", "1e-6", "1e-3", "0.05"):
-        text = text.replace(f'"{number}"', number)
-    path.write_text(text.replace("[law]", '[options]\na = 2\nb = "x"\nc = true\n[law]'))
+    path = own_code(rod, body, plain=True)
+    path.write_text(path.read_text().replace("[law]", '[options]\na = 2\nb = "x"\nc = true\n[law]'))
     cases.load(path, allow_code=True)
 
 
@@ -1157,11 +1014,9 @@ def test_keys_are_taken_away(rod):
     [
         ("law.kidn", None, "there is no key 'law.kidn' to remove; did you mean 'kind'?"),
         ("law.niose", 1, "there is no key 'law.niose'; did you mean 'noise'?"),
-        ("lwa.noise", 1, "there is no key 'lwa'; did you mean 'law'?"),
         ("unknowns.alhpa.prior", 1, "has no 'unknowns.alhpa'; did you mean 'alpha'?"),
         ("channels.T_21.noise", 1, "did you mean 'T_20'?"),
         ("law..noise", 1, "'law..noise' is not a key"),
-        ("law.noise", "2 m", "law.noise: 'm' cannot be converted"),
     ],
 )
 def test_settings_that_are_refused(rod, key, value, named):
@@ -1177,16 +1032,7 @@ def test_settings_need_an_equals_sign():
         parse(["law"])
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
-def test_documents_survive_being_written(path):
-    document = tomllib.loads(path.read_text())
-    document["odd"] = {"a b": 'x"\\\n\x07', "": [True, 1e300, {"y": {}}], "inf": float("inf")}
-    assert tomllib.loads(tomlkit.dumps(document)) == document
-
-
 # --- references and variants -----------------------------------------------------------------
-
-REFERENCE = ("[expect]", '[reference]\nalpha = "0.97 cm^2/s"\nsource = "made up"\n[expect]')
 
 
 def described(path):
@@ -1196,7 +1042,7 @@ def described(path):
 
 @pytest.mark.slow
 def test_references(rod):
-    path = rod(REFERENCE, ("alpha = [9e-5, 1.05e-4]", 'alpha.error = "<= 0.03"'))
+    path = rod(("[expect]", REFERENCE), ("alpha = [9e-5, 1.05e-4]", 'alpha.error = "<= 0.03"'))
     case, data = described(path)
     assert case.references == {"alpha": pytest.approx(9.7e-5)}
     assert case.source == "made up"
@@ -1210,49 +1056,11 @@ def test_references(rod):
     assert table.rows[0][-2] == "9.7e-05"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [
-        ('alpha = "0.97', 'alhpa = "0.97', "reference: there is no unknown number 'alhpa'; did"),
-        ("cm^2/s", "cm/s", "reference.alpha: 'cm/s' cannot be converted"),
-    ],
-)
-def test_references_that_are_refused(rod, old, new, named):
-    with pytest.raises(lp.errors.CaseError) as error:
-        cases.load(rod((REFERENCE[0], REFERENCE[1].replace(old, new))))
-    assert named in str(error.value)
-
-
-VARIANTS = """
-[[variants]]
-name = "noisier"
-set = { law.noise = "1 K", "data.every" = 2 }
-seeds = 3
-expect = { rmse = "<= 1", alpha.error = "<= 0.1" }
-
-[expect]"""
-
-
 def test_variants(rod):
     (variant,) = cases.load(rod(("[expect]", VARIANTS))).spec.variants
     assert variant.name == "noisier"
     assert variant.seeds == 3
     assert variant.expect == {"rmse": ("<=", 1.0), "alpha.error": ("<=", 0.1)}
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "named"),
-    [
-        ("seeds", "sedes", "there is no key 'variants[0].sedes'; did you mean 'seeds'?"),
-        ("seeds = 3", 'seeds = 3\n[[variants]]\nname = "noisier"', "two have the name 'noisier'"),
-        ('name = "noisier"', "", "the key 'variants[0].name' is missing"),
-        ('rmse = "<= 1"', "rmse = 1", "variants[0].expect.rmse: got 1"),
-    ],
-)
-def test_variants_that_are_refused(rod, old, new, named):
-    with pytest.raises(lp.errors.CaseError) as error:
-        cases.load(rod(("[expect]", VARIANTS.replace(old, new))))
-    assert named in str(error.value)
 
 
 # --- shipped cases ---------------------------------------------------------------------------
@@ -1280,17 +1088,6 @@ def shipped(name, tmp_path, *changes):
 @pytest.fixture
 def measured(data_dir, monkeypatch):
     monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("measured")
-def test_soil_uniform(tmp_path):
-    _, data = result_of(shipped("soil_uniform", tmp_path))
-    found = measures(data)
-    assert 4e-7 <= found["alpha"] <= 7e-7
-    assert found["rmse"] <= 0.32
-    assert {"rmse.T_10", "rmse.T_20", "rmse.T_30", "rmse.T_40", "rmse.T_50"} <= set(found)
-    assert found["failed_steps"] == 0
 
 
 @pytest.mark.long
@@ -1327,15 +1124,6 @@ def test_thermal_response_does_not_depend_on_the_prior(tmp_path):
 def test_a_misspelt_expectation(rod):
     (note,) = cases.load(rod(("alpha = [9e-5", "alpah = [9e-5"))).notes
     assert note.startswith("expect.alpah: a run of this case has no such number; did you mean")
-
-
-def test_decimal_commas_are_not_cut(rod):
-    path = rod()
-    data = path.with_name("rod.csv")
-    header, *rows = data.read_text().splitlines()
-    data.write_text("\n".join([header, *(row.replace(".", ",") for row in rows)]) + "\n")
-    with pytest.raises(lp.errors.DataError, match=r"row 2: .* fields, but the header has 6"):
-        cases.load(path).prepare()
 
 
 def test_units_of_many_cases_are_those_of_pint():

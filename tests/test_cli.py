@@ -70,12 +70,6 @@ def test_bad_input_is_one_sentence_and_exit_code_2(here):
     assert list(here.iterdir()) == []
 
 
-@pytest.mark.process
-def test_wrong_usage_is_exit_code_2():
-    assert shell("run").returncode == 2
-    assert shell("walk").returncode == 2
-
-
 def test_main_returns_codes(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["livepde", "report", "nowhere"])
     assert cli.main() == 2
@@ -194,34 +188,6 @@ def test_nothing_is_written_over(rod, here):
     assert "already contains a run" in bad("run", rod, "--out", "out")
     assert {p: p.stat().st_mtime_ns for p in (here / "out").iterdir()} == before
     assert "exists. Choose another folder" in bad("init", "rod")
-
-
-def test_a_case_that_is_refused_leaves_nothing(rod, here):
-    path = Path(rod)
-    path.write_text(path.read_text().replace("cells", "cels"))
-    assert "did you mean 'cells'?" in bad("run", rod, "--out", "out")
-    assert not (here / "out").exists()
-
-
-def test_data_that_are_refused_leave_nothing(rod, here):
-    data = here / "rod" / "rod.csv"
-    data.write_text(data.read_text().replace("\n40,", "\n40,warm"))
-    assert "row 4, column 'T_left': got 'warm" in bad("run", rod, "--out", "out")
-    assert not (here / "out").exists()
-
-
-@pytest.mark.slow
-def test_check_tells_what_can_hardly_be_identified(rod):
-    path = Path(rod)
-    text = path.read_text().replace("bounds =", "# bounds =")
-    text = text.replace(
-        "# by layer:", 'regions = { near = [0, "39 cm"], far = ["39 cm", "40 cm"] }\n#'
-    )
-    text = text.replace('"0.05 K"', '"1 K"')
-    path.write_text(text)
-    code, output = call("check", rod)
-    assert code == 0
-    assert "not identifiable" in output
 
 
 @pytest.mark.slow

@@ -14,7 +14,6 @@ from commands import bad, call
 from factories import short_rod
 
 from livepde import cases
-from livepde.cases.proposals import proposed
 from livepde.cases.read import parse
 from livepde.cases.remedies import NO_SETTING, with_settings
 from livepde.cases.variants import (
@@ -22,6 +21,7 @@ from livepde.cases.variants import (
     Variant,
     VariantRun,
     conclusions,
+    proposed,
     recommended,
     run_variant,
     variant_of,

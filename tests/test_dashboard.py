@@ -363,7 +363,7 @@ def test_ctrl_c_while_it_says_where_ends_it(tmp_path, monkeypatch):
     def interrupted():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sys.modules["livepde.cli.watch"], "terminal", interrupted)
+    monkeypatch.setattr(sys.modules["livepde.cli.finished"], "terminal", interrupted)
     assert CliRunner().invoke(cli.app, ["watch", str(tmp_path), "--address", "0"]).exit_code == 0
     assert {*threading.enumerate()} == before  # threads that serve would keep it from its end
 

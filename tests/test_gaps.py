@@ -225,13 +225,6 @@ def taken(sink: Intake, rows) -> tuple[list, dict]:
 ROWS = [{"t": float(k), "T": 1.0, "left": float(k)} for k in range(8)]
 
 
-def test_without_a_wait_a_gap_is_passed_on():
-    rows = [row if row["t"] != 3.0 else {**row, "left": None} for row in ROWS]
-    found, counts = taken(intake(), rows)
-    assert [t for t, value in found if math.isnan(value)] == [3.0]
-    assert counts == {"missing": 1}
-
-
 @pytest.mark.parametrize("gap", [{"t": 3.0, "T": 1.0, "left": None}, {"t": 3.0, "T": 1.0}])
 @pytest.mark.parametrize("options", [{"wait": 2.0}, {"habit": 2.0}])
 def test_within_the_wait_a_gap_is_interpolated(gap, options):
@@ -331,12 +324,6 @@ def test_a_channel_may_keep_its_gaps_and_spikes(tmp_path):
     left = prepared.stream.values[:, 0]
     assert np.flatnonzero(np.isnan(left)).tolist() == [30, 31, 119]
     assert left[60] == 9999.0
-
-
-@pytest.mark.parametrize("key", ['missing = "interpolate"', 'spikes = "keep"'])
-def test_sensors_are_neither_interpolated_nor_screened(tmp_path, key):
-    with pytest.raises(lp.errors.CaseError, match="require a boundary or input channel"):
-        cases.load(plant(tmp_path, sensor=f", {key}"))
 
 
 @pytest.mark.parametrize(("wait", "known"), [(0.0, False), (3 * SECONDS, True)])

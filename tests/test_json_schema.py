@@ -73,7 +73,6 @@ def test_short_forms_are_accepted(more, tmp_path):
         "titel = 'a rod'",
         "[mesh]\nfrom = 0\nto = 1\ncells = 'many'",
         "[law]\nkind = 'kalman'",
-        "[law]\nmode = 5",
         "[expect]\nrmse = '< 3'",
         "[steps]\nscheme = 'rk4'",
         "[channels]\nT = { role = 'thermometer', column = 'T' }",

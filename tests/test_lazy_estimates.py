@@ -14,7 +14,7 @@ from livepde.frames import interval_ends
 from livepde.laws import Belief
 from livepde.laws.filter_state import FilterState
 from livepde.models import heat
-from livepde.readout import ScalarReadout, unknown_of
+from livepde.readout import ScalarReadout
 from livepde.records import Record, RecordArrays, Snapshot
 
 
@@ -130,7 +130,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
         left = estimate.belief.left([*space.labels.values()])
         wanted = []
         for (label, (value, std)), share in zip(estimate.parameters.items(), left, strict=True):
-            ends = interval_ends(label, unknown_of(space, label), value, std)
+            ends = interval_ends(label, space.unknown_of(label), value, std)
             wanted += [value, std, *map(float, ends.values()), float(share)]
         np.testing.assert_array_equal(readout(estimate.belief), wanted)
 

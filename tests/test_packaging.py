@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import livepde
 from livepde import cli
-from livepde.cli import citation
+from livepde.cli import experiments
 from livepde.models import EQUATIONS
 
 ROOT = Path(__file__).parents[1]
@@ -160,7 +160,7 @@ def test_apa():
 def test_a_release_has_a_year(monkeypatch, tmp_path):
     released = (ROOT / "CITATION.cff").read_text() + "date-released: 2027-03-01\n"
     (tmp_path / "CITATION.cff").write_text(released)
-    monkeypatch.setattr(citation, "files", lambda package: tmp_path)
+    monkeypatch.setattr(experiments, "files", lambda package: tmp_path)
     assert told("citation").startswith("@misc{livepde2027,")
     assert "  year = {2027},\n" in told("citation")
     assert told("citation", "--format", "apa").startswith("The livepde authors. (2027). livepde (")

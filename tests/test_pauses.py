@@ -19,7 +19,7 @@ from livepde.fleet import Fleet
 from livepde.laws.filter_state import InputHistory, pauses
 from livepde.runs import sampling_findings
 from livepde.stepping import Span
-from livepde.streams.sampling import clock_leaps, unit_factor
+from livepde.streams.oddities import clock_leaps, unit_factor
 
 ALPHA = 1.5e-5
 DT = 10.0

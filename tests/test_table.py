@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from contextlib import closing
@@ -57,28 +56,22 @@ def test_what_counts_as_missing(csv, missing):
     [
         ("t,a,b\n0,1,1\n1,oops,1\n", "row 3, column 'a': got 'oops'"),
         ("t,a,b\n0,1,1\n\n1,1,inf\n", "row 4, column 'b': got 'inf'"),
-        ("t,a,b\n0,1,1\n1,1,-Infinity\n", "row 3, column 'b'"),
         ("t,a,c\n0,1,1\n", "no column 'b'"),
         ("time,a,b\n0,1,1\n", "did you mean 'time'"),
         ("t,a,b\n0,1,1\nlater,1,1\n", "row 3, column 't': got 'later'"),
-        ("t,a,b\n0,1,1\n,1,1\n", "row 3, column 't'"),
         ("t,a,b\n2025-01-01,1,1\n5,1,1\n", "expected a date"),
         ("t,a,b\n0,1,1\ns,K,K\n1,1,1\n", "row 3, column 't': got 's'; expected a number"),
         ("t,a,b\n0,'1,5',1\n", "row 2: 4 fields, but the header has 3; decimals need a point"),
         ('t,a,b\n0,"1,5",1\n', "got '1,5'; if that is a decimal comma, set decimal = ','"),
-        ('t,a,b\n"0,5",1,1\n"0,6",1,1\n', "got '0,5'; if that is a decimal comma"),
         ("t,a,b\n1.4.2025 9:05,1,1\n", "set time_format, perhaps '%d.%m.%Y %H:%M'"),
-        ("t;a;b\n0;1;1\n", "3 with ';': set separator = ';'."),
         ("t;a;b\n0;1,5;1\n", "3 with ';': set separator = ';' and decimal = ','."),
         ("t,a,b\n", "no rows"),
-        ("", "cannot be read"),
+        ("", "cannot be read as a CSV file: it is empty"),
     ],
 )
 def test_bad_tables_name_file_row_and_column(csv, text, named):
     path = csv(text)
-    clock = Clock("time" if text.startswith("t,a,b\n0,1,1\n5") else "t")
-    if "did you mean" in named:
-        clock = Clock("tim")
+    clock = Clock("tim" if "did you mean" in named else "t")
     with pytest.raises(DataError) as error:
         read_csv(path, COLUMNS, clock)
     assert named in str(error.value)
@@ -124,9 +117,7 @@ def test_as_a_german_excel_writes_it(tmp_path, encoding):
     "text",
     [
         "id,t,a,b\n7,0,1,2,\n7,1,3,4,\n",
-        "id,t,a,b,\n7,0,1,2,\n7,1,3,4,\n",
         "id,t,a,b,\n7,0,1,2,cold\n7,1,3,4\n",
-        '"id", "t", "a", "b"\n7, 0, "1", 2\n7, 1, 3, 4,,\n',
         'id,t,a,b\n"7,5",0,1,2\n"7,6", 1,3,4\n',
         '"id", "t", "a", "b"\n"7,5", 0, 1, 2\n7, "1", 3, 4\n',
     ],
@@ -164,11 +155,6 @@ def test_quotes_and_what_looks_like_an_end(csv):
         read_csv(path, COLUMNS, Clock("t"))
     table = read_csv(csv('t,a,"b\nb"\n0,1,"x\ny"\n1,2,3'), {"T": Column(("a",))}, Clock("t"))
     assert table.values[:, 0].tolist() == [1.0, 2.0]
-
-
-def test_an_empty_file(csv):
-    with pytest.raises(DataError, match="cannot be read as a CSV file: it is empty"):
-        read_csv(csv(""), COLUMNS, Clock("t"))
 
 
 def test_a_point_in_times_is_none_of_decimals(csv):
@@ -214,7 +200,6 @@ def test_a_column_that_is_there_twice_is_refused(csv, column):
             "1.234",
             "row 2, column 'a': got '1.234'; with decimal = ',', a point is not a decimal",
         ),
-        ("1,5", "1.234,5", "row 2, column 'a': got '1.234,5'; expected a number"),
         ("01.04.2025 12:30", "31.02.2025 12:30", "as time_format has it, '%d.%m.%Y %H:%M'"),
     ],
 )
@@ -233,42 +218,12 @@ def test_time_has_to_increase(csv, times):
 NIGHT = datetime(2025, 10, 25, 22, tzinfo=UTC)  # in Berlin the day begins on which 3:00 is 2:00
 
 
-@pytest.fixture
-def night(csv):
-    def write(minutes, offset):
-        moments = [NIGHT + timedelta(minutes=minutes * k) for k in range(26 * 60 // minutes)]
-        local = [moment.astimezone(GERMAN.zone) for moment in moments]
-        texts = [f"{t if offset else t.replace(tzinfo=None)},1,1\n" for t in local]
-        return csv("t,a,b\n" + "".join(texts))
-
-    return write
-
-
 @pytest.mark.parametrize("stop", ["2025-10-26", date(2025, 10, 26)])
-def test_a_day_includes_its_hours_also_if_it_has_25(night, stop):
+def test_a_day_includes_its_hours_also_if_it_has_25(csv, stop):
+    local = [(NIGHT + timedelta(minutes=30 * k)).astimezone(GERMAN.zone) for k in range(52)]
     clock = Clock("t", start="2025-10-26", stop=stop, zone=GERMAN.zone)
-    table = read_csv(night(30, offset=True), COLUMNS, clock)
+    table = read_csv(csv("t,a,b\n" + "".join(f"{t},1,1\n" for t in local)), COLUMNS, clock)
     assert table.t.tolist() == [1800.0 * k for k in range(50)]
-
-
-@pytest.mark.parametrize("minutes", [30, 60])
-def test_an_hour_that_comes_twice_is_told(night, minutes):
-    path = night(minutes, offset=False)
-    told = "if clocks were set back, write dates with an offset, such as 2025-10-26 02:30"
-    with pytest.raises(TimeOrderError, match=told):
-        read_csv(path, COLUMNS, Clock("t", zone=GERMAN.zone))
-    header, *rows = path.read_text().splitlines()
-    texts = [json.dumps(dict(zip(header.split(","), r.split(","), strict=True))) for r in rows]
-    with pytest.raises(TimeOrderError, match=told):
-        list(JsonLines(texts, COLUMNS, Clock("t", zone=GERMAN.zone)))
-
-
-def test_missing_file(tmp_path):
-    (tmp_path / "nine.csv").touch()
-    with pytest.raises(
-        DataError, match=r"there is no file .*none\.csv'; did you mean 'nine\.csv'\?"
-    ):
-        read_csv(tmp_path / "none.csv", COLUMNS, Clock("t"))
 
 
 def dates(csv, **options):
@@ -341,9 +296,7 @@ def test_json_lines_with_dates_and_bounds(tmp_path):
         ("not json", "is not JSON"),
         ('{"t": "later", "a": 1}', "got 'later'; expected a number, as in the other rows"),
         ("[1, 2]", "expected an object"),
-        ('{"time": 1}', "there is no 't'"),
         ('{"t": 1, "a": "warm"}', "line 2, 'a': got 'warm'"),
-        ('{"t": 1, "a": true}', "got True"),
         ('{"t": 1, "a": 1e999}', "must be finite"),
         ('{"t": 0, "a": 1}', "that of the one before"),
         ('{"t": true, "a": 1}', "got True"),

@@ -17,7 +17,6 @@ from livepde.control.controllers import packages, quiet
 from livepde.fem import LogNormal
 from livepde.linalg import Array
 from livepde.observation import Transformed
-from livepde.readout import unknown_of
 
 RADAU = ((5 / 12, -1 / 12), (3 / 4, 1 / 4))  # of two stages, the second at the end
 QUIET = {
@@ -161,7 +160,7 @@ class MovingHorizon:
         for k, (label, prior, std) in enumerate(
             zip(model.unknowns, model.prior, model.std, strict=True)
         ):
-            positive = isinstance(unknown_of(space, label).prior, LogNormal)
+            positive = isinstance(space.unknown_of(label).prior, LogNormal)
             found.append(prior * exp(std / prior * p[k]) if positive else prior + std * p[k])
         return found
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from benchmarks.control.problem import Problem
 from livepde.control import Controller, Estimator, Kalman, Known, Learned, Loop
 from livepde.linalg import Array
-from livepde.readout import unknown_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,7 @@ class Run:
             )
         space = model.frame.model.parameter_space
         units = dict.fromkeys(model.outputs.names, model.frame.outputs.observation.unit)
-        units |= {label: unknown_of(space, label).unit for label in model.unknowns}
+        units |= {label: space.unknown_of(label).unit for label in model.unknowns}
         data = {
             name: (
                 "time",

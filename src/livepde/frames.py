@@ -16,7 +16,6 @@ from livepde.laws import Belief
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import unknown_of
 from livepde.records import (
     DATE,
     ESTIMATES,
@@ -240,7 +239,7 @@ def layout_of(
     """
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:
-        unknown = unknown_of(model.parameter_space, label)
+        unknown = model.parameter_space.unknown_of(label)
         unit: dict[str, Any] = {"units": unknown.unit}
         plain = isinstance(unknown.prior, Normal)  # then mean and standard deviation
         numbers[label] = {**unit, **_prior(unknown), **({} if plain else {"comment": MEDIAN})}

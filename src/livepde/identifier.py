@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
-from livepde.channels import Channels
 from livepde.dates import origin_at, since_1970, stamp_of
 from livepde.errors import (
     ConfigurationError,
@@ -49,7 +48,16 @@ from livepde.model import Model
 from livepde.observation import Observation, Observed
 from livepde.records import Layout
 from livepde.result import Estimate, Result
-from livepde.samples import Readings, Sample, check_noise, is_tabular, number, numbers, sample_of
+from livepde.samples import (
+    Channels,
+    Readings,
+    Sample,
+    check_noise,
+    is_tabular,
+    number,
+    numbers,
+    sample_of,
+)
 from livepde.showing import Shown, listed, options_of
 from livepde.stepping import MOST_SUBSTEPS, Advance, Between, End, Held, Interval, Scheme
 from livepde.units import conversion

@@ -22,11 +22,6 @@ LEVEL = 0.95
 Ends: TypeAlias = Callable[[float, float], tuple[float, ...]]
 
 
-def unknown_of(space: FunctionSpace, label: str) -> Any:
-    """Return the unknown of a scalar label."""
-    return space.unknown_of(label)
-
-
 class ScalarReadout:
     """Numbers of the scalar unknowns, in the order of `Layout.numbers`.
 
@@ -38,7 +33,7 @@ class ScalarReadout:
         rows = list(space.labels.values())
         consecutive = bool(rows) and rows == list(range(rows[0], rows[0] + len(rows)))
         self._rows: Any = slice(rows[0], rows[-1] + 1) if consecutive else rows
-        self._ends = [_ends(unknown_of(space, label)) for label in space.labels]
+        self._ends = [_ends(space.unknown_of(label)) for label in space.labels]
         self._prior: tuple[Array | None, list[float]] = (None, [])
 
     def __call__(self, belief: Belief) -> list[float]:
@@ -193,7 +188,7 @@ class Marginal:
 def known_badly(belief: Belief, space: FunctionSpace) -> Iterator[Finding]:
     """Return findings on scalar unknowns that are not identifiable, or end at a bound."""
     for label, row in space.labels.items():
-        unknown, value = unknown_of(space, label), float(belief.q[row])
+        unknown, value = space.unknown_of(label), float(belief.q[row])
         lower, upper = map(float, unknown.prior.bounds)
         if value in (lower, upper):
             yield at_bound(label, value)

@@ -34,7 +34,7 @@ from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import Marginal, ScalarReadout, coordinates_of, known_badly, unknown_of
+from livepde.readout import Marginal, ScalarReadout, coordinates_of, known_badly
 from livepde.records import (
     STATUS_CODES,
     Layout,
@@ -147,7 +147,7 @@ class Estimate(Shown):
     def _shown(self) -> tuple[str, Mapping[str, str]]:
         rows = {}
         for label in self.space.labels:
-            unit = unknown_of(self.space, label).unit
+            unit = self.space.unknown_of(label).unit
             rows[label] = f"{self[label]} {unit}".rstrip()
         for name in self.space.fields:
             values, std = self[name].median, self[name].deviation
@@ -243,15 +243,15 @@ class Estimate(Shown):
         std = self.q_std if self.q_std is not None else np.full_like(self.q, np.nan)
         if name in space.labels:
             k = space.labels[name]
-            return Marginal(float(self.q[k]), float(std[k]), unknown_of(space, name))
+            return Marginal(float(self.q[k]), float(std[k]), space.unknown_of(name))
         if name in space.fields:
             part = space.part(name)
-            known = unknown_of(space, name)
+            known = space.unknown_of(name)
             return Marginal(self.q[part], std[part], known, partial(self._at, name))
         if self.state_space is not None and name in self.state_space.fields:
             part = self.state_space.part(name)
             u_std = self.u_std if self.u_std is not None else np.full_like(self.u, np.nan)
-            known = unknown_of(self.state_space, name)
+            known = self.state_space.unknown_of(name)
             return Marginal(self.u[part], u_std[part], known, partial(self._at, name))
         components = () if self.state_space is None else self.state_space.fields
         raise ConfigurationError(
@@ -283,8 +283,8 @@ class Estimate(Shown):
             values, std = (x.reshape(-1, at.shape[1]).T for x in (values, std))
             shape = (*shape, values.shape[1])
         if not shape:
-            return Marginal(float(values[0]), float(std[0]), unknown_of(space, name))
-        return Marginal(values.reshape(shape), std.reshape(shape), unknown_of(space, name))
+            return Marginal(float(values[0]), float(std[0]), space.unknown_of(name))
+        return Marginal(values.reshape(shape), std.reshape(shape), space.unknown_of(name))
 
 
 class Result(Shown):
@@ -483,7 +483,7 @@ class Result(Shown):
         last, model = self._last("sample"), self.model
         q, u = draws(last.belief, last.space, n, seed)
         numbers = {
-            label: ("draw", q[:, k], {"units": unknown_of(last.space, label).unit})
+            label: ("draw", q[:, k], {"units": last.space.unknown_of(label).unit})
             for label, k in last.space.labels.items()
         }
         fields: dict[str, Any] = {}

@@ -85,14 +85,10 @@ class Affine:
 
 
 def convert(value: float | str, unit: str, where: str, *, difference: bool = False) -> float:
-    """Return a quantity in the model's unit.
+    """Return a quantity, a number in the model's unit or text such as "20 h", in that unit.
 
     Parameters
     ----------
-    value
-        A number, already in that unit, or text such as "20 h".
-    unit
-        The model's unit; empty: a pure number.
     where
         File and key, for the message.
     difference

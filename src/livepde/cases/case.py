@@ -1,4 +1,4 @@
-"""Case: identifier and stream made from a case file."""
+"""Case: law, identifier and stream made from a case file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from datetime import datetime
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import tomlkit
@@ -23,22 +23,33 @@ from livepde.cases.case_channels import (
     initial_of,
     initial_weights,
     input_noise_of,
+    noise_of,
     observation_of,
     sensor_notes,
+    unknowns_of,
 )
-from livepde.cases.case_content import CaseContent
+from livepde.cases.case_content import CaseContent, resolve
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
-from livepde.cases.equations import resolve
-from livepde.cases.laws import law_of
 from livepde.cases.process import conditioned, drive_notes, model_of, process_notes, wall_attributes
 from livepde.cases.read import apply, did_you_mean, read_spec, read_text, read_toml
-from livepde.cases.schema import SENSORS
+from livepde.cases.schema import SENSORS, GradientSpec, SensitivitySpec
 from livepde.diagnostics.check_report import Bound, Sense
-from livepde.errors import DataError
+from livepde.errors import DataError, LawError
 from livepde.fem import Inputs, Moment
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
-from livepde.laws import AnyLaw, GradientLaw
+from livepde.laws import (
+    AnyLaw,
+    ConstantDamping,
+    Damping,
+    GradientLaw,
+    Guards,
+    Jumps,
+    Refit,
+    ResidualDamping,
+    SensitivityLaw,
+    Shadows,
+)
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
@@ -47,6 +58,8 @@ from livepde.runs.summary import ROLES, TOTALS
 from livepde.samples import Sample
 from livepde.stepping import Alexander2, ImplicitEuler, Scheme
 from livepde.streams import Clock, Column, DataTable
+
+Options = TypeVar("Options")
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,11 +352,7 @@ class Case(CaseContent):
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
-        found = [
-            *drive_notes(self, self.model),
-            *process_notes(self),
-            *sensor_notes(self),
-        ]
+        found = [*drive_notes(self, self.model), *process_notes(self), *sensor_notes(self)]
         if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
@@ -434,3 +443,67 @@ class Case(CaseContent):
         prepared = Prepared(self, first, (), start, origin, live=live)
         prepared.identifier_with(self.law).step(first.t, first.z)  # raises on missing values
         return prepared
+
+
+def law_of(case: CaseContent) -> AnyLaw:
+    """Return the law; raises `CaseError`."""
+    spec = case.spec.law
+    with case.located("law", LawError):
+        if not isinstance(spec, GradientSpec):
+            return _sensitivity(case, spec)
+        damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+        if spec.mu is not None:
+            damping = ConstantDamping(spec.mu)
+        return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
+
+
+def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
+    time = case.equation.time_unit
+    return SensitivityLaw(
+        modes=spec.modes,
+        memory=case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory),
+        drift=case.convert(spec.drift, f"1/{time}" if time else "", "law.drift"),
+        noise=_noise(case, spec),
+        refit=_chosen(Refit, spec.refit),
+        rank=spec.rank,
+        gate=spec.gate,
+        gate_patience=spec.gate_patience,
+        jumps=_jumps(case, spec),
+        guards=_chosen(Guards, spec.guards),
+        shadows=_chosen(Shadows, spec.shadows),
+        verdict=spec.verdict,
+    )
+
+
+def _jumps(case: CaseContent, spec: SensitivitySpec) -> Jumps | None:
+    """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
+    given = spec.jumps
+    found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
+    known = [*case.spec.unknowns, *unknowns_of(case)]
+    key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
+    for name in (found.unknowns if found is not None else None) or ():
+        case.require(name, known, key, f"there is no unknown '{name}'")
+    return found
+
+
+def _chosen(kind: type[Options], given: bool | Options) -> Options | None:
+    """Return options of a law that a case has as true (the defaults), false or a table."""
+    if isinstance(given, bool):
+        return kind() if given else None
+    return given
+
+
+def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
+    """Return the noise of the law, which needs it here or from every sensor."""
+    if spec.noise is not None and spec.noise != "auto":
+        return case.positive(spec.noise, case.equation.state.unit, "law.noise")
+    if noise_of(case, "sensor") is None:
+        if spec.noise == "auto":
+            text = "got 'auto', which begins with a guess: give every sensor its noise."
+            raise case.error("law.noise", text)
+        raise case.missing(
+            "law.noise",
+            "the sensitivity law weighs the sensors by their noise (a standard deviation); "
+            "give it here or with every sensor.",
+        )
+    return None if spec.noise is None else "auto"

@@ -398,13 +398,9 @@ def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
     if initial is None or isinstance(initial, dict):
         return ()
     unit = "K" if (of := case.equation.state.unit) == "degC" else of
-    std, length = (
-        None if value is None else case.positive(value, unit, f"initial.{key}", np.inf)
-        for key, value, unit in (
-            ("std", initial.std, unit),
-            ("length", initial.length, case.equation.length_unit),
-        )
-    )
+    std = None if initial.std is None else case.positive(initial.std, unit, "initial.std")
+    unit = case.equation.length_unit
+    length = None if (L := initial.length) is None else case.positive(L, unit, "initial.length")
     known = None
     if _made_of_readings(case):
         known = dict(zip(*_level(_initial_readings(case, first)), strict=True))

@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime, tzinfo
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -16,11 +16,9 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
-from livepde.cases.case_content import CaseContent
-from livepde.cases.equations import check_options, load_code, own_code
+from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
 from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec
 from livepde.dates import since_1970
-from livepde.linalg import Mask
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
     Clock,
@@ -32,10 +30,10 @@ from livepde.streams import (
     tabulated,
 )
 from livepde.streams.csvfile import header_of
-from livepde.streams.first_rows import wild_first_rows
 from livepde.streams.gaps import fill_table
 from livepde.streams.intake import Habit, Policy
 from livepde.streams.mqtt import Broker, MqttSink, MqttSource
+from livepde.streams.oddities import wild_first_rows
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 from livepde.units import conversion
@@ -65,27 +63,22 @@ def clock_of(case: CaseContent, data: DataSpec | None = None) -> Clock:
     rule = conversion(data.time_unit or unit, unit, case.where("data.time_unit"))
     second = conversion("s", unit, case.where("data.time")).factor if unit else 1.0
     start, stop = _instant(case, data.start, "start"), _instant(case, data.stop, "stop")
+    try:  # dates that name no zone have this one
+        zone = ZoneInfo(name := case.spec.data.zone)
+    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
+        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
+        raise case.error("data.zone", text) from None
     return Clock(
         data.times[0],
         rule.factor,
         start,
         stop,
         second,
-        zone=_zone(case),
+        zone=zone,
         format=data.time_format,
         decimal=data.decimal,
         hour="".join(data.times[1:]),
     )
-
-
-def _zone(case: CaseContent) -> tzinfo:
-    """Return the zone of dates that name none."""
-    name = case.spec.data.zone
-    try:
-        return ZoneInfo(name)
-    except (KeyError, OSError, ValueError):  # not found, a folder, not a name at all
-        text = f"there is no time zone '{name}'; expected a name such as Europe/Berlin."
-        raise case.error("data.zone", text) from None
 
 
 def _instant(case: CaseContent, value: Any, key: str) -> Any:
@@ -250,7 +243,8 @@ def without_wild_start(case: CaseContent, table: DataTable) -> DataTable:
     wild = wild_first_rows(table.t, table.values, _comparable(case, table.names))
     if not wild.any():
         return table
-    values, drives = np.where(wild, math.nan, table.values), _driving(case, table.names)
+    values, channels = np.where(wild, math.nan, table.values), case.spec.channels
+    drives = np.array([name in channels and channels[name].drives for name in table.names])
     lacking = (wild & drives).any(axis=1)
     begin = int(np.flatnonzero(lacking)[-1]) + 1 if lacking.any() else 0
     counts = zip(table.names, wild.sum(axis=0).tolist(), strict=True)
@@ -292,12 +286,6 @@ def _comparable(case: CaseContent, names: Sequence[str]) -> list[list[int]]:
         if channel.role in ("boundary", *SENSORS):
             groups.setdefault(channel.of, []).append(k)
     return [*groups.values()]
-
-
-def _driving(case: CaseContent, names: Sequence[str]) -> Mask:
-    """Return which columns drive the model."""
-    channels = case.spec.channels
-    return np.array([name in channels and channels[name].drives for name in names])
 
 
 def without_gaps(case: CaseContent, table: DataTable) -> DataTable:

@@ -34,9 +34,9 @@ from livepde.runs.feeds import Feed, Gathered, Paced, SampleFeed
 from livepde.runs.journal import Journal
 from livepde.runs.live_loop import LOOK, Live, Sink
 from livepde.samples import Sample
-from livepde.streams.first_rows import FEWEST
 from livepde.streams.gaps import RECENT
 from livepde.streams.intake import Intake, Ready, Remark, gather
+from livepde.streams.oddities import FEWEST_FOLLOWING
 
 LOG = logging.getLogger("livepde.run")
 
@@ -196,12 +196,8 @@ class LiveCase:
 
     def _prepared(self, first: Sample) -> Prepared:
         """Return the case with its first sample; rows that were all read at once are not live."""
-        return self.case.begin(first, self._start, live=self._intake is not None)
-
-    @property
-    def _start(self) -> datetime | None:
-        """The date of t = 0, if times are dates; known after the first row."""
-        return self._origin if self._intake is None else self._intake.start
+        origin = self._origin if self._intake is None else self._intake.start
+        return self.case.begin(first, origin, live=self._intake is not None)
 
     def _begun(
         self, stopping: threading.Event, irregular: dict[tuple[str, str], Remark]
@@ -223,7 +219,12 @@ class LiveCase:
             found += new
             for remark in [*remarks, *self._without_wild(found)]:
                 gather(irregular, remark)
-            while found and not self._too_few(found):
+            # If the first row looks wild, more rows have to show it.
+            while found and (
+                self._feed.done
+                or len(found) > FEWEST_FOLLOWING
+                or not suspect_start(self.case, found[0].values)
+            ):
                 values = dict.fromkeys(self.case.columns, math.nan) | found[0].values
                 held |= {n: values[n] for n in holds if not math.isnan(values[n])}
                 values |= held
@@ -247,14 +248,9 @@ class LiveCase:
         wrong = f" ({first.kind}: {first.message})" if first is not None else ""
         raise DataError(f"{self.case.path}: {why}{wrong}.")
 
-    def _too_few(self, found: Sequence[Ready]) -> bool:
-        """Return whether more rows have to show if the first one is wild, as it looks."""
-        few = not self._feed.done and len(found) <= FEWEST
-        return few and suspect_start(self.case, found[0].values)
-
     def _without_wild(self, found: list[Ready]) -> list[Remark]:
         """Blank wild values of the first rows, and return remarks on them."""
-        if len(found) <= FEWEST:
+        if len(found) <= FEWEST_FOLLOWING:
             return []
         remarks = []
         for k, name in wild_start(self.case, [(one.t, one.values) for one in found]):
@@ -312,7 +308,7 @@ class LiveCase:
             begun = journal.layout.attrs.get("origin")
             position = journal.position
             options |= {
-                "origin": _seconds(begun),
+                "origin": since_1970(datetime.fromisoformat(begun)) if begun is not None else 0.0,
                 "dates": begun is not None,
                 "last": journal.last,
                 "recent": [(one.t, one.values) for one in journal.recent(RECENT)],
@@ -320,10 +316,3 @@ class LiveCase:
         intake = Intake(case.columns, case.clock, self._policy, **options)
         intake.past = journal
         return intake, position
-
-
-def _seconds(origin: str | None) -> float:
-    """Return the seconds since 1970 of an origin as a layout has it; 0 if times are numbers."""
-    if origin is None:
-        return 0.0
-    return since_1970(datetime.fromisoformat(origin))

@@ -32,37 +32,17 @@ VALUES = {"number", "date"}  # kinds of cells that a header does not have
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """A table of measurements as it was read.
-
-    Attributes
-    ----------
-    path
-        The CSV file.
-    written
-        How it is written.
-    time
-        Column of times; or days and times of day, two columns.
-    time_format
-        Of its dates; empty: ISO format, or numbers.
-    time_unit
-        Of its times; `BLANK` if unknown, empty if the equation's time has none.
-    samples
-        Times, and the columns that hold numbers.
-    row_numbers, texts
-        Columns that are not used: numbers of rows, and those without numbers.
-    more
-        Tables that are joined to this one by time.
-    """
+    """A table of measurements as it was read."""
 
     path: Path
     written: Written
-    time: tuple[str, ...]
-    time_format: str
-    time_unit: str
-    samples: DataTable
-    row_numbers: tuple[str, ...]
-    texts: tuple[str, ...]
-    more: tuple[Measured, ...] = ()
+    time: tuple[str, ...]  # column of times; or days and times of day, two columns
+    time_format: str  # of its dates; empty: ISO format, or numbers
+    time_unit: str  # of its times; `BLANK` if unknown, empty if the equation's time has none
+    samples: DataTable  # times, and the columns that contain numbers
+    row_numbers: tuple[str, ...]  # columns that are not used
+    texts: tuple[str, ...]  # columns without numbers, not used either
+    more: tuple[Measured, ...] = ()  # tables that are joined to this one by time
 
     @property
     def tables(self) -> tuple[Measured, ...]:

@@ -47,11 +47,6 @@ def blocks(members: Mapping[str, Prepared]) -> tuple[list[MemberBlock], dict[str
 
     A block has members whose cases differ only in data, initial state and descriptions, and whose
     samples have the same times, if `Fleet` can step their model and law together.
-
-    Parameters
-    ----------
-    members
-        Name -> case with its data.
     """
     groups, apart = _alike(members)
     found = []
@@ -81,16 +76,13 @@ def _alike(members: Mapping[str, Prepared]) -> tuple[list[dict[str, Prepared]], 
             continue
         # Members often share one case, whose text takes longer to write than a look-up.
         if one.case not in settings:
-            settings[one.case] = _settings(one.case)
+            unread = {"channels": {"__all__": READ}}
+            settings[one.case] = one.case.spec.model_dump_json(
+                exclude={**dict.fromkeys(TOLD, True), **unread}
+            )
         key = settings[one.case], one.assimilate_from, one.stream.t.tobytes()
         groups.setdefault(key, {})[name] = one
     return list(groups.values()), apart
-
-
-def _settings(case: Case) -> str:
-    """Return the common settings of members that step together, as text."""
-    unread = {"channels": {"__all__": READ}}
-    return case.spec.model_dump_json(exclude={**dict.fromkeys(TOLD, True), **unread})
 
 
 def _refuses(one: Prepared) -> str:
@@ -107,13 +99,7 @@ def _refuses(one: Prepared) -> str:
 
 
 class MemberBlock:
-    """Members that are stepped together.
-
-    Parameters
-    ----------
-    members
-        Name -> case with its data, at least one; of one model, with tables of the same times.
-    """
+    """Members of one model that are stepped together; their tables have the same times."""
 
     def __init__(self, members: Mapping[str, Prepared]) -> None:
         self.members = dict(members)
@@ -147,16 +133,8 @@ class MemberBlock:
     def run(self, paths: Sequence[Path]) -> None:
         """Take all samples; estimates so far are kept also if the run ends early.
 
-        Parameters
-        ----------
-        paths
-            Paths of new journals, one for each member. They are written at intervals; `ended`
-            writes the rest.
-
-        Raises
-        ------
-        RunError
-            A journal cannot be written.
+        The new journals at `paths`, one for each member, are written at intervals; `ended` writes
+        the rest.
         """
         self._paths = list(paths)
         table, stopping = self._tables[0], threading.Event()

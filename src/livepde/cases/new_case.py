@@ -21,8 +21,7 @@ from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
-from livepde.streams.sentinels import sentinels
-from livepde.streams.switches import switches
+from livepde.streams.oddities import sentinels, switches
 
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
@@ -36,6 +35,8 @@ HEAD = """\
 # A case of livepde: equation, unknowns, and the role of each channel.
 #   livepde check {case}     check this case, and which unknowns its sensors can identify
 #   livepde run {case}       estimate the unknowns, and write a run directory
+"""
+OPEN = """\
 # Replace each '?': the table has no value for it. 'livepde check' lists those that remain.
 """
 VALUES = """\
@@ -46,10 +47,6 @@ ENDS = """\
 TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
 NOISE = 0.05
 CASE = """\
-#:schema ./livepde.schema.json
-# A case of livepde: equation, unknowns, and the role of each channel.
-#   livepde check {0}     check this case, and which unknowns its sensors can identify
-#   livepde run {0}       estimate the unknowns, and write a run directory
 # Numbers are in the model's units (m, s, degC). Text such as "40 cm" is converted.
 # For your own data: 'livepde init DIR --data FILE.csv' writes a case from the table.
 title = "A metal rod, heated and cooled at its left end"
@@ -100,24 +97,12 @@ rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
 
 @dataclass(frozen=True)
 class FoundChannel:
-    """A channel of the case, as the table suggests it.
-
-    Attributes
-    ----------
-    name
-        In the case.
-    given
-        Its keys and values.
-    columns
-        Of the table; none for an input that the table lacks.
-    told
-        A comment.
-    """
+    """A channel of the case, as the table suggests it."""
 
     name: str
-    given: Mapping[str, Any]
-    columns: tuple[str, ...]
-    told: str
+    given: Mapping[str, Any]  # its keys and values
+    columns: tuple[str, ...]  # of the table; none for an input that the table lacks
+    told: str  # a comment
 
     @property
     def is_sensor(self) -> bool:
@@ -131,10 +116,11 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
     given = {item.name for item in found if item.columns and not item.is_sensor}
     # Noise is a standard deviation, a difference of temperatures: in K.
     noise = _open(equation.state.unit.replace("degC", "K"))
+    told = "missing: far outside the other values; check them" if _missing(table) else ""
     lines = [
         *_top(table, equation, given),
         *_inline("mesh", _mesh(equation)),
-        *_inline("data", _data(table, folder), _missing_told(table)),
+        *_inline("data", _data(table, folder), told),
         *_contents(table),
         *_unknowns(equation, given),
         *_inputs(found),
@@ -145,25 +131,12 @@ def _case_for(table: Measured, folder: Path, equation: Equation) -> str:
         *_channels(equation, found),
     ]
     text = "\n".join(lines)
-    return f"{HEAD.format(case=folder / 'case.toml')}{text}\n"
+    return f"{HEAD.format(case=folder / 'case.toml')}{OPEN}{text}\n"
 
 
-def _places_for(found: list[FoundChannel], equation: Equation) -> str:
-    """Return the table of positions that is to be filled in; empty if no channel names one."""
-    columns = [c for item in found if item.given.get("positions") == PLACES for c in item.columns]
-    axes = "xyz"[: equation.dimension]
-    lines = [",".join(["name", *axes]), *(",".join([c, *BLANK * len(axes)]) for c in columns)]
-    return "\n".join(lines) + "\n" if columns else ""
-
-
-def _quantity(number: str, unit: str) -> str:
-    """Return a number with a unit."""
-    return f"{number} {unit}" if unit else number
-
-
-def _open(unit: str) -> str:
-    """Return the blank of a quantity that is to be filled in."""
-    return _quantity(BLANK, unit)
+def _open(unit: str, number: str = BLANK) -> str:
+    """Return a quantity with its unit, by default the blank that is to be filled in."""
+    return f"{number} {unit}".rstrip()
 
 
 def _inline(key: str, given: Mapping[str, Any], told: str = "") -> Iterator[str]:
@@ -233,11 +206,6 @@ def _missing(table: Measured) -> list[float]:
     return sorted(v for v in found if not any(usual(v, values) for values in columns))
 
 
-def _missing_told(table: Measured) -> str:
-    """Return a comment on the values that count as missing; empty without."""
-    return "missing: far outside the other values; check them" if _missing(table) else ""
-
-
 def _written(table: Measured, folder: Path) -> dict[str, Any]:
     """Return the format of a file as keys of [data], defaults included."""
     written, path = table.written, table.path
@@ -272,7 +240,7 @@ def _steps(table: Measured, equation: Equation) -> Iterator[str]:
     if len(steps) and steps.max() > 1.5 * np.median(steps):
         known = table.time_unit != BLANK
         number = f"{np.median(steps):g}" if known else BLANK
-        step = _quantity(number, table.time_unit if known else equation.time_unit)
+        step = _open(table.time_unit if known else equation.time_unit, number)
         given = step if table.time_unit or number == BLANK else float(step)
         yield from _inline("steps", {"dt_max": given}, "longer intervals are divided")
 
@@ -342,7 +310,8 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
             unit = _stated(name, inputs.pop(entry).unit)
             given = {"role": "input", "column": name, **({"unit": unit} if unit else {})}
             comment = _range(values)
-            if _switches(table, name):
+            samples = next(one.samples for one in table.tables if name in one.samples.names)
+            if switches(samples.t, values):
                 given["between"] = "hold"
                 comment += ", constant stretches with jumps"
             found.append(FoundChannel(entry, given, (name,), comment))
@@ -351,12 +320,6 @@ def channels_in(table: Measured, equation: Equation) -> list[FoundChannel]:
             found.append(_sensor(equation, label, name, values))
     there = {item.name for item in found if not item.is_sensor}
     return [*_in_families(equation, found), *_lacking(equation, inputs, there)]
-
-
-def _switches(table: Measured, name: str) -> bool:
-    """Return whether a column has constant stretches with jumps."""
-    samples = next(one.samples for one in table.tables if name in one.samples.names)
-    return switches(samples.t, samples.values[:, samples.names.index(name)])
 
 
 def _lacking(
@@ -417,19 +380,19 @@ def _sensor(equation: Equation, key: str, name: str, values: Array) -> FoundChan
 
 def _in_families(equation: Equation, found: list[FoundChannel]) -> list[FoundChannel]:
     """Return the channels with numbered sensors whose places are open, u_0 to u_37, as one."""
+
+    def stem_of(item: FoundChannel) -> tuple[str, bool]:
+        """Return the column of a numbered sensor without its number; else the name, and False."""
+        numbered = NUMBERED.fullmatch(item.columns[0])
+        open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
+        return (numbered[1], True) if numbered and open_ else (item.name, False)
+
     result: list[FoundChannel] = []
-    for (stem, numbered), items in groupby(found, _stem):
+    for (stem, numbered), items in groupby(found, stem_of):
         members = list(items)
         whole = numbered and len(members) >= FAMILY
         result += [_family(equation, stem, members)] if whole else members
     return result
-
-
-def _stem(item: FoundChannel) -> tuple[str, bool]:
-    """Return the column of a numbered sensor without its number, and True; else name and False."""
-    numbered = NUMBERED.fullmatch(item.columns[0])
-    open_ = item.is_sensor and BLANK in str(item.given["at"]) and "unit" not in item.given
-    return (numbered[1], True) if numbered and open_ else (item.name, False)
 
 
 def _family(equation: Equation, stem: str, members: list[FoundChannel]) -> FoundChannel:
@@ -462,13 +425,7 @@ def write_template(
 ) -> tuple[Path, Path]:
     """Write a commented case into a folder, and return the paths of case and data.
 
-    Parameters
-    ----------
-    table
-        A CSV file of measurements that the case is for; it stays where it is. Else data are made
-        up and written beside the case.
-    equation
-        Of the case for that table.
+    The case is for a table of measurements, or else for made-up data that are written beside it.
 
     Raises
     ------
@@ -479,7 +436,7 @@ def write_template(
     """
     if table is None:
         check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
-        text = CASE.format(folder / "case.toml")
+        text = (HEAD + CASE).format(case=folder / "case.toml")
         write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])
@@ -490,8 +447,14 @@ def write_template(
 
 def files_for(table: Measured, folder: Path, equation: Equation) -> dict[str, str]:
     """Return name -> text of the files of a case for a table."""
-    places = _places_for(channels_in(table, equation), equation)
-    return {"case.toml": _case_for(table, folder, equation), **({PLACES: places} if places else {})}
+    files = {"case.toml": _case_for(table, folder, equation)}
+    named = [one for one in channels_in(table, equation) if one.given.get("positions") == PLACES]
+    columns = [column for one in named for column in one.columns]
+    if columns:  # a table of positions that is to be filled in
+        axes = "xyz"[: equation.dimension]
+        rows = [["name", *axes], *([column, *BLANK * len(axes)] for column in columns)]
+        files[PLACES] = "".join(f"{','.join(row)}\n" for row in rows)
+    return files
 
 
 def check_free(folder: Path, names: Iterable[str]) -> None:

@@ -35,17 +35,9 @@ NOTHING = "advice on sensors: the data contain no measurement."
 
 @dataclass(frozen=True)
 class Identified:
-    """One unknown in the preview.
+    """One unknown in the preview: its standard deviations before and after the samples."""
 
-    Attributes
-    ----------
-    name
-        Label of a number; of a field its name, with the vertices known best and worst.
-    prior, posterior
-        Standard deviations before and after the samples.
-    """
-
-    name: str
+    name: str  # label of a number; of a field its name, with the vertices known best and worst
     prior: float
     posterior: float
     unit: str
@@ -65,24 +57,14 @@ class Identified:
 class Preview:
     """Information on the unknowns in the first samples of a case.
 
-    Attributes
-    ----------
-    unknowns
-        One item for each number, two for each field.
-    samples
-        Number of samples with a measurement.
-    sentences
-        Sentences on unknowns that are traded off, the number of identified modes of each field,
-        shifts of unknowns by the discretisation, and sensor errors that would go undetected.
-    last
-        The same unknowns for a run of the last samples instead, as many; empty if there are no
-        more.
+    The sentences name unknowns that are traded off, the number of identified modes of each field,
+    shifts of unknowns by the discretisation, and sensor errors that would go undetected.
     """
 
-    unknowns: tuple[Identified, ...] = ()
-    samples: int = 0
+    unknowns: tuple[Identified, ...] = ()  # one item for each number, two for each field
+    samples: int = 0  # with a measurement
     sentences: tuple[str, ...] = ()
-    last: tuple[Identified, ...] = ()
+    last: tuple[Identified, ...] = ()  # by as many last samples instead; empty without more
 
 
 class StatedNoise(SensitivityLaw):
@@ -219,21 +201,14 @@ def _compare(prepared: Prepared, before: Belief, after: Belief) -> list[Identifi
 class Advice:
     """The best of all candidate positions for one more sensor.
 
-    Attributes
-    ----------
-    position
-        Coordinates, shape (d,).
-    now, then
-        Name of each unknown -> remaining share of its prior standard deviation with the present
-        sensors, and with the new one; of a field the root of the share of its mean variance.
-    candidates
-        Number of compared positions.
+    `now` and `then` have the remaining share of the prior standard deviation of each unknown with
+    the present sensors, and with the new one; of a field the root of that of its mean variance.
     """
 
-    position: Array
+    position: Array  # coordinates, shape (d,)
     now: Mapping[str, float]
     then: Mapping[str, float]
-    candidates: int
+    candidates: int  # number of compared positions
 
 
 def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
@@ -252,19 +227,13 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     are ranked by the variance reduction of one more reading at each sample of the preview, from the
     joint covariance of state and unknowns; each of the best few gets a preview of its own, and the
     one with the smallest final variance is the advice.
-
-    Raises
-    ------
-    ConfigurationError
-        The law has no covariance, or it is not clear which component of the state a sensor would
-        see.
     """
     case, law = prepared.case, linearised(prepared.case.law)
     if law is None:
         raise ConfigurationError(
-            "advice on sensors needs a law with a covariance: kind = 'sensitivity' or 'auto'."
+            "advice on sensors needs a law with a covariance: kind = 'sensitivity'."
         )
-    if _moves(case.model, law):
+    if law.drift or case.model.latent.random:  # an unknown moves
         return _advise_moving(prepared, law, list(samples))
     here, each, factor = _information(prepared, law, samples)
     if factor is None:
@@ -280,11 +249,6 @@ def advise(prepared: Prepared, samples: Iterable[Sample]) -> Advice:
     )
     _, positions, _ = _candidates(prepared)
     return Advice(positions[:, best], now, then, len(after))
-
-
-def _moves(model: Model, law: SensitivityLaw) -> bool:
-    """Return whether an unknown changes in time, by the law or by its own evolution."""
-    return bool(law.drift or model.latent.random)
 
 
 def _information(

@@ -7,7 +7,7 @@ import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
 from itertools import chain
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import tomlkit
 from pydantic import BaseModel, ValidationError
+from tomlkit.items import InlineTable
 
 from livepde.cases.schema import CaseSpec
 from livepde.errors import CaseError
@@ -110,12 +111,9 @@ def read_toml(text: str, where: str) -> dict[str, Any]:
     _check_text(text, where)
     try:
         document = tomllib.loads(text)
-    except RecursionError as error:
-        raise CaseError(f"{where}: is not valid TOML: {error}.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise CaseError(f"{where}: is not valid TOML: {error}{_line(text, str(error))}.") from None
-    except ValueError as error:  # a number or a date that Python cannot hold
-        raise CaseError(f"{where}: is not valid TOML: {error}.") from None
+    except (RecursionError, ValueError) as error:  # or a number or a date that Python cannot hold
+        line = _line(text, str(error)) if isinstance(error, tomllib.TOMLDecodeError) else ""
+        raise CaseError(f"{where}: is not valid TOML: {error}{line}.") from None
     _check_document(document, where)
     return document
 
@@ -315,14 +313,10 @@ def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) 
 
     Parameters
     ----------
-    document
-        The parsed case.
     settings
         Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
         sets the keys in it and leaves the others; None takes the key away. A table for an unknown
         or a channel that the case has not adds it.
-    where
-        For messages.
 
     Raises
     ------
@@ -433,13 +427,10 @@ def _check_document(document: Mapping[str, Any], where: str) -> None:
         name = key.rpartition(".")[2]
         if isinstance(value, int) and abs(value) > COUNTS.get(name, OTHER):
             most = COUNTS.get(name, OTHER)
-            raise CaseError(f"{where}: {key}: got {_digits(value)}; expected at most {most}.")
+            got = value if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
+            raise CaseError(f"{where}: {key}: got {got}; expected at most {most}.")
         if isinstance(value, float) and LARGEST < abs(value) < float("inf"):
             raise CaseError(f"{where}: {key}: got {value:g}; expected less than {LARGEST:g}.")
-
-
-def _digits(value: int) -> str:
-    return str(value) if abs(value) < 10**20 else f"a number of {value.bit_length()} bits"
 
 
 def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
@@ -458,3 +449,41 @@ def _values(value: Any, where: str) -> Iterator[tuple[str, Any, int]]:
             stack += [(f"{key}.{n}" if key else n, v, depth + 1) for n, v in value.items()]
         else:
             stack += [(key, item, depth + 1) for item in value]
+
+
+def filled(text: str, settings: Mapping[str, Any], where: str) -> str:
+    """Return the text of a case with settings applied as by `apply`, and its comments."""
+    for key, value in settings.items():
+        expected = apply(read_toml(text, where), {key: value}, where)
+        text = _with(text, key_path(key, where), value)
+        # Empty tables consist of a head only.
+        found, wanted = (
+            {name: item for name, item in document.items() if item != {}}
+            for document in (read_toml(text, where), expected)
+        )
+        if found != wanted:
+            raise CaseError(f"{where}: {key}: cannot be set here; edit the file instead.")
+    if settings:
+        spec_of(read_toml(text, where), where)
+    return text
+
+
+def _with(text: str, path: Sequence[str], value: Any) -> str:
+    """Return a case with another value of a key, whose comment stays; None takes the key away."""
+    document = tomlkit.parse(text)
+    here: Any = document
+    *tables, name = path
+    for k, part in enumerate(tables):
+        inner = here.get(part, {})
+        if isinstance(inner, InlineTable):  # written anew as a whole, evenly spaced
+            rest = ".".join(map(toml_key, path[k + 1 :]))
+            name, value = part, apply(inner.unwrap(), {rest: value}, "")
+            break
+        if not isinstance(inner, Mapping) or part not in here:
+            here[part] = tomlkit.table()
+        here = here[part]
+    if value is None:
+        here.pop(name, None)
+    else:
+        here[name] = tomlkit.parse(toml_line("x", value))["x"]
+    return tomlkit.dumps(document)

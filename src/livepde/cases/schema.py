@@ -1,29 +1,44 @@
-"""Schema of case files, as pydantic models: types of single values, and a class for each table."""
+"""Schema of case files, as pydantic models: a class for each table."""
 
 from __future__ import annotations
 
-import codecs
-import re
 from collections.abc import Mapping
-from datetime import date, datetime
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import (
-    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
-    GetJsonSchemaHandler,
     StrictBool,
     Tag,
     WithJsonSchema,
     model_validator,
 )
-from pydantic_core import CoreSchema
 
-from livepde.diagnostics.check_report import Bound, Sense
+from livepde.cases.values import (
+    LIST,
+    NUMBER,
+    TEXT,
+    Also,
+    Box,
+    Encoding,
+    Expected,
+    Identifier,
+    Instant,
+    Name,
+    NonNegativeInt,
+    Number,
+    Pair,
+    Point,
+    PositiveFloat,
+    PositiveInt,
+    Quantity,
+    TimeFormat,
+    options_of,
+    short,
+)
 from livepde.fem import Scalar
 from livepde.laws import GradientLaw, Guards, Jumps, Refit, SensitivityLaw, Shadows
 from livepde.observation import Discrepancy
@@ -34,139 +49,6 @@ from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
 
 SENSORS = ("sensor", "withheld", "ignored")  # roles of channels that measure the state
-
-
-def _quantity(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, int | float | str):
-        message = 'expected a number, or text with a unit as "20 h"'
-        raise ValueError(message)  # noqa: TRY004 (pydantic collects ValueErrors only)
-    return value if isinstance(value, str) else float(value)
-
-
-class Also:
-    """Short forms that a validator accepts as well, for the JSON schema.
-
-    Parameters
-    ----------
-    schemas
-        Their JSON schemas.
-    """
-
-    def __init__(self, *schemas: dict[str, Any]) -> None:
-        self.schemas = schemas
-
-    def __get_pydantic_json_schema__(
-        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """Return what pydantic asks annotations for."""
-        return {"anyOf": [handler(core_schema), *self.schemas]}
-
-
-TEXT, NUMBER = ({"type": kind} for kind in ("string", "number"))
-LIST = {"type": "array", "items": {"anyOf": [NUMBER, TEXT]}}
-BOUNDS: dict[str, Any] = {
-    "anyOf": [
-        {"type": "array", "items": NUMBER, "minItems": 2, "maxItems": 2},
-        {"type": "string", "pattern": r"^\s*(<=|>=)\s*[-+0-9.eE]+\s*$"},
-        {"type": "object"},  # TOML reads alpha.error = ... as a table
-    ]
-}
-
-
-def _short(key: str) -> BeforeValidator:
-    """Return the reading of a value that is not a table as a table with this key only."""
-    return BeforeValidator(lambda given: given if isinstance(given, Mapping) else {key: given})
-
-
-def _number(value: Any) -> Any:
-    """Refuse true and false, which pydantic takes for 1 and 0."""
-    if isinstance(value, bool):
-        raise ValueError("expected a number")  # noqa: TRY004 (pydantic collects ValueErrors only)
-    return value
-
-
-def _options(kind: type) -> BeforeValidator:
-    """Return a check that options of a law have numbers for numbers, true or false for switches."""
-
-    def checked(value: Any) -> Any:
-        for key, given in value.items() if isinstance(value, Mapping) else ():
-            usual = getattr(kind, key, None)
-            switch = isinstance(usual, bool)
-            if isinstance(usual, int | float) and switch != isinstance(given, bool):
-                rule = "true or false" if switch else "a number"
-                raise ValueError(f"{key} must be {rule}; got {given!r}")
-        return value
-
-    return BeforeValidator(checked)
-
-
-def _limits(value: Any) -> Any:
-    """[low, high], "<= number" or ">= number" -> (sense, bound)."""
-    if isinstance(value, list) and len(value) == 2:
-        low, high = value
-        if all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
-            return "in", (float(low), float(high))
-    if isinstance(value, str):
-        match = re.fullmatch(r"\s*(<=|>=)\s*([-+0-9.eE]+)\s*", value)
-        if match:
-            try:
-                return match[1], float(match[2])
-            except ValueError:
-                pass
-    raise ValueError('expected [low, high], "<= number" or ">= number"')
-
-
-def _encoding(value: str) -> str:
-    try:
-        codecs.lookup(value)
-    except LookupError:
-        raise ValueError("expected the name of an encoding, as 'utf-8', 'cp1252'") from None
-    return value
-
-
-def _time_format(value: str) -> str:
-    moment = datetime(2001, 2, 3, 4)
-    try:
-        # A complete format returns the date that was written with it.
-        if datetime.strptime(moment.strftime(value), value).date() == moment.date():
-            return value
-    except (ValueError, re.error):  # the latter of a part that stands twice
-        pass
-    raise ValueError("expected year, month, day and time, as '%d.%m.%Y %H:%M'")
-
-
-def _flat(value: Any) -> Any:
-    """{"k": {"error": x}} -> {"k.error": x}: TOML reads k.error = x as a table."""
-    if not isinstance(value, dict):
-        return value
-    found: dict[str, Any] = {}
-    for name, item in value.items():
-        inner = _flat(item)
-        if isinstance(inner, dict):
-            found |= {f"{name}.{key}": one for key, one in inner.items()}
-        else:
-            found[name] = item
-    return found
-
-
-Quantity: TypeAlias = Annotated[float | str, BeforeValidator(_quantity)]
-Number: TypeAlias = Annotated[float, BeforeValidator(_number)]
-PositiveFloat: TypeAlias = Annotated[Number, Field(gt=0)]
-PositiveInt: TypeAlias = Annotated[int, Field(gt=0), BeforeValidator(_number)]
-NonNegativeInt: TypeAlias = Annotated[int, Field(ge=0), BeforeValidator(_number)]
-Pair: TypeAlias = tuple[Quantity, Quantity]
-Point: TypeAlias = Quantity | tuple[Quantity, ...]
-Box: TypeAlias = tuple[Quantity, Quantity, Quantity, Quantity]
-Instant: TypeAlias = date | datetime | float | str
-Encoding: TypeAlias = Annotated[str, AfterValidator(_encoding)]
-Name: TypeAlias = Annotated[str, Field(min_length=1)]
-Identifier: TypeAlias = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-TimeFormat: TypeAlias = Annotated[str, AfterValidator(_time_format)]
-Expected: TypeAlias = Annotated[
-    dict[str, Annotated[tuple[Sense, Bound], BeforeValidator(_limits)]],
-    BeforeValidator(_flat),
-    WithJsonSchema({"type": "object", "additionalProperties": BOUNDS}),
-]
 
 
 class Spec(BaseModel):
@@ -271,7 +153,7 @@ class FileSpec(Spec):
     time_format: TimeFormat | None = None
 
 
-File: TypeAlias = Annotated[FileSpec, _short("file"), Also(TEXT)]
+File: TypeAlias = Annotated[FileSpec, short("file"), Also(TEXT)]
 
 
 class DataSpec(Spec):
@@ -382,7 +264,7 @@ class RegionSpec(PriorSpec):
     over: Pair | Box | Name
 
 
-Region: TypeAlias = Annotated[RegionSpec, _short("over"), Also(LIST, TEXT)]
+Region: TypeAlias = Annotated[RegionSpec, short("over"), Also(LIST, TEXT)]
 
 
 class UnknownSpec(PriorSpec):
@@ -570,16 +452,16 @@ class SensitivitySpec(Spec):
     rank: PositiveInt | None = SensitivityLaw.rank
     gate: PositiveFloat = SensitivityLaw.gate
     gate_patience: PositiveInt = SensitivityLaw.gate_patience
-    shadows: StrictBool | Annotated[Shadows, _options(Shadows)] = True
+    shadows: StrictBool | Annotated[Shadows, options_of(Shadows)] = True
     drift: Quantity = SensitivityLaw.drift
     memory: Quantity | None = None
-    refit: StrictBool | Annotated[Refit, _options(Refit)] = True
+    refit: StrictBool | Annotated[Refit, options_of(Refit)] = True
     jumps: (
         StrictBool
         | Annotated[tuple[Name, ...], Field(min_length=1)]
-        | Annotated[Jumps, _options(Jumps)]
+        | Annotated[Jumps, options_of(Jumps)]
     ) = False
-    guards: StrictBool | Annotated[Guards, _options(Guards)] = True
+    guards: StrictBool | Annotated[Guards, options_of(Guards)] = True
     verdict: StrictBool | Literal["cheap"] = True
 
 
@@ -686,7 +568,7 @@ class BoundarySpec(Spec):
         return self
 
 
-Boundary: TypeAlias = Annotated[BoundarySpec, _short("value"), Also(NUMBER, TEXT)]
+Boundary: TypeAlias = Annotated[BoundarySpec, short("value"), Also(NUMBER, TEXT)]
 
 
 class SourceSpec(Spec):
@@ -723,7 +605,7 @@ Components: TypeAlias = Annotated[
 Initial: TypeAlias = Annotated[
     Annotated[InitialSpec, Tag("whole")] | Annotated[Components, Tag("components")],
     Discriminator(_has_from),
-    _short("from"),
+    short("from"),
     Also(NUMBER, TEXT),
 ]
 

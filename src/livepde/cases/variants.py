@@ -1,4 +1,4 @@
-"""Variants of a case: how the run of each one ends, and which one is recommended."""
+"""Variants of a case: proposals, how the run of each one ends, and which one is recommended."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import numpy as np
 from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
-from livepde.cases.read import parse, settings_in
-from livepde.cases.remedies import with_settings
+from livepde.cases.read import parse, settings_in, toml_key, toml_value
+from livepde.cases.remedies import freed, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.plots.style import modes_told
@@ -24,30 +24,43 @@ from livepde.runs import verdict
 from livepde.runs.summary import channel_errors, rmse
 from livepde.samples import Sample
 from livepde.streams import DataTable
-from livepde.verdict import Cause, Verdict
+from livepde.verdict import Cause, Verdict, channel_setting
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from livepde.cases.case import Case
 
 EVERY = 1_000_000_000  # fields are not compared
 AS_STATED = "as stated"
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of withheld sensors may grow: about its own error
+MOST = 12  # variants that the program chooses
+PLACE = 0.01  # of the length of the domain: how far off a sensor may be
+SAMPLES = 64  # in which a source moves the state by the usual error
+NAMES = {  # kind of cause -> name of the variant
+    "offset": "offset of {}",
+    "gain": "gain of {}",
+    "position": "position of {}",
+    "jump": "jumps of {}",
+    "source": "source",
+    "loss": "loss",
+    "flux": "flux at {}",
+    "boundary": "offset of {}",
+    "initial": "uncertain start",
+    "sensor": "without {}",
+    "stuck": "without {}",
+    "unit": "unit of {}",
+}
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A case with other values.
-
-    Attributes
-    ----------
-    name, settings
-        Its name, and texts "key=value" as `--set` takes them.
-    """
+    """A case with other values."""
 
     name: str
-    settings: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()  # "key=value" as for `--set`
 
 
 @dataclass(frozen=True)
@@ -74,12 +87,6 @@ class VariantRun:
 
     Attributes
     ----------
-    variant
-        The variant.
-    error
-        Why it failed; empty if it did not.
-    verdict
-        Its verdict, as `Verdict.to_dict` gives it.
     log_evidence
         `Result.log_evidence` of all readings that it assimilates, as a density in the unit of the
         data: variants with another unit of a sensor are comparable.
@@ -94,15 +101,13 @@ class VariantRun:
     errors, withheld
         Assimilated and withheld sensor -> root mean square of its errors one step ahead, second
         half of the samples.
-    estimates
-        Unknown number -> its last estimate.
     unknowns
         How many numbers were unknown; of a field the number of modes.
     """
 
     variant: Variant
-    error: str = ""
-    verdict: Mapping[str, Any] = field(default_factory=dict)
+    error: str = ""  # why it failed; empty if it did not
+    verdict: Mapping[str, Any] = field(default_factory=dict)  # of `Verdict.to_dict`
     log_evidence: float = math.nan
     readings: Mapping[str, int] = field(default_factory=dict)
     same_readings: float | None = None
@@ -187,13 +192,7 @@ def _pooled(values: Iterable[float]) -> float:
 
 
 def variant_of(text: str) -> Variant:
-    """Return the variant in a text: 'name: key=value; key=value', the name may be missing.
-
-    Raises
-    ------
-    CaseError
-        Without a setting, or with one that is none.
-    """
+    """Return the variant in a text: 'name: key=value; key=value', the name may be missing."""
     head, colon, rest = text.partition(":")
     named = bool(colon) and "=" not in head
     settings = settings_in(rest if named else text)
@@ -250,7 +249,10 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
     known, table = late.stream, stated.stream
     if not (isinstance(known, DataTable) and isinstance(table, DataTable)):
         return math.nan
-    apart = _seconds_between(known, table) * clock_of(stated.case).second
+    apart = 0.0  # of times that are numbers
+    if known.origin is not None and table.origin is not None:
+        apart = since_1970(known.origin) - since_1970(table.origin)
+        apart *= clock_of(stated.case).second
     before, after = delays(late.case), delays(stated.case)
     values = table.values.copy()
     for name in found.readings:
@@ -268,13 +270,6 @@ def _evidence_of_same(stated: Prepared, late: Prepared, found: VariantRun) -> fl
     run = _run(stated, replace(table, values=values), columns=False)
     own = _ended(Variant(AS_STATED), stated, run.to_xarray())
     return own.log_evidence if dict(own.readings) == dict(found.readings) else math.nan
-
-
-def _seconds_between(one: DataTable, other: DataTable) -> float:
-    """Return the seconds from the origin of another table to that of one; 0 of numbers."""
-    if one.origin is None or other.origin is None:
-        return 0.0
-    return since_1970(one.origin) - since_1970(other.origin)
 
 
 def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun:
@@ -436,3 +431,114 @@ def _disagreements(best: VariantRun, others: Sequence[VariantRun]) -> Iterator[s
         yield f"{name} depends on the variant: its interval in {listed} does not overlap."
     if shared and not found:
         yield "All variants agree: their intervals overlap with that of the recommended one."
+
+
+def proposed(prepared: Prepared, base: VariantRun, most: int = MOST) -> list[Variant]:
+    """Return variants of a case, the likely causes of the verdict of its run first, each once."""
+    found: dict[frozenset[str], Variant] = {}
+    likely = [
+        Variant(
+            NAMES.get(cause.kind, cause.kind + " of {}").format(cause.subject),
+            settings_in(cause.setting),
+        )
+        for cause in base.causes
+    ]
+    for variant in (*likely, *_usual(prepared, base)):
+        if variant.settings:
+            # The same keys with another prior are no other variant.
+            keys = frozenset(setting.partition("=")[0] for setting in variant.settings)
+            found.setdefault(keys, variant)
+    return list(found.values())[:most]
+
+
+def _usual(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
+    """Iterate over what is often missing or too much in a case."""
+    case = prepared.case
+    if case.spec.law.kind != "sensitivity":
+        return
+    yield from _process(prepared, base)
+    yield from _sensors(prepared, base)
+    yield from _fewer(case)
+    yield from _layers(case)
+    known = {name: size for name, size in base.misfits.items() if math.isfinite(size)}
+    if len(known) > 2:
+        worst = max(known, key=lambda name: known[name])
+        yield Variant(f"without {worst}", (channel_setting(worst, "role", '"ignored"'),))
+    if not case.spec.law.jumps and base.estimates:
+        yield Variant("jumps", ("law.jumps=true",))
+
+
+def _usual_error(base: VariantRun) -> float:
+    """Return the median error of the assimilated sensors."""
+    known = [size for size in base.errors.values() if math.isfinite(size)]
+    return float(np.median(known)) if known else math.nan
+
+
+def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
+    """Iterate over terms that the process may lack."""
+    error, table = _usual_error(base), prepared.raw
+    if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
+        return
+    time = SAMPLES * float(np.median(np.diff(table.t)))
+    for kind, size in (("source", error / time), ("loss", 0.1 / time)):
+        yield Variant(kind, freed(prepared, Cause(kind, "", "", size=size)))
+    values = [Cause("boundary", name, "", size=error) for name in prepared.case.roles("boundary")]
+    offsets = [setting for cause in values for setting in freed(prepared, cause)]
+    if offsets:
+        yield Variant("offsets of the boundary values", tuple(offsets))
+    for name in map(str, prepared.case.mesh.boundaries or {}):
+        flux = freed(prepared, Cause("flux", name, "", size=error / time))
+        yield Variant(f"flux at {name}", flux)
+
+
+def _sensors(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
+    """Iterate over errors that all sensors may have."""
+    error = _usual_error(base)
+    length = float(np.ptp(prepared.case.mesh.p, axis=1).max())
+    sizes = {"offset": error, "position": PLACE * length}
+    words = {"offset": "offsets of all sensors", "position": "positions of all sensors"}
+    for kind, size in sizes.items():
+        causes = [Cause(kind, name, "", size=size) for name in prepared.case.sensors]
+        settings = [setting for cause in causes for setting in freed(prepared, cause)]
+        if settings and len(causes) > 1:
+            yield Variant(words[kind], tuple(settings))
+
+
+def _fewer(case: Case) -> Iterator[Variant]:
+    """Iterate over the case with fewer unknowns."""
+    for key, word in (("offset", "offsets"), ("gain", "gains"), ("at_std", "uncertain positions")):
+        stated = [n for n, one in case.roles("sensor").items() if getattr(one, key) is not None]
+        yield Variant(f"no {word}", tuple(channel_setting(name, key, "") for name in stated))
+    used = {
+        value
+        for item in (*case.spec.boundary.values(), *case.spec.sources.values())
+        for value in vars(item).values()
+        if isinstance(value, str)
+    }
+    for name, unknown in case.spec.unknowns.items():
+        key = f"unknowns.{toml_key(name)}"
+        if unknown.regions:
+            yield Variant(f"one {name} everywhere", (f"{key}.regions=",))
+        known = case.equation.unknowns.get(name)
+        if known is not None and known.optional and name not in used and name != "C":
+            yield Variant(f"no {name}", (f"{key}=",))
+
+
+def _layers(case: Case) -> Iterator[Variant]:
+    """Iterate over unknowns with two layers, with their border at the middle of the sensors."""
+    if len(case.mesh.p) != 1:
+        return
+    low, high = float(case.mesh.p.min()), float(case.mesh.p.max())
+    places = getattr(case.observation, "positions", None)
+    inner = np.asarray(places, dtype=float).ravel() if places is not None else np.empty(0)
+    middle = float(np.median(inner)) if len(inner) else 0.5 * (low + high)
+    nodes = np.sort(case.mesh.p[0])[1:-1]
+    if not len(nodes):
+        return
+    border = float(nodes[np.abs(nodes - middle).argmin()])
+    for name, unknown in case.spec.unknowns.items():
+        own = next(iter(case.equation.unknowns), "") == name
+        if own and not unknown.regions and not unknown.field:
+            layers = {"lower": [low, border], "upper": [border, high]}
+            setting = f"unknowns.{toml_key(name)}.regions={toml_value(layers)}"
+            yield Variant(f"two layers of {name}", (setting,))

@@ -1,7 +1,8 @@
-"""A case to start from, and the built-in equations."""
+"""A case to start from, the built-in equations, and the JSON schema of cases."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -65,9 +66,8 @@ def init(
     Example:  livepde init mycase
     Your own: livepde init mycase --data measured.csv --equation groundwater
     """
-    from livepde.cases.fill import filled
     from livepde.cases.new_case import check_free, files_for, write_files, write_template
-    from livepde.cases.read import parse
+    from livepde.cases.read import filled, parse
     from livepde.models import EQUATIONS
 
     console = terminal()
@@ -203,3 +203,16 @@ def _entries(found: Equation) -> list[tuple[str, ...]]:
             ("[sources.NAME]", "value", "gained in a region", source, ""),
         ]
     return rows
+
+
+def schema() -> None:
+    """Print the JSON schema of case files: editors use it to complete and explain keys.
+
+    The first line of a case names it: #:schema ./livepde.schema.json
+
+    Example:  livepde schema > livepde.schema.json
+    """
+    from livepde.cases.json_schema import case_schema
+
+    text = json.dumps(case_schema(), indent=1, ensure_ascii=False)
+    terminal().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -13,8 +13,7 @@ from rich.markup import escape
 
 from livepde.cli.options import CaseArgument, CodeOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, extent, print_table, terminal
-from livepde.streams.sentinels import sentinels
-from livepde.streams.switches import switches
+from livepde.streams.oddities import sentinels, switches
 
 if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
@@ -70,17 +69,17 @@ def check(
 
 def _refused(prepared: Prepared) -> list[str]:
     """Return sentences on values of input channels that a run will refuse."""
+    texts = {
+        "start": "{name}: the first {n} values are outliers. A run counts them as missing.",
+        "spike": "{name}: {n} values are spikes. A run rejects them. To use them, set "
+        '`channels.{name}.spikes = "keep"`.',
+    }
     remarks = getattr(prepared.stream, "remarks", {})
-    wild = [
-        f"{name}: the first {number} values are outliers. A run counts them as missing."
-        for (kind, name), number in remarks.items()
-        if kind == "start"
-    ]
-    return wild + [
-        f"{name}: {number} values are spikes. A run rejects them. To use them, set "
-        f'`channels.{name}.spikes = "keep"`.'
-        for (kind, name), number in remarks.items()
-        if kind == "spike"
+    return [
+        text.format(name=name, n=number)
+        for kind, text in texts.items()
+        for (of, name), number in remarks.items()
+        if of == kind
     ]
 
 
@@ -228,8 +227,6 @@ def _show_model(console: Console, case: Case) -> None:
 
 
 def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTable) -> None:
-    import numpy as np
-
     from livepde.runs import Table
 
     steps = np.diff(samples.t)
@@ -243,6 +240,9 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
     for name, values in list(zip(samples.names, samples.values.T, strict=True))[:MOST_CHANNELS]:
         least, largest, missing = extent(values)
         of = case.columns[name].noise_of
+        # Distances between known values, with one before the first and one after the last.
+        known = np.flatnonzero(np.concatenate([[True], np.isfinite(values), [True]]))
+        longest_gap = int(np.diff(known).max()) - 1
         rows.append(
             (
                 name,
@@ -251,22 +251,13 @@ def _show_data(console: Console, case: Case, prepared: Prepared, samples: DataTa
                 largest,
                 case.unit(of).replace("degC", "K") if of else case.unit(name),
                 missing,
-                _longest_gap(np.isfinite(values)),
+                longest_gap,
             )
         )
     if (more := len(samples.names) - MOST_CHANNELS) > 0:
         rows.append((f"and {more} more", "", "", "", "", "", ""))
     columns = ("channel", "role", "least", "largest", "unit", "missing", "longest gap")
     print_table(console, Table("Channels", columns, rows))
-
-
-def _longest_gap(present: Any) -> int:
-    """Return the largest number of missing values in a row."""
-    import numpy as np
-
-    # Distances between known values, with one before the first and one after the last.
-    known = np.flatnonzero(np.concatenate([[True], present, [True]]))
-    return int(np.diff(known).max()) - 1
 
 
 def _show_checks(console: Console, prepared: Prepared) -> bool:

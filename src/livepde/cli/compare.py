@@ -71,8 +71,14 @@ def compare(
     By hand:  livepde compare mycase/case.toml --variant "offset: channels.T_10.offset='0.2 K'"
     Of a run: livepde compare runs/mycase --write mycase/better.toml
     """
-    from livepde.cases.proposals import proposed
-    from livepde.cases.variants import AS_STATED, Variant, conclusions, recommended, variant_of
+    from livepde.cases.variants import (
+        AS_STATED,
+        Variant,
+        conclusions,
+        proposed,
+        recommended,
+        variant_of,
+    )
 
     given = [variant_of(text) for text in variants or ()]
     named = case
@@ -236,8 +242,7 @@ def _check_target(target: Path, case: Path, force: bool) -> None:
 def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:
     """Write a case with settings, one part after the other, and return a sentence on it."""
     from livepde.atomic_write import write_bytes
-    from livepde.cases.fill import filled
-    from livepde.cases.read import parse, read_text
+    from livepde.cases.read import filled, parse, read_text
 
     text = read_text(case)
     for each in settings:

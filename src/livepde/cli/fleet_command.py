@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.markup import escape
+from threadpoolctl import threadpool_limits
 
-from livepde.cli.fleet_parts import Backend, in_parts
 from livepde.cli.options import CaseArgument, CodeOption, JsonOption, SetOption, load_case, option
 from livepde.cli.printing import CHECK_FAILED, INTERRUPTED, present
 from livepde.cli.run import concluded, run_batch, writer_of
@@ -25,66 +27,41 @@ if TYPE_CHECKING:
 
     from livepde.cases import Case, Prepared
     from livepde.cases.member_blocks import MemberBlock
-    from livepde.runs import Check, Driven, Run, RunWriter, Table
+    from livepde.runs import Check, Driven, Run, RunWriter
 
 SUMMARY = "fleet.csv"
 NAME, DATA = "name", "data"  # columns of the table; every other one is a key of the case
 ASKED, GOES_ON = "--separately", "resumed runs"
 UNFIT = frozenset('/\\:*?"<>|')  # what names of folders do without
+Row = TypeVar("Row")
+Found = TypeVar("Found")
+LARGEST = 256  # members of a part: so many runs are interrupted if a worker dies
+ATTEMPTS = 5  # without a part that comes back in between
+DEAD_WORKER = {"KilledWorker", "ActorDiedError"}  # what Dask and Ray call it
 
 
 @dataclass(frozen=True)
 class Member:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes
-    ----------
-    name
-        Its run directory is called so.
-    data
-        Its file; empty: that of the case.
-    settings
-        Texts KEY=VALUE.
-    """
-
-    name: str
-    data: str = ""
-    settings: tuple[str, ...] = ()
+    name: str  # of its run directory
+    data: str = ""  # its file; empty: that of the case
+    settings: tuple[str, ...] = ()  # KEY=VALUE
 
 
 @dataclass(frozen=True)
 class MemberOutcome:
-    """How the run of a member ended.
-
-    Attributes
-    ----------
-    status
-        "finished", "interrupted" or "failed".
-    samples
-        How many it has processed.
-    level
-        Level of its verdict; empty without samples.
-    unknowns
-        Label of each number -> last value and standard deviation.
-    failed
-        Names of checks that failed.
-    lost
-        Why steps failed -> how many.
-    error
-        Why it failed.
-    apart
-        Why it was run separately; empty if it was not.
-    """
+    """How the run of a member ended."""
 
     name: str
-    status: str
+    status: str  # "finished", "interrupted" or "failed"
     samples: int = 0
-    level: str = ""
-    unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)
-    failed: tuple[str, ...] = ()
-    lost: dict[str, int] = field(default_factory=dict)
+    level: str = ""  # of its verdict; empty without samples
+    unknowns: dict[str, tuple[float, float]] = field(default_factory=dict)  # last value, std
+    failed: tuple[str, ...] = ()  # names of checks
+    lost: dict[str, int] = field(default_factory=dict)  # why steps failed -> how many
     error: str = ""
-    apart: str = ""
+    apart: str = ""  # why it was run separately; empty if it was not
 
 
 def fleet(
@@ -156,11 +133,14 @@ def _report(
     as_json: bool,
 ) -> None:
     """Print the outcomes of all members; a member that failed ends the command with an error."""
+    from livepde.runs import Table
+
     wrong = [item for item in ended if item.status == "failed" or item.failed]
     notes = [*_how(ended), *told, *_complaints(ended)]
     lines = [f"[bold]Run directories: {escape(str(folder))}[/]"]
-    run, tables = str(folder), [_table(summary)]
-    present(tables, [], notes, as_json=as_json, lines=lines, run=run, failed=len(wrong))
+    rows = [tuple(row) for row in summary.itertuples(index=False)]
+    tables = [Table(f"{len(rows)} runs", list(map(str, summary.columns)), rows)]
+    present(tables, [], notes, as_json=as_json, lines=lines, run=str(folder), failed=len(wrong))
     if any(item.status == "interrupted" for item in ended):
         raise typer.Exit(INTERRUPTED)
     if wrong:
@@ -249,15 +229,7 @@ def _in_order(rows: Sequence[Member], ended: Mapping[str, MemberOutcome]) -> lis
 
 @dataclass(frozen=True)
 class FleetRunner:
-    """Runner of the members of one process.
-
-    Attributes
-    ----------
-    case, folder, allow_code, settings, resume, separately
-        As given to the command.
-    home
-        Folder that relative paths begin at, for processes that run elsewhere.
-    """
+    """Runner of the members of one process; its fields are options of the command."""
 
     case: Path
     folder: Path
@@ -265,7 +237,7 @@ class FleetRunner:
     settings: tuple[str, ...]
     resume: bool
     separately: bool = False
-    home: Path = Path()
+    home: Path = Path()  # where relative paths begin, for processes that run elsewhere
 
     def __call__(self, rows: Sequence[Member]) -> list[MemberOutcome]:
         """Run members as `livepde run` would, as blocks where they can."""
@@ -290,7 +262,8 @@ class FleetRunner:
         for row in rows:
             try:
                 if row.settings not in loaded:
-                    loaded[row.settings] = self._load(row)
+                    path = self.home / self.case
+                    loaded[row.settings] = load_case(path, self.allow_code, self._own(row))
                 case = loaded[row.settings]
                 self._refuse_other(row, case)
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
@@ -311,14 +284,9 @@ class FleetRunner:
     def left(
         self, rows: Sequence[Member], ended: Mapping[str, MemberOutcome], status: str, why: str
     ) -> dict[str, MemberOutcome]:
-        """Return how runs ended that no process follows any more, marked so in their records.
+        """Return how the other runs ended, which no process follows any more.
 
-        Parameters
-        ----------
-        rows, ended
-            Members, and those that are accounted for.
-        status, why
-            Of runs that are still marked as running.
+        Runs that are still marked as running get this status and reason.
         """
         from livepde import runs
 
@@ -341,9 +309,6 @@ class FleetRunner:
             except LivepdeError as error:
                 found[name] = MemberOutcome(name, status, error=str(error))
         return found
-
-    def _load(self, member: Member) -> Case:
-        return load_case(self.home / self.case, self.allow_code, self._own(member))
 
     def _target(self, name: str) -> Path:
         return self.home / self.folder / name
@@ -492,8 +457,104 @@ def _summary(ended: Sequence[MemberOutcome]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _table(summary: pd.DataFrame) -> Table:
-    from livepde.runs import Table
+class Backend(StrEnum):
+    """Backends of joblib that livepde can set up by itself."""
 
-    rows = [tuple(row) for row in summary.itertuples(index=False)]
-    return Table(f"{len(rows)} runs", [str(name) for name in summary.columns], rows)
+    loky = "loky"
+    dask = "dask"
+    ray = "ray"
+
+
+def in_parts(
+    run: Callable[[Sequence[Row]], Found],
+    rows: Sequence[Row],
+    jobs: int,
+    backend: Backend | None,
+    told: list[str],
+) -> Iterator[Found]:
+    """Run rows in parts of bounded size, and iterate over their results, in any order.
+
+    A part whose worker died is run again; `run` has to resume from its run directories. Dask uses
+    all workers of its cluster. `told` receives a sentence for each loss of a worker.
+
+    Raises
+    ------
+    ConfigurationError
+        joblib or the backend is not installed.
+    RunError
+        Workers died `ATTEMPTS` times in a row without a finished part in between.
+    """
+    try:
+        from joblib import Parallel, delayed, effective_n_jobs
+        from joblib.parallel import get_active_backend
+    except ImportError as error:
+        raise ConfigurationError(
+            "--jobs requires joblib: pip install 'livepde[fleet]'. Without --jobs, members run one "
+            "after the other."
+        ) from error
+    with ExitStack() as stack:
+        if backend is not None:
+            _configure(backend, stack)
+        jobs = min(effective_n_jobs(jobs), len(rows))
+        count = max(jobs, -(-len(rows) // LARGEST))
+        parts = {k: rows[k::count] for k in range(count)}
+        lost = 0
+        while parts:
+            tasks = [delayed(_attempt)(run, k, part) for k, part in parts.items()]
+            soon = get_active_backend()[0].supports_return_generator  # Ray gives all at the end
+            how = "generator_unordered" if soon else "list"
+            parallel = Parallel(n_jobs=jobs, batch_size=1, return_as=how)
+            try:
+                for k, found in parallel(tasks):
+                    del parts[k]
+                    lost = 0
+                    yield found
+            except Exception as error:
+                # A dead worker: killed, or out of memory.
+                if (
+                    not isinstance(error, BrokenExecutor)
+                    and type(error).__name__ not in DEAD_WORKER
+                ):
+                    raise
+                lost += 1
+                members = sum(map(len, parts.values()))
+                what = (
+                    f"A worker process died (killed or out of memory), {members} members unfinished"
+                )
+                if lost == ATTEMPTS:
+                    raise RunError(f"{what}, {lost} times in a row without progress.") from error
+                told.append(f"{what}. They were resumed from their run directories.")
+
+
+def _attempt(
+    run: Callable[[Sequence[Row]], Found], k: int, part: Sequence[Row]
+) -> tuple[int, Found]:
+    with threadpool_limits(1):
+        return k, run(part)
+
+
+def _configure(backend: Backend, stack: ExitStack) -> None:
+    """Configure the backend of joblib until the stack is closed."""
+    from joblib import parallel_config
+
+    if backend is Backend.ray:
+        try:
+            from ray.util.joblib import register_ray
+        except ImportError as error:
+            raise ConfigurationError(
+                "--backend ray needs Ray: pip install ray, here and on its nodes."
+            ) from error
+        register_ray()  # type: ignore[no-untyped-call,unused-ignore]
+    if backend is Backend.dask:
+        try:
+            import distributed
+        except ImportError as error:
+            raise ConfigurationError(
+                "--backend dask needs Dask: pip install 'dask[distributed]', here and on its "
+                "workers."
+            ) from error
+        dask: Any = distributed  # without types
+        # Of DASK_SCHEDULER_ADDRESS, or of its own.
+        client: AbstractContextManager[Any] = dask.Client()
+        stack.enter_context(client)
+    stack.enter_context(parallel_config(backend=backend.value))

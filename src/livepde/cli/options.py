@@ -81,13 +81,7 @@ def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> C
 
 
 def prepare_again(opened: Run, data: str | None, allow_code: bool) -> Prepared:
-    """Read the case and the data of a run, with its settings.
-
-    Parameters
-    ----------
-    data
-        The run's data, if its case was moved.
-    """
+    """Read the case and the data of a run, with its settings."""
     from livepde.errors import CaseError, RunError
 
     case = opened.case_file()

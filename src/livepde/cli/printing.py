@@ -50,11 +50,7 @@ def can_draw(console: Console) -> bool:
 def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict[str, Any]:
     """Return the figures of a run: name -> function that draws.
 
-    Parameters
-    ----------
-    journal
-        Has the readings, for the first panels of `overview`, and the figure `curves`, of runs that
-        are not too long.
+    A journal has the readings for the first panels of `overview`, and for the figure `curves`.
     """
     from livepde import plots
 
@@ -92,12 +88,8 @@ def present(
 ) -> None:
     """Print results as text, or as one JSON object.
 
-    Parameters
-    ----------
-    title, lines
-        Of the text, before and after the results; with markup.
-    dataset, facts
-        Of the object: the run whose measures and verdict it has, and further entries.
+    The text has a title before the results and lines after them, with markup. The object has
+    measures and verdict of the run in `dataset`, and further facts.
     """
     console = terminal()
     if not as_json:
@@ -126,7 +118,12 @@ def show(
     """Print tables, checks and notes."""
     for table in shown:
         print_table(console, table)
-    _print_checks(console, list(checks))
+    grid = RichTable.grid(padding=(0, 2))
+    for item in checks:
+        mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
+        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
+    if grid.row_count:
+        console.print(grid)
     for note in notes:
         console.print(f"[yellow]Note:[/] {escape(note)}", soft_wrap=True)
 
@@ -158,7 +155,10 @@ def print_table(console: Console, table: Table) -> None:
     for k, column in enumerate(table.columns):
         values = [row[k] for row in table.rows]
         numbers = k > 0 and all(map(_numeric, values))
-        width = _least_width(column, values, numbers)
+        # The title and text can be folded between words.
+        cells = list(map(_cell, values))
+        words = [*(cells if numbers else " ".join(cells).split()), *column.split()]
+        width = max(map(len, words), default=0)
         needed += width + 2  # two blanks between columns
         grid.add_column(
             escape(column), justify="right" if numbers else "left", min_width=width, overflow="fold"
@@ -166,13 +166,6 @@ def print_table(console: Console, table: Table) -> None:
     for row in table.rows:
         grid.add_row(*(escape(_cell(value)) for value in row))
     console.print(grid, width=max(console.width, needed), crop=False)
-
-
-def _least_width(column: str, values: Iterable[Any], numbers: bool) -> int:
-    """Return the width that a column needs: the title and text can be folded between words."""
-    cells = [_cell(value) for value in values]
-    words = cells if numbers else " ".join(cells).split()
-    return max(map(len, [*words, *column.split()]), default=0)
 
 
 def _numeric(value: Any) -> bool:
@@ -184,13 +177,3 @@ def _numeric(value: Any) -> bool:
 
 def _cell(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-def _print_checks(console: Console, checks: Sequence[Check]) -> None:
-    if not checks:
-        return
-    grid = RichTable.grid(padding=(0, 2))
-    for item in checks:
-        mark = "[green]ok[/]" if item.ok else "[bold red]failed[/]"
-        grid.add_row(mark, escape(item.name), _cell(item.value), item.sense, item.bound_text)
-    console.print(grid)

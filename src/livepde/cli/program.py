@@ -10,18 +10,14 @@ from rich.markup import escape
 from threadpoolctl import threadpool_limits
 
 from livepde import __version__
-from livepde.cli.cases import equations, init
+from livepde.cli.cases import equations, init, schema
 from livepde.cli.check import check
-from livepde.cli.citation import citation
 from livepde.cli.compare import compare
-from livepde.cli.experiments import demo, reproduce
-from livepde.cli.export import export, fmu
+from livepde.cli.experiments import citation, demo, reproduce
+from livepde.cli.finished import export, fmu, report, watch
 from livepde.cli.fleet_command import fleet
 from livepde.cli.printing import BAD_INPUT, terminal
-from livepde.cli.report import report
 from livepde.cli.run import run
-from livepde.cli.schema import schema
-from livepde.cli.watch import watch
 from livepde.errors import LivepdeError
 from livepde.library_messages import tame_libraries
 

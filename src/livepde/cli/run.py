@@ -1,13 +1,21 @@
-"""Run of a case: estimate its unknowns, and write a run directory."""
+"""Run of a case, on complete data or live: estimate its unknowns, write a run directory."""
 
 from __future__ import annotations
 
 import json
+import logging
+import math
+import os
+import subprocess
 import sys
-from collections.abc import Callable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
@@ -15,7 +23,6 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.live import LiveOptions, run_live
 from livepde.cli.options import (
     CaseArgument,
     CodeOption,
@@ -34,14 +41,20 @@ from livepde.cli.printing import (
     present,
     terminal,
 )
-from livepde.errors import ConfigurationError, LivepdeError
+from livepde.errors import ConfigurationError, DataError, LivepdeError
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.cases import Case, Prepared
+    from livepde.cases.live_case import LiveCase
     from livepde.identifier import Identifier
+    from livepde.result import Estimate
     from livepde.runs import Check, Driven, RunWriter, Table
+    from livepde.runs.live_loop import Sink
+LOG = logging.getLogger("livepde.run")
+BEAT = 60.0  # seconds between two lines of the log that say how far a run is
+METRICS_PORT = 9100
 
 
 class LogKind(StrEnum):
@@ -147,17 +160,9 @@ def run(
         raise driven.error
     if not estimates:  # which are all that standard output is for then
         _report(loaded.title, folder, driven, found, as_json)
-    _exit(driven, found.checks, live, as_json)
-
-
-def _exit(driven: Driven, checks: Sequence[Check], live: bool, as_json: bool) -> None:
-    """End the command with an exit code if the run was interrupted or, with JSON, a check failed.
-
-    A live run usually ends by a signal, which is not an interruption then.
-    """
-    if driven.status == "interrupted" and not live:
+    if driven.status == "interrupted" and not live:  # a live run usually ends by a signal
         raise typer.Exit(INTERRUPTED)
-    if as_json and not all(item.ok for item in checks):
+    if as_json and not all(item.ok for item in found.checks):
         raise typer.Exit(CHECK_FAILED)
 
 
@@ -215,24 +220,16 @@ def writer_of(
     """Return the writer of the run directory, a new or a resumed one."""
     from livepde.runs import RECORD, RunWriter
 
+    about: dict[str, Any] = {
+        "version": __version__,
+        "command": command,
+        "case": loaded.text,
+        "settings": settings,
+        "original": loaded.original,
+    }
     if resume and (folder / RECORD).exists():
-        return RunWriter.reopen(
-            folder,
-            version=__version__,
-            command=command,
-            case=loaded.text,
-            settings=settings,
-            original=loaded.original,
-        )
-    return RunWriter.create(
-        folder,
-        version=__version__,
-        command=command,
-        title=loaded.title,
-        case=loaded.text,
-        settings=settings,
-        original=loaded.original,
-    )
+        return RunWriter.reopen(folder, **about)
+    return RunWriter.create(folder, title=loaded.title, **about)
 
 
 def run_batch(
@@ -284,13 +281,7 @@ def concluded(
     *,
     draw: bool = True,
 ) -> Conclusion:
-    """Write the results of a run, and return them.
-
-    Parameters
-    ----------
-    draw
-        Whether to draw figures.
-    """
+    """Write the results of a run, with figures if `draw`, and return them."""
     from livepde.cases.remedies import with_settings
     from livepde.runs import (
         arrivals,
@@ -381,3 +372,136 @@ def _traded(loaded: Case, identifier: Identifier) -> list[str]:
     if not isinstance(loaded.law, SensitivityLaw):
         return []
     return identifiability(loaded.model, identifier.latent_belief()).sentences
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of a live run, as given to the command."""
+
+    data: str | Iterable[str] | None = None  # instead of the case's own source
+    goes_on: bool = False  # whether the source continues by itself, at its own pace
+    speed: float | None = None
+    listen: str | None = None
+    page: str | None = None
+    token: str = ""
+    estimates: bool = False
+    allow_env: tuple[str, ...] = ()
+
+    @property
+    def pace(self) -> float:
+        """Speed of the samples relative to real time; inf: each is taken as soon as it is there."""
+        if self.goes_on:
+            return math.inf
+        return 1.0 if self.speed is None else self.speed
+
+
+def run_live(
+    case: Case, how: LiveOptions, folder: Path, write: Callable[[], RunWriter], stack: ExitStack
+) -> tuple[RunWriter, tuple[Prepared, Driven]]:
+    """Run a case in its run directory until its source ends or a signal comes.
+
+    Parameters
+    ----------
+    write
+        Makes the run directory; called when the source is connected.
+    stack
+        Closes all opened resources, among them the journal, from which the result reads.
+    """
+    from livepde.cases.live_case import LiveCase
+    from livepde.runs import JOURNAL, conduct, stopped_by_signals
+
+    wiring = stack.enter_context(
+        LiveCase(case, how.data, path=folder / JOURNAL, pace=how.pace, allow_env=how.allow_env)
+    )
+    health, stopping = partial(_health, wiring), threading.Event()
+    sinks = _observers(case, how, stack, health)
+    writer = write()
+    # The report at the end needs them, when a signal leaves few seconds.
+    for library in ("xarray", "pint"):
+        import_module(library)
+    if how.page is not None:
+        _show(how.page, how.token, folder, stack)
+    with stopped_by_signals(stopping, lambda: True):
+        try:
+            live = wiring.live(sinks, stopping)
+        except DataError as error:
+            writer.finish(status="failed", notes=[str(error)])
+            raise
+        if live is not None and wiring.prepared is not None:
+            return writer, (wiring.prepared, conduct(live, patient=True))
+    writer.finish(status="interrupted", notes=["Ended before the first sample."])
+    raise typer.Exit(INTERRUPTED)
+
+
+def _health(wiring: LiveCase) -> Mapping[str, Any]:
+    """Return the content of /health, also before the first sample."""
+    if wiring.running is not None:
+        return wiring.running.health
+    silent, why = wiring.silent, wiring.why  # read once: another thread sets them
+    return {
+        "ok": not why,
+        "why": why,
+        "ailment": "silent" if silent else "start" if why else "",
+        "samples": 0,
+        "silent": silent,
+        "status": "waiting for the first sample",
+    }
+
+
+class _Heartbeat:
+    """A sink that logs the progress of a run at intervals."""
+
+    def __init__(self) -> None:
+        self._logged = -math.inf
+
+    def put(self, estimate: Estimate) -> None:
+        now = time.monotonic()
+        if now - self._logged < BEAT:
+            return
+        self._logged = now
+        numbers = estimate.parameters.items()
+        shown = ", ".join(f"{label} = {value:.6g} +- {std:.2g}" for label, (value, std) in numbers)
+        LOG.info("t = %g: %s", estimate.t, shown or estimate.status.code)
+
+    def close(self) -> None:
+        """Do nothing: there are no resources to release."""
+
+
+def _observers(
+    case: Case, how: LiveOptions, stack: ExitStack, health: Callable[[], Mapping[str, Any]]
+) -> list[Sink]:
+    """Start servers and outputs of a live run, and return their sinks."""
+    from livepde.runs.web import Address
+
+    if how.page is not None:
+        from livepde.dashboard import check_installed
+
+        Address.read(how.page, 0, how.token)  # an invalid address is reported before all else
+        check_installed()
+    sinks: list[Sink] = [_Heartbeat()]
+    if how.estimates:
+        from livepde.runs.monitor import JsonLinesSink
+
+        sinks.append(JsonLinesSink(sys.stdout))
+    if how.listen is not None:
+        from livepde.runs.monitor import Metrics, Monitor
+
+        metrics = Metrics(case.sensors, case.clock.second)
+        monitor = Monitor(Address.read(how.listen, METRICS_PORT, how.token), health, metrics)
+        stack.callback(monitor.close)
+        LOG.info("health and metrics at %s", monitor.shown)
+        sinks.append(metrics)
+    return sinks
+
+
+def _show(page: str, token: str, folder: Path, stack: ExitStack) -> None:
+    """Serve the page from a separate process: drawing must not delay steps."""
+    watch = [sys.executable, "-m", "livepde", "watch", str(folder), "--address", page]
+    secret = {"LIVEPDE_TOKEN": token} if token else {}
+    process = subprocess.Popen(
+        [*watch, "--attached"],
+        stdin=subprocess.PIPE,
+        stdout=sys.stderr,
+        env={**os.environ, **secret},
+    )
+    stack.callback(process.communicate)  # closes its standard input, and waits

@@ -16,7 +16,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, IntArray
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.readout import unknown_of
 
 # Relative difference that is attributed to rounding.
 SAME = 1e-9
@@ -284,7 +283,7 @@ class GalerkinReduction:
         """Return the reference parameter, and those with one number at an end of its interval."""
         found, space = [self.q], self.model.parameter_space
         for label, k in space.labels.items():
-            unknown = unknown_of(space, label)
+            unknown = space.unknown_of(label)
             for end in unknown.interval(unknown.prior.centre, unknown.prior.std, LIKELY):
                 found.append(self.q.copy())
                 found[-1][k] = end

@@ -15,7 +15,6 @@ from livepde.fem import Inputs, Moment
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observation, Observed
-from livepde.readout import unknown_of
 from livepde.stepping import Advance, Alexander2, simulate
 
 # Substeps of the full model per sample in `error`, so that its own time error is small.
@@ -66,7 +65,7 @@ class ReducedModel:
         """Return the reduced model of a reduction."""
         parts, r = frame.parts(), frame.V.shape[1]
         space = frame.model.parameter_space
-        unknowns = [unknown_of(space, label) for label in space.labels]
+        unknowns = [space.unknown_of(label) for label in space.labels]
         return cls(
             unknowns=tuple(space.labels),
             channels=frame.model.channels,
@@ -181,7 +180,7 @@ class ReducedModel:
         """Return unknown numbers shifted in latent values, to first order by `shift`, (m,)."""
         space = self.frame.model.parameter_space
         moved = [
-            unknown_of(space, label).prior.transform.shifted(value, abs(by), np.sign(by))
+            space.unknown_of(label).prior.transform.shifted(value, abs(by), np.sign(by))
             for label, value, by in zip(self.unknowns, q, shift, strict=True)
         ]
         return np.array(moved, dtype=float)

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from livepde.cases import Case, load
-from livepde.cases.equations import load_code
+from livepde.cases.case_content import load_code
 from livepde.errors import ConfigurationError, RunError, optional
 from livepde.exchange.unit_process import DataTimes, UnitProcess, of_case, of_code
 from livepde.runs.exported import refuse_file

@@ -19,7 +19,6 @@ from livepde.laws import GradientLaw
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Observed
-from livepde.readout import unknown_of
 from livepde.records import STATUS_CODES
 from livepde.result import Estimate
 from livepde.samples import Sample, number
@@ -141,7 +140,7 @@ class UnitProcess:
         return found
 
     def _estimated(self, label: str, name: str) -> Iterator[OutputVariable]:
-        unit = unknown_of(self.model.parameter_space, label).unit
+        unit = self.model.parameter_space.unknown_of(label).unit
         yield OutputVariable(name, unit, f"Estimate of {name}.")
         if self.covariance:
             yield OutputVariable(
@@ -154,7 +153,7 @@ class UnitProcess:
         q = model.latent.value(model.initial_parameter())
         found = [math.nan]
         for label, k in space.labels.items():
-            found += self._pair(float(q[k]), float(unknown_of(space, label).prior.std))
+            found += self._pair(float(q[k]), float(space.unknown_of(label).prior.std))
         for name in self.fields:
             values = space.fields[name].at_vertices @ q[space.part(name)]
             for value in values[vertex_order(model)].tolist():

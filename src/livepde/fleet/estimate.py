@@ -18,7 +18,6 @@ from livepde.laws import Belief, Status
 from livepde.laws.step_diagnostics import Diagnostics
 from livepde.linalg import Array, IntArray, Mask
 from livepde.model import Model
-from livepde.readout import unknown_of
 from livepde.records import NOTE, STATUS_CODES, STATUS_FLAGS, Layout, Record, Snapshot
 from livepde.result import Estimate, kept
 
@@ -331,7 +330,7 @@ class FleetRecords:
         shares = after / np.where(before > 0.0, before, np.nan)
         for label, k in space.labels.items():
             value, std = beliefs.q[:, k], after[:, k]
-            ends = interval_ends(label, unknown_of(space, label), value, std)
+            ends = interval_ends(label, space.unknown_of(label), value, std)
             columns += [value, std, *ends.values(), shares[:, k]]
         return np.stack(columns, axis=1)
 

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, TextIO
 from livepde import __version__
 from livepde.errors import RunError, optional
 from livepde.library_messages import OneLine
-from livepde.readout import unknown_of
 from livepde.result import Estimate
 from livepde.runs.live_loop import Sink
 from livepde.runs.web import Address, Server
@@ -122,7 +121,7 @@ class Metrics(Sink):
         for label, (value, std) in estimate.parameters.items():
             self._estimate.labels(label).set(value)
             self._deviation.labels(label).set(std)
-            self._unit.labels(label, unknown_of(estimate.space, label).unit).set(1)
+            self._unit.labels(label, estimate.space.unknown_of(label).unit).set(1)
         for name, value in zip(self._sensors, estimate.innovation.tolist(), strict=True):
             self._innovation.labels(name).set(value)
         self._time.set(estimate.t / self._second)

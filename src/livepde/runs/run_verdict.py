@@ -19,7 +19,7 @@ from livepde.linalg import Array
 from livepde.plots.style import note, prior_left
 from livepde.records import STATUS_CODES, field_names, scalars
 from livepde.runs.summary import digits, jumps, shown
-from livepde.streams.sampling import FACTORS, clock_leaps, unit_factor
+from livepde.streams.oddities import FACTORS, clock_leaps, unit_factor
 from livepde.verdict import (
     FLAT,
     MOST,

@@ -50,25 +50,16 @@ BOOKS = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")  # how workbooks begin: .xlsx and .
 
 @dataclass(frozen=True)
 class Written:
-    """The detected format of a CSV file, and its first rows.
+    """The detected format of a CSV file, and the cells of its first rows.
 
-    Attributes
-    ----------
-    separator, decimal, encoding
-        As `read_csv`, `Column` and `Clock` take them.
-    skip
-        Lines before the header: titles.
-    time_formats
-        Possible formats of its dates, if they are not in ISO format: more than one if the order of
-        day, month and year is ambiguous.
-    header, rows
-        Cells of the header, and of the first rows.
+    Dates that are not in ISO format have several possible formats if the order of day, month and
+    year is ambiguous.
     """
 
     separator: str
     decimal: str
     encoding: str
-    skip: int
+    skip: int  # lines before the header: titles
     time_formats: tuple[str, ...]
     header: list[str]
     rows: list[list[str]]
@@ -227,17 +218,7 @@ def _check_header(
 def how_written(path: str | Path, encoding: str = "", skip: int | None = None) -> Written:
     """Return how a CSV file seems to be written, by its first rows.
 
-    Parameters
-    ----------
-    encoding
-        How its text is written, if that is known.
-    skip
-        Lines before the header, if that is known; else those with fewer cells than most lines.
-
-    Raises
-    ------
-    DataError
-        No such file, or a workbook.
+    `encoding` and `skip` are used if they are known.
     """
     lines, encoding = _first_lines(Path(path), encoding)
     separator = _separator(lines[skip or 0 :])
@@ -272,8 +253,11 @@ def _time_formats(
 ) -> tuple[str, ...]:
     """Return the formats of the first named column that may hold dates; none without one."""
     for k, name in enumerate(header):
-        cells = [row[k] for row in rows if k < len(row)]
-        if name and (formats := _formats(cells, decimal)):
+        texts = [row[k].strip() for row in rows if k < len(row)]
+        texts = [text for text in texts if text.lower() not in MISSING]
+        if not name or not texts or number_of(texts[0], decimal) is not None:
+            continue
+        if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
             return formats
     return ()
 
@@ -303,14 +287,6 @@ def _titles(lines: Sequence[str], separator: str) -> int:
     if not titled or any(number_of(name.strip(), ",") is not None for name in names):
         return 0  # it is the header that is short
     return start
-
-
-def _formats(cells: Sequence[str], decimal: str) -> tuple[str, ...]:
-    """Return the formats in which a column's cells may be dates; none of numbers and ISO dates."""
-    texts = [cell.strip() for cell in cells if cell.strip().lower() not in MISSING]
-    if not texts or number_of(texts[0], decimal) is not None:
-        return ()
-    return tuple(filter(None, date_formats(texts)))
 
 
 def _likely(content: bytes, encoding: str) -> str:

@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy  # scipy.interpolate and scipy.ndimage are slow to load, and rarely needed
 
-from livepde.errors import ConfigurationError, SampleError
+from livepde.errors import ConfigurationError
 from livepde.linalg import Array, IntArray, Mask
-from livepde.samples import Sample, number, sample_of
+from livepde.samples import Sample, in_order, number
 from livepde.stepping import Between, Held
 from livepde.streams.table import DataTable
 
@@ -49,18 +49,10 @@ Series = Sequence[tuple[float, float]]
 
 
 class _Residuals(NamedTuple):
-    """Residuals of values to the cubic through two neighbours on each side.
+    """Residuals of values to the cubic through two neighbours on each side."""
 
-    Attributes
-    ----------
-    size
-        Residuals, shape (values - 4,), reduced where the neighbours are far away.
-    weights
-        Weights of the five values in each residual, shape (values - 4, 5).
-    """
-
-    size: Array
-    weights: Array
+    size: Array  # shape (values - 4,), reduced where the neighbours are far away
+    weights: Array  # of the five values in each residual, shape (values - 4, 5)
 
 
 def _residuals(t: Array, x: Array) -> _Residuals:
@@ -250,14 +242,8 @@ def fill_table(
     """Return a finished record without gaps between known values, and without spikes.
 
     Its remarks count interpolated values as "interpolated", refused ones as "spike" and remaining
-    gaps as "missing".
-
-    Parameters
-    ----------
-    interpolated, screened
-        Channels whose gaps are filled, and those whose spikes are refused.
-    means
-        Channels whose readings are means since the last one: a gap is part of the next mean.
+    gaps as "missing". Readings of the channels `means` are means since the last one: a gap is part
+    of the next mean.
     """
     values, remarks = table.values.copy(), dict(table.remarks)
     fills, screens, of_means = set(interpolated), set(screened), set(means)
@@ -356,15 +342,7 @@ class Filled(Iterable[Sample]):
             name: deque(maxlen=RECENT) for name in self.stage.channels
         }
         waiting: deque[tuple[Sample, dict[str, float]]] = deque()
-        before = -math.inf
-        for item in self.stream:
-            sample = sample_of(item)
-            if not sample.t > before:
-                raise SampleError(
-                    f"FillGaps: the sample at t = {sample.t!r} is not later than the one before at "
-                    f"t = {before!r}; sort the stream and drop repeated samples."
-                )
-            before = sample.t
+        for sample in in_order(self.stream, "FillGaps"):
             waiting.append((sample, self._values(sample)))
             while waiting and self._decided(waiting):
                 yield self._released(waiting, recent)
@@ -429,16 +407,7 @@ def decided(
 ) -> tuple[float, tuple[str, ...]]:
     """Return the value of a channel for a sample, and the kinds of remarks on it.
 
-    Parameters
-    ----------
-    t, value
-        Time of the sample and its value, NaN if it is missing.
-    past, later
-        Known values before and after.
-    beyond
-        As for `find_spikes`; infinity: spikes stay.
-    between
-        How the channel behaves between two readings.
+    `past` and `later` are known values before and after. If `beyond` is infinite, spikes stay.
     """
     kinds: tuple[str, ...] = ()
     if between == "hold":

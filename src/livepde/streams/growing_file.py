@@ -39,42 +39,22 @@ UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 class Line(NamedTuple):
-    """A line, or what has happened to a file.
+    """A line, or what has happened to a file."""
 
-    Attributes
-    ----------
-    number, start
-        Number of the file, and the first byte of the line in it.
-    content
-        The line, with its end.
-    kind, told
-        Why there is no line: "malformed", or "rewritten" where rows may be missing; '' if there is.
-    """
-
-    number: int
-    start: int
-    content: bytes
-    kind: str = ""
+    number: int  # of the file
+    start: int  # first byte of the line in it
+    content: bytes  # with its end
+    kind: str = ""  # if there is no line: "malformed", or "rewritten" where rows may be missing
     told: str = ""
 
 
 class Place(NamedTuple):
-    """A place in a file: where it is, and by what the file is known.
+    """A place in a file: where it is, and by what the file is known."""
 
-    Attributes
-    ----------
-    start
-        Byte before which all was read.
-    crc, inode
-        Checksum of the first bytes before it, and the inode number; 0: unknown.
-    header
-        Byte at which the header in effect begins.
-    """
-
-    start: int = 0
-    crc: int = 0
-    inode: int = 0
-    header: int = 0
+    start: int = 0  # byte before which all was read
+    crc: int = 0  # checksum of the first bytes before it
+    inode: int = 0  # 0: unknown
+    header: int = 0  # byte at which the header in effect begins
 
     @classmethod
     def read(cls, text: str) -> Place | None:
@@ -119,11 +99,6 @@ class _Content:
     @property
     def stat(self) -> os.stat_result:
         return os.fstat(self.file.fileno())
-
-    @property
-    def identity(self) -> tuple[int, int]:
-        found = self.stat
-        return found.st_dev, found.st_ino
 
     def _written(self) -> tuple[int, int]:
         """Return when the file was written last, and its size."""
@@ -275,20 +250,11 @@ class GrowingFile:
     A file that is renamed (rotated logs) is read to its end before the new one of its name, also
     where it was renamed twice between two looks, or while the program was away; for a minute it is
     still looked at. A copy that was made before the file was emptied is found in the same way.
-
-    Attributes
-    ----------
-    path
-        The file; it need not exist yet.
-    grows
-        Whether lines may be added.
-    place
-        Where an earlier session has stopped; None: at the start.
     """
 
-    path: Path
-    grows: bool
-    place: Place | None = None
+    path: Path  # it need not exist yet
+    grows: bool  # whether lines may be added
+    place: Place | None = None  # where an earlier session has stopped
     _now: _Content | None = field(default=None, init=False)
     _next: deque[_Content] = field(default_factory=deque, init=False)  # rotated, to be read
     _older: list[tuple[_Content, float]] = field(default_factory=list, init=False)
@@ -436,7 +402,7 @@ class GrowingFile:
             named = self.path.stat()
         except FileNotFoundError:
             return False
-        if (named.st_dev, named.st_ino) == now.identity:
+        if os.path.samestat(named, now.stat):
             return False
         if not self._next:
             self._remember(now)

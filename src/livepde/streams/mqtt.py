@@ -299,7 +299,9 @@ class MqttSource(_Peer, RowSource):
                 known = self._deliveries.get(message.mid)
                 # Sent again after a reconnect: its row is in the queue or in the journal already.
                 if message.dup and known is not None and known.content == content:
-                    self._renew(known)
+                    known.connection = self._connection
+                    if known.safe:
+                        self._confirm(known)
                     return
                 delivery = _Delivery(message.mid, content, self._connection)
                 self._deliveries[message.mid] = delivery
@@ -309,12 +311,6 @@ class MqttSource(_Peer, RowSource):
                 return
             old = message.dup or message.retain
             self._rows.put(self._row(columns[0], payload, delivery, old))
-
-    def _renew(self, known: _Delivery) -> None:
-        """Take note that a message has come again of which the row is under way or safe."""
-        known.connection = self._connection
-        if known.safe:
-            self._confirm(known)
 
     def _confirm(self, delivery: _Delivery) -> None:
         self._client.ack(delivery.number, 1)

@@ -23,7 +23,7 @@ import numpy as np
 
 from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array
-from livepde.samples import Sample, sample_of
+from livepde.samples import Sample, in_order
 
 LARGEST_MEMO = 256  # weights kept for different spacings and patterns of missing samples
 RESOLUTION = 1e-9  # offsets that differ by less than this share of the width have the same weights
@@ -125,14 +125,8 @@ class Smoothed(Iterable[Sample]):
         self._reset()
         weights = self.smoother.weights()
         before = -np.inf
-        for item in self.stream:
-            sample = sample_of(item)
+        for sample in in_order(self.stream, "smoothing"):
             t = float(sample.t)
-            if not t > before:
-                raise SampleError(
-                    f"smoothing: the sample at t = {t!r} is not later than the one before at "
-                    f"t = {before!r}; sort the stream and drop repeated samples."
-                )
             z = self._read(sample)
             smooth, variance, change = weights.add(t, z)
             self._learn(t, z)

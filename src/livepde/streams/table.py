@@ -230,14 +230,8 @@ def to_table(
 ) -> DataTable:
     """Return the channels between start and stop.
 
-    Parameters
-    ----------
-    written
-        The dates as they are written; None if times are numbers.
-    numbers
-        Gives the chosen rows of a column.
-    where
-        Names the data and a row, for messages.
+    `written` are the dates as they are written, None if times are numbers. `numbers` gives the
+    chosen rows of a column, `where` names the data and a row.
     """
     dates = written is not None
     if written is not None:
@@ -333,12 +327,7 @@ def _with_held(
 ) -> tuple[Array, Mask]:
     """Return the rows of a table, and which stay, with what all rows state of held inputs.
 
-    Parameters
-    ----------
-    rows
-        Knows the values of held inputs before the first row.
-    chosen, kept
-        Rows that `every` leaves, and those of them in which no channel is missing that they need.
+    `chosen` are the rows that `every` leaves, `kept` those of them that lack no needed channel.
     """
     found, stays = values.copy(), kept.copy()
     # Where no row is left out, only the first one may get values: those from before it.

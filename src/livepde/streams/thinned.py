@@ -51,12 +51,10 @@ class Thinned:
                 self._last[k] = row[k]
 
     def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
-        """Return what is left of a row; None if nothing.
+        """Return what is left of a row, NaN where a column is missing; None if nothing.
 
         Parameters
         ----------
-        t, row
-            Time and values, NaN where missing, shape (columns,).
         chosen
             Whether `every` leaves the row.
         whole
