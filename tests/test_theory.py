@@ -32,9 +32,9 @@ from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise, Twin
 
 # The functions of the same names hide these modules in their package.
-constants_module = sys.modules["livepde.diagnostics.constants"]
-parts_module = sys.modules["livepde.diagnostics.state_parts"]
-excitation_module = sys.modules["livepde.diagnostics.excitation"]
+constants_module = sys.modules["livepde.diagnostics.theory.constants"]
+parts_module = sys.modules["livepde.diagnostics.theory.state_parts"]
+excitation_module = sys.modules["livepde.diagnostics.theory.excitation"]
 
 ROOT = Path(__file__).parents[1]
 ZERO = {"boundary": 0.0}

@@ -38,10 +38,9 @@ from livepde.fem import (
     with_constants,
 )
 from livepde.linalg import Array, IntArray
-from livepde.operators import DualOperator
 from livepde.records import Layout, name_clashes
 from livepde.showing import Shown, expression, listed
-from livepde.spaces import BorderedSpace, HilbertSpace, product
+from livepde.spaces import BorderedSpace, DualOperator, HilbertSpace, product
 
 Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
 

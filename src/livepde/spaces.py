@@ -1,4 +1,4 @@
-"""Hilbert spaces by their Gram matrix."""
+"""Hilbert spaces by their Gram matrix, and linear operators between them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from livepde.linalg import (
     positive_definite,
 )
 
-__all__ = ["BorderedSpace", "HilbertSpace", "product"]
+__all__ = ["BorderedSpace", "DualOperator", "HilbertSpace", "product"]
 
 # Beyond this condition number of the scaled Gram matrix a space counts as singular: fewer than two
 # digits of a Riesz representative would be correct.
@@ -543,6 +543,48 @@ def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> Hilbe
     # A Schur complement needs the coefficients of all spaces first, auxiliary unknowns last.
     order = np.concatenate([*leading, *rest])
     return BorderedSpace(sp.csr_array(whole[order][:, order]), dim, name, fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class DualOperator:
+    """A linear operator T: source -> target*, given by a weak form.
+
+    Parameters
+    ----------
+    matrix
+        Shape (target.dim, source.dim); row i is the functional tested with basis function i.
+    source, target
+        The spaces; the values of the operator are *dual* vectors of `target`.
+    """
+
+    matrix: sp.csr_array
+    source: HilbertSpace
+    target: HilbertSpace
+
+    def __post_init__(self) -> None:
+        expected = (self.target.dim, self.source.dim)
+        if self.matrix.shape != expected:
+            raise SpaceError(
+                f"Operator {self.source.name} -> {self.target.name}*: matrix of shape "
+                f"{self.matrix.shape}, the spaces need {expected}."
+            )
+
+    def __call__(self, x: Array) -> Array:
+        """Return T x, a dual vector of the target, shape (target.dim,)."""
+        value: Array = self.matrix @ x
+        return value
+
+    def transposed(self, y: Array) -> Array:
+        """Return T^T y, a dual vector of the source, for y in the target."""
+        value: Array = self.matrix.T @ y
+        return value
+
+    def adjoint(self, y: Array) -> Array:
+        """Return T* y in the source: (T* y, xi)_source = <T xi, y> for every tangent xi.
+
+        The paper's A(u)^*: Q <- X of (est_exact_q), a transpose and one Riesz solve.
+        """
+        return self.source.riesz(self.transposed(y))
 
 
 def _data(matrix: sp.csr_array) -> Array:

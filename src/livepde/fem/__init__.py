@@ -5,8 +5,6 @@ from __future__ import annotations
 from skfem.helpers import dd as hess
 from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
 
-from livepde.fem.coefficients import Coefficients, numbers
-from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
     Channel,
@@ -19,12 +17,18 @@ from livepde.fem.fields import (
     Scalar,
     Scalars,
     Unknown,
+    absolute,
     declared,
     interval,
     line,
+    maximum,
+    minimum,
+    positive,
+    upwind,
 )
 from livepde.fem.forms import Form, ignores
-from livepde.fem.latent import Composed, Latent, LatentPart, compose
+from livepde.fem.latent import Coefficients, Composed, Latent, LatentPart, compose, numbers
+from livepde.fem.measure import START, Inputs, Moment, Place, with_constants
 from livepde.fem.meshes import (
     box,
     cells,
@@ -36,11 +40,17 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
-from livepde.fem.notation import absolute, maximum, minimum, positive, upwind
-from livepde.fem.place import START, Inputs, Moment, Place, with_constants
-from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
-from livepde.fem.random_field import random_field
-from livepde.fem.sobolev import Sobolev
+from livepde.fem.priors import (
+    Evolution,
+    LogitNormal,
+    LogNormal,
+    MeanReverting,
+    Normal,
+    Periodic,
+    Prior,
+    RandomWalk,
+)
+from livepde.fem.sobolev import Sobolev, random_field
 from livepde.fem.space import FunctionSpace, Named
 
 __all__ = [

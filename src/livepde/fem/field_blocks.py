@@ -16,7 +16,7 @@ from skfem import Basis, Dofs
 from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
-from livepde.fem.elements import own
+from livepde.fem.elementwise import scatter, shared
 from livepde.fem.fields import (
     Channel,
     Declaration,
@@ -26,11 +26,9 @@ from livepde.fem.fields import (
     Scalars,
     is_nodal,
 )
-from livepde.fem.measure import Measure
-from livepde.fem.periodic import tied
-from livepde.fem.place import Moment, Place
+from livepde.fem.measure import Measure, Moment, Place, own
+from livepde.fem.meshes import tied
 from livepde.fem.priors import Normal
-from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
 JETS = ("value", "grad", "hess")

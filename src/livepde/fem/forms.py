@@ -30,11 +30,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
-from livepde.fem.elementwise import ElementProducts, ElementTensor
+from livepde.fem.elementwise import ElementProducts, ElementTensor, Scatter, scatter
 from livepde.fem.fields import Integrand, On
-from livepde.fem.measure import Measure
-from livepde.fem.place import START, Inputs, Moment, Place
-from livepde.fem.scatter import Scatter, scatter
+from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern
 

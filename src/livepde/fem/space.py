@@ -14,8 +14,7 @@ import scipy.sparse as sp
 from livepde.errors import SpaceError
 from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
 from livepde.fem.fields import Declaration, Piecewise, Scalar, Unknown, declared
-from livepde.fem.measure import Measure
-from livepde.fem.place import Moment
+from livepde.fem.measure import Measure, Moment
 from livepde.linalg import Array, IntArray, Mask, compact
 
 

@@ -12,8 +12,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
-from livepde.models.common import Number
-from livepde.models.description import Equation, Option, Quantity, Variable, closed
+from livepde.models.description import Equation, Number, Option, Quantity, Variable, closed
 
 
 def borehole(

@@ -19,8 +19,9 @@ from livepde.observation.reconstruction import (
     Reconstructed,
     Reconstruction,
     Reconstructor,
+    Split,
+    is_selection,
 )
-from livepde.observation.split import Split, is_selection
 from livepde.spaces import HilbertSpace
 
 Direct = Callable[[Any, Place], Any]

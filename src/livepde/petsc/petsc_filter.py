@@ -25,9 +25,18 @@ from livepde.errors import LawError
 from livepde.laws.filter import contraction
 from livepde.laws.law import Status
 from livepde.linalg import Array, IntArray, Mask
-from livepde.petsc.petsc_model import PetscModel
-from livepde.petsc.step import ImplicitStep, advance, require_order
-from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
+from livepde.petsc.petsc_model import (
+    ImplicitStep,
+    PetscModel,
+    advance,
+    combined,
+    gathered,
+    inner,
+    linear_solver,
+    random_vector,
+    require_order,
+    zeros,
+)
 
 ACCURATE = 1e-14  # relative change of the variances of modes
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeAlias
 
@@ -16,9 +18,29 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.stepping.between import LINES, Held
-from livepde.stepping.interruption import safe_point
+from livepde.stepping.interval import LINES, Held
 from livepde.stepping.newton import StepFailed
+
+# A variable of the context, not of a control: a refit in its own thread is not interrupted.
+CHECK: ContextVar[Callable[[], None] | None] = ContextVar("livepde_interruption", default=None)
+
+
+def safe_point() -> None:
+    """Call the function of `interruptible`, if there is one; called before each substep."""
+    check = CHECK.get()
+    if check is not None:
+        check()
+
+
+@contextmanager
+def interruptible(check: Callable[[], None]) -> Iterator[None]:
+    """Let a function be called before each substep; what it raises ends the computation."""
+    token = CHECK.set(check)
+    try:
+        yield
+    finally:
+        CHECK.reset(token)
+
 
 # An interval of more than so many substeps of `dt_max`, such as a pause of the source, is divided
 # into fewer and longer ones: hourly readings with steps of a second are below, and any pause costs

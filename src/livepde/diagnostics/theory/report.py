@@ -10,17 +10,18 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import CheckReport, Table
-from livepde.diagnostics.constants import Spaces, constants
-from livepde.diagnostics.error_bounds import TwinTracker, bounds, conditions
-from livepde.diagnostics.excitation import Excitation, Spectrum
-from livepde.diagnostics.links import interpolation, link
-from livepde.diagnostics.stopping import (
+from livepde.diagnostics.theory.constants import Spaces, constants
+from livepde.diagnostics.theory.error_bounds import (
     OnlineStopping,
     StoppingState,
+    TwinTracker,
+    bounds,
+    conditions,
     noise_size,
     reconstruction_matrix,
     stopping_time,
 )
+from livepde.diagnostics.theory.excitation import Excitation, Spectrum, interpolation, link
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier

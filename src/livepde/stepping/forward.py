@@ -1,11 +1,14 @@
-"""Implicit stage of the forward model with a known parameter, and its tangents."""
+"""The forward model with a known parameter: implicit stage, tangents, and time integration."""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,8 +28,9 @@ from livepde.linalg import (
     compact,
 )
 from livepde.model import Model
-from livepde.stepping.corrections import At, Corrections, Kept, solved
-from livepde.stepping.newton import TINY, Newton, StepFailed
+from livepde.stepping.interval import Interval
+from livepde.stepping.newton import TINY, At, Corrections, Kept, Newton, StepFailed, solved
+from livepde.stepping.schemes import Advance, advance
 
 # Relative error of a state that is solved with a reused factor.
 STATE = 1e-8
@@ -424,3 +428,45 @@ class _StageEquation:
         own = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
         return own <= max(allowed * own / max(at.size, TINY), rounding)
+
+
+def simulate(
+    model: Model,
+    q: Array,
+    u0: Any,
+    times: Sequence[float],
+    control: Advance,
+    inputs: Callable[[float], Any] | None = None,
+) -> Iterator[tuple[float, Array]]:
+    """Yield (t, u) of the forward model at the given times, the first being the initial time.
+
+    Parameters
+    ----------
+    q
+        Coefficients of the parameter, shape (m,).
+    u0
+        Initial state: a number, a function of x, or coefficients.
+    inputs
+        Function t -> mapping of input channels.
+
+    Raises
+    ------
+    StepFailed
+        A step failed even when halved as often as `control` allows.
+    """
+    values = inputs or (lambda t: {})
+    forward = ForwardStage(model)
+    none = np.zeros(0)
+    u = model.impose(model.initial_values(u0), Moment(times[0], values(times[0])))
+    yield times[0], u
+    for t0, t1 in pairwise(times):
+        interval = Interval(t0=t0, t1=t1, inputs0=values(t0), inputs1=values(t1), z0=none, z1=none)
+
+        # The interval is a default, since a closure would see that of a later round.
+        def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
+            return forward.solve(c, q, h, interval.at(t))
+
+        u, _, failure = advance(control, stage, u, t0, t1)
+        if failure is not None:
+            raise failure
+        yield t1, u

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
 
-from livepde.diagnostics.state_parts import DENSE, Border, Images, Part, lanczos
+from livepde.diagnostics.theory.state_parts import DENSE, Border, Images, Part, lanczos
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
 from livepde.laws.damping_bounds import Constants

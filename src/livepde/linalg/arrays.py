@@ -1,14 +1,84 @@
-"""Products of one matrix with vectors that are the rows of an array."""
+"""Array types, products with rows, numbers that are not finite, and a bounded memo."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from collections.abc import Callable, Hashable, Mapping
+from functools import wraps
+from typing import Any, ClassVar, Generic, ParamSpec, TypeAlias, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
+from numpy.typing import NDArray
 
-from livepde.linalg.types import Array
+Array: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.integer[Any]]
+Mask: TypeAlias = NDArray[np.bool_]
+Sparse: TypeAlias = Any  # any SciPy sparse array: the stubs know no common 2D class
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class nonfinite_allowed:
+    """A context, or a decorator, without warnings of numbers that are not finite.
+
+    Not `np.errstate` as a decorator: that is one object for all calls, which with NumPy 1 keeps the
+    old state of all threads in one place. This one makes an object for each call. Nor
+    `contextlib.contextmanager`, whose generator costs a step of a small model more.
+    """
+
+    def __enter__(self) -> None:
+        self._state = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+        self._state.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._state.__exit__(*error)
+
+    def __call__(self, function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def inner(*args: P.args, **kwargs: P.kwargs) -> R:
+            with nonfinite_allowed():
+                return function(*args, **kwargs)
+
+        return inner
+
+
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
+
+
+class Memo(Generic[Key, Value]):
+    """A bounded memo of a function: cleared when it would grow beyond `most` values.
+
+    Two threads that ask for the same key at once both compute it, and get equal values. Values must
+    be immutable.
+
+    >>> squares = Memo(most=2)
+    >>> sum(squares.get(k, lambda k=k: k**2) for k in (1, 2, 3))
+    14
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        # The dictionary is replaced as a whole and never mutated, so that a thread may keep reading
+        # the one it has: no lock is needed.
+        self._values: Mapping[Key, Value] = {}
+
+    def get(self, key: Key, make: Callable[[], Value]) -> Value:
+        """Return the value of a key, computed on first use."""
+        values = self._values
+        if key in values:
+            return values[key]
+        value = make()
+        values = self._values
+        self._values = {**(values if len(values) < self._most else {}), key: value}
+        return value
+
+    def __len__(self) -> int:
+        return len(self._values)
+
 
 # Entries up to which a dense product costs less than one by diagonals, and than a sparse one.
 DENSE, WIDE = 2_500, 10_000
