@@ -209,12 +209,8 @@ class HilbertSpace:
         """Return the prior variance of each coefficient outside given modes, shape (n,).
 
         As `variance`, but beyond 20 000 coefficients the remainder is interpolated instead of the
-        whole variance. Values at rounding level are set to zero.
-
-        Parameters
-        ----------
-        modes
-            G-orthonormal columns, shape (n, k).
+        whole variance. Values at rounding level are zero. `modes` are G-orthonormal columns, (n,
+        k).
         """
         held = (modes**2).sum(axis=1)
         if self.dim <= LARGE:
@@ -277,16 +273,10 @@ class HilbertSpace:
     def spread(self, weights: Array, modes: Array) -> float:
         """Return the trace of diag(weights) G^{-1}: the weighted sum of prior variances.
 
-        Beyond 20 000 coefficients the part of `modes` is exact, and the remainder is Hutchinson's
-        estimate with 16 fixed random vectors: its relative standard error is at most 0.35, and
-        decreases with the number of modes that contribute.
-
-        Parameters
-        ----------
-        weights
-            Nonnegative, shape (n,).
-        modes
-            G-orthonormal columns, shape (n, k), as `modes` returns them.
+        Beyond 20 000 coefficients the part of `modes`, G-orthonormal columns, is exact, and the
+        remainder is Hutchinson's estimate with 16 fixed random vectors: its relative standard error
+        is at most 0.35, and decreases with the number of modes that contribute. `weights` are
+        nonnegative, shape (n,).
         """
         if self.dim <= LARGE:
             return float(weights @ self.variance)
@@ -303,21 +293,15 @@ class HilbertSpace:
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
         """Leading modes of the Gaussian measure with covariance G^{-1}.
 
-        Solves mass phi = lambda G phi for the `count` largest lambda; the columns are
-        G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
-        approximation of G^{-1} of that rank in the norm of `mass`.
+        Solves mass phi = lambda G phi for the `count` largest lambda; the columns of phi, (n,
+        count), are G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
+        approximation of G^{-1} of that rank in the norm of `mass`. The lambda, descending, are the
+        variances.
 
         By Lanczos' method beyond 400 coefficients, with one Riesz solve per iteration and a fixed
         start vector, so that every run finds the same modes. Each lambda is exact to rounding,
         beyond 20 000 coefficients to a relative error of 1e-8. The variance outside of the modes is
         that of the measure minus the sum of theirs (`spread`).
-
-        Returns
-        -------
-        phi
-            Shape (n, count).
-        variance
-            Eigenvalues lambda, descending.
         """
         from scipy.linalg import eigh
         from scipy.sparse.linalg import LinearOperator, eigsh
@@ -384,16 +368,9 @@ class BorderedSpace(HilbertSpace):
     a law that needs a system with G solves one with K and auxiliary unknowns instead. H^s of
     fractional order and powers of operators have this form (`livepde.fem.Sobolev`).
 
-    `gram` and `tangent_gram` form the dense G, which is possible up to 2000 coefficients.
-
-    Parameters
-    ----------
-    border
-        K, symmetric, shape (n + auxiliary, n + auxiliary); G must be positive definite.
-    dim
-        Number of coefficients n.
-    name, fixed
-        As for `HilbertSpace`. Fixed coefficients may not be coupled with others in K.
+    `gram` and `tangent_gram` form the dense G, which is possible up to 2000 coefficients. `border`
+    is K, symmetric; G, of shape (dim, dim), must be positive definite. Fixed coefficients may not
+    be coupled with others in K.
     """
 
     def __init__(
@@ -459,8 +436,7 @@ class BorderedSpace(HilbertSpace):
     def _root(self) -> _Root | None:
         """Return the inverse of G = -F H^{-1} F with symmetric F, as for H^2; else None.
 
-        For large spaces: F is positive definite and admits Cholesky or multigrid, the indefinite K
-        does not.
+        For large spaces: F admits Cholesky or multigrid, the indefinite K does not.
         """
         n, (E, F, H) = self.dim, self._parts
         if n <= LARGEST_EXPLICIT or E.count_nonzero() or F.shape != (n, n):
@@ -549,12 +525,8 @@ def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> Hilbe
 class DualOperator:
     """A linear operator T: source -> target*, given by a weak form.
 
-    Parameters
-    ----------
-    matrix
-        Shape (target.dim, source.dim); row i is the functional tested with basis function i.
-    source, target
-        The spaces; the values of the operator are *dual* vectors of `target`.
+    Row i of `matrix`, (target.dim, source.dim), is the functional tested with basis function i: the
+    values of the operator are *dual* vectors of `target`.
     """
 
     matrix: sp.csr_array

@@ -16,9 +16,11 @@ from livepde.fem.fields import (
     Predicate,
     Scalar,
     Scalars,
+    Source,
     Unknown,
     absolute,
     declared,
+    ignores,
     interval,
     line,
     maximum,
@@ -26,7 +28,7 @@ from livepde.fem.fields import (
     positive,
     upwind,
 )
-from livepde.fem.forms import Form, ignores
+from livepde.fem.forms import Form
 from livepde.fem.latent import Coefficients, Composed, Latent, LatentPart, compose, numbers
 from livepde.fem.measure import START, Inputs, Moment, Place, with_constants
 from livepde.fem.meshes import (
@@ -51,7 +53,7 @@ from livepde.fem.priors import (
     RandomWalk,
 )
 from livepde.fem.sobolev import Sobolev, random_field
-from livepde.fem.space import FunctionSpace, Named
+from livepde.fem.space import FunctionSpace, Named, source_density
 
 __all__ = [
     "START",
@@ -84,6 +86,7 @@ __all__ = [
     "Scalar",
     "Scalars",
     "Sobolev",
+    "Source",
     "Unknown",
     "absolute",
     "base_name",
@@ -112,6 +115,7 @@ __all__ = [
     "read_mesh",
     "rectangle",
     "smooth",
+    "source_density",
     "trace",
     "transpose",
     "upwind",

@@ -39,13 +39,8 @@ def shared(array: IntArray) -> IntArray:
 def scatter(pairs: Pairs, shape: tuple[int, int]) -> Scatter:
     """Return the canonical scatter map of element matrices: one object for equal arguments.
 
-    Parameters
-    ----------
-    pairs
-        Row and column numbers of local functions for each term, shapes (i, elements), (j,
-        elements).
-    shape
-        Shape of the matrix.
+    `pairs` are row and column numbers of local functions for each term, shapes (i, elements) and
+    (j, elements).
     """
     key = _digest(np.array(shape), *(dofs for pair in pairs for dofs in pair))
     found = _known.get(key)
@@ -68,10 +63,7 @@ def _digest(*arrays: Any) -> bytes:
 class Scatter:
     """Scatter map: adds element matrices, (i, j, elements), to the data of a sparse matrix.
 
-    Attributes
-    ----------
-    pattern
-        Pattern of the matrix: all entries of all element matrices.
+    Its `pattern` has all entries of all element matrices.
     """
 
     def __init__(self, pairs: Pairs, shape: tuple[int, int]) -> None:
@@ -86,10 +78,7 @@ class Scatter:
     def add(self, data: Array, term: int, at: slice, local: Array, keep: bool = True) -> None:
         """Add the entries of some elements of a term, shape (i, j, elements), to data.
 
-        Parameters
-        ----------
-        keep
-            Cache the positions of this term's entries, for repeated assembly.
+        `keep` caches the positions of this term's entries, for repeated assembly.
         """
         # Elements share positions: np.add.at sums repeated ones, which `data[at] += local` would
         # not.
@@ -153,13 +142,9 @@ class ElementProducts:
     ) -> ElementProducts:
         """Collect the element tensors from parts of the mesh.
 
-        Parameters
-        ----------
-        order
-            Names of the three arguments.
-        terms
-            For each term the coefficient numbers of each argument, shape (local, elements), and the
-            parts: slice of the elements, and their tensors, shape (i, j, n, elements).
+        `order` names the three arguments. Each term has the coefficient numbers of each argument,
+        shape (local, elements), and parts: slice of the elements, and their tensors, shape (i, j,
+        n, elements).
         """
         return cls(order, tuple(_TensorTerm(*_combined(parts), dofs) for dofs, parts in terms))
 
@@ -202,14 +187,8 @@ def _combined(parts: Iterable[tuple[slice, Array]]) -> tuple[Array, Array]:
 class ElementTensor:
     """Matrix-free T such that T @ w is the data of a matrix linear in the coefficients w.
 
-    Parameters
-    ----------
-    products
-        Element tensors of the form.
-    slots
-        Arguments of the rows, of the columns, and of w.
-    places
-        Positions of the entries of element matrices in the data.
+    `slots` are the arguments of the rows, of the columns, and of w; `places` are the positions of
+    the entries of element matrices in the data.
     """
 
     products: ElementProducts

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from inspect import signature
 from itertools import chain
 from typing import Any, TypeAlias
 
@@ -22,6 +23,7 @@ from livepde.errors import SpaceError
 from livepde.fem.priors import CONSTANT, Evolution, Normal, Prior, RandomWalk
 from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
+from livepde.showing import expression
 
 # Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
 # with a probability of 2e-23.
@@ -30,6 +32,9 @@ STANDARD = Normal()
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
+
+Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
+"""A source density: a number or f(x, t); for several components a mapping of names to those."""
 
 Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
@@ -57,6 +62,21 @@ class On:
     form: Integrand
 
 
+def ignores(function: Any, position: int) -> bool:
+    """Return whether a function declares by the name `_` that it ignores an argument.
+
+    Probing could not tell: a term may use an argument only at some times.
+
+    >>> ignores(lambda u, v, x: -x.t * v, 0), ignores(lambda _, v, x: -x.t * v, 0)
+    (False, True)
+    """
+    try:
+        names = [*signature(function).parameters]
+    except (TypeError, ValueError):  # of a function that is not written in Python
+        return False
+    return position < len(names) and names[position] == "_"
+
+
 def interval(
     start: float,
     stop: float,
@@ -70,15 +90,10 @@ def interval(
 
     Parameters
     ----------
-    start, stop
-        End points, in the unit of length of the model.
-    cells
-        Number of elements.
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
         True for elements that grow by a constant ratio, as in radial problems; needs start > 0.
-        False for a uniform mesh.
     through
         Points that must be nodes of the mesh: the nearest inner node is moved to each, so that a
         `Subdomain`, a layer or a sensor ends at a node.
@@ -157,13 +172,9 @@ class _Declared:
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
         """Return the ends of the central interval that holds the unknown with probability `level`.
 
-        Those of the prior's kind of distribution (`Prior.interval`), for a `LogNormal` and a
-        `LogitNormal` also cut off at the ends of the latent values (`within`).
-
-        Parameters
-        ----------
-        value, std
-            Estimates and their standard deviations, of equal shape.
+        Those of the prior's kind of distribution (`Prior.interval`) for estimates `value` with
+        standard deviations `std`, for a `LogNormal` and a `LogitNormal` also cut off at the ends of
+        the latent values (`within`).
         """
         low, high = self.prior.interval(value, std, level)
         if not isinstance(self.prior, Normal):
@@ -249,8 +260,18 @@ class Field(_Declared):
         return [item for value in self.dirichlet.values() for item in _each_value(value)]
 
     @property
+    def boundary_text(self) -> str:
+        """The Dirichlet values as text."""
+
+        def shown(value: Any) -> str:
+            if isinstance(value, Channel):
+                return f"channel {value.name}"
+            return expression(value) if callable(value) else f"{value}"
+
+        return ", ".join(f"{name} = {shown(value)}" for name, value in self.dirichlet.items())
+
+    @property
     def point_std(self) -> float:
-        """Largest prior standard deviation of a latent value at a point; inf if unknown."""
         pointwise = isinstance(self.inner, Sobolev) and self.inner.factor != 1.0
         return math.sqrt(2.0) * self.prior.latent_std if pointwise else math.inf
 
@@ -405,14 +426,7 @@ class Piecewise(_Declared):
 class Scalars(_Declared):
     """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
-    Forms and sensors see a mapping, q.offset["T_10"].
-
-    Parameters
-    ----------
-    names
-        Their names.
-    prior, unit, evolution, within
-        As for `Scalar`.
+    Forms and sensors see a mapping, q.offset["T_10"]. The other options are those of `Scalar`.
     """
 
     names: Sequence[str]

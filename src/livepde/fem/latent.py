@@ -115,12 +115,8 @@ class Coefficients:
 class LatentPart:
     """Latent coefficients of one unknown: `copies` times `size`, copy by copy.
 
-    Attributes
-    ----------
-    name, unknown, block
-        Name, declaration and block of the unknown in the function space.
-    part
-        Slice of its coefficients among all latent ones.
+    `unknown` and `block` are its declaration and block in the function space, `part` is the slice
+    of its coefficients among all latent ones.
     """
 
     name: str
@@ -328,7 +324,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form composed with q = V T(a): latent coefficients instead of q."""
+    """A form composed with q = V T(a): `Form` in latent coefficients instead of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form
@@ -336,22 +332,18 @@ class Composed(FormMatrices):
         self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}
 
     def on(self, cells: IntArray) -> Composed:
-        """Return the form integrated over some cells of the mesh only."""
         return Composed(self.form.on(cells), self.latent)
 
     @property
     def affine(self) -> bool:
-        """True if the form is affine in u."""
         return self.form.affine
 
     @property
     def constant(self) -> bool:
-        """True if the form reads neither time nor inputs."""
         return self.form.constant
 
     @property
     def steady(self) -> bool:
-        """True if the derivative in u reads neither time nor inputs."""
         return self.form.steady
 
     @property
@@ -360,7 +352,6 @@ class Composed(FormMatrices):
         return self.latent.linear and self.form.linear_in_parameter
 
     def differentiates(self, slot: str, test: str = "v") -> bool:
-        """Return True if, integrated by parts, the form contains derivatives of an argument."""
         return self.form.differentiates(slot, test)
 
     def _physical(self, coefficients: dict[str, Array]) -> dict[str, Array]:
@@ -369,11 +360,9 @@ class Composed(FormMatrices):
         return {**coefficients, "q": self.latent.value(coefficients["q"])}
 
     def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
-        """Return the derivative in the linear argument `slot`."""
         return self.form.vector(slot, moment, **self._physical(coefficients))
 
     def pattern(self, rows: str, cols: str) -> Pattern:
-        """Return the sparsity of the matrices `data(rows, cols)`."""
         return self._mapped(rows, cols)[0]
 
     def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array | None]:
@@ -394,7 +383,6 @@ class Composed(FormMatrices):
         return self._maps[rows, cols]
 
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
-        """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`."""
         pattern, mapped = self._mapped(rows, cols)
         physical = self._physical(coefficients)
         data = self.form.data(rows, cols, moment, **physical)

@@ -187,8 +187,7 @@ class _LineHermite(ElementLineHermite):  # type: ignore[misc]
 def own(element: Element) -> Element:
     """Return a private copy of an element.
 
-    Elements with global degrees of freedom cache the first mesh they are used on, and are silently
-    wrong on another one.
+    Elements with global degrees of freedom cache their first mesh, and are wrong on another one.
     """
     if type(element) is ElementLineHermite:
         return _LineHermite()

@@ -15,14 +15,7 @@ import numpy as np
 import scipy
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
-from skfem import (
-    Mesh,
-    MeshHex,
-    MeshLine,
-    MeshQuad,
-    MeshTet,
-    MeshTri,
-)
+from skfem import Mesh, MeshHex, MeshLine, MeshQuad, MeshTet, MeshTri
 from skfem.element import (
     Element,
     ElementHex1,

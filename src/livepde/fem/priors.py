@@ -60,11 +60,8 @@ class Evolution:
 class RandomWalk(Evolution):
     """Random walk: a standard deviation of rate * sqrt(h) is added in a time h.
 
-    Parameters
-    ----------
-    rate
-        In the unit of the unknown (of its logarithm for a `LogNormal`) per square root of the
-        model's unit of time.
+    The rate is in the unit of the unknown (of its logarithm for a `LogNormal`) per square root of
+    the model's unit of time.
     """
 
     rate: float
@@ -168,12 +165,9 @@ class Transform(ABC):
     def shifted(self, q: Array, std: Array, z: float) -> Array:
         """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).
 
-        Parameters
-        ----------
-        q, std
-            T of the latent mean, and T' times the latent standard deviation; NaN stays NaN. Where q
-            equals an end of T's range to rounding, the latent standard deviation cannot be
-            recovered, and the end on the side of z is returned.
+        `q` is T of the latent mean, `std` T' times the latent standard deviation; NaN stays NaN.
+        Where q equals an end of T's range to rounding, the latent standard deviation cannot be
+        recovered, and the end on the side of z is returned.
         """
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
@@ -184,13 +178,10 @@ class Transform(ABC):
             return np.where(np.isnan(std), np.nan, self.value(moved))
 
     def moments(self, q: Array, std: Array) -> tuple[Array, Array]:
-        """Return mean and standard deviation of T(Gaussian).
+        """Return mean and standard deviation of T(Gaussian) from `q` and `std` as for `shifted`.
 
-        Parameters
-        ----------
-        q, std
-            As for `shifted`. Where q equals an end of T's range to rounding, that is the mean, and
-            `std` is returned as it is.
+        Where q equals an end of T's range to rounding, that is the mean, and `std` is returned as
+        it is.
         """
         # T is analytic in a strip, so that sums over even steps converge faster than any power of
         # the step; here to 1e-8 for latent standard deviations up to 20.
@@ -289,12 +280,7 @@ class Logit(Transform):
 class Prior(ABC):
     """What is known of a number before the first sample: common base of the distributions.
 
-    Attributes
-    ----------
-    std
-        Standard deviation in the unit of the unknown.
-    bounds
-        (lower, upper), never left by an estimate.
+    `std` is the standard deviation in the unit of the unknown; an estimate never leaves `bounds`.
     """
 
     std: float
@@ -309,6 +295,13 @@ class Prior(ABC):
     @abstractmethod
     def transform(self) -> Transform:
         """The transform q = T(latent)."""
+
+    @property
+    def text(self) -> str:
+        """The prior as text, with bounds where they are not those of its kind."""
+        usual = self.bounds == getattr(type(self), "bounds", None)
+        bounds = "" if usual else f", bounds={self.bounds}"
+        return f"{type(self).__name__}({self.centre:g}, std={self.std:g}{bounds})"
 
     @property
     def latent_mean(self) -> float:
@@ -334,13 +327,8 @@ class Prior(ABC):
         """Return the ends of the central interval that holds q with probability `level`.
 
         Quantiles of the Gaussian belief about the latent values, mapped through the transform and
-        cut off at the bounds.
-
-        Parameters
-        ----------
-        value, std
-            Medians, and standard deviations to first order (the latent one times the slope at the
-            median), of equal shape.
+        cut off at the bounds. `value` are medians, `std` standard deviations to first order (the
+        latent one times the slope at the median), of equal shape.
         """
         from statistics import NormalDist
 
@@ -379,14 +367,9 @@ class Prior(ABC):
 
 @dataclass(frozen=True)
 class Normal(Prior):
-    """Normal distribution of q.
+    """Normal distribution of q with `mean` and `std`, in the unit of the unknown.
 
-    Parameters
-    ----------
-    mean, std
-        Mean and standard deviation, in the unit of the unknown.
-    bounds
-        (lower, upper), to which estimates are clipped.
+    Estimates are clipped to `bounds`, (lower, upper).
     """
 
     mean: float = 0.0

@@ -87,11 +87,6 @@ class Sobolev:
         in the interior; within about a length of a free boundary the standard deviation grows, to
         sqrt(2) std on it.
 
-        Parameters
-        ----------
-        dimension
-            Dimension of the mesh.
-
         Raises
         ------
         SpaceError
@@ -136,12 +131,8 @@ class Sobolev:
     def border(self, M: sp.csr_array, K: sp.csr_array, free: Array) -> sp.csr_array:
         """Return the sparse matrix whose Schur complement on the first n unknowns is G.
 
-        Parameters
-        ----------
-        M, K
-            Mass matrix and matrix of `operator`, shape (n, n).
-        free
-            Mask: one for each free coefficient, zero for each fixed one, which is decoupled.
+        M is the mass matrix, K that of `operator`, shape (n, n); `free` is one for each free
+        coefficient, zero for each fixed one, which is decoupled.
         """
         mask, fixed = sp.diags_array(free), sp.diags_array(1.0 - free)
         M, K = (sp.csr_array(mask @ matrix @ mask + fixed) for matrix in (M, K))
@@ -217,16 +208,9 @@ Known: TypeAlias = Mapping[Any, float]
 
 @dataclass(frozen=True, eq=False)
 class _Kernel:
-    """Matern covariance of smoothness 3/2, conditioned on the first `known` of some places.
+    """Matern covariance of smoothness 3/2 on places (places, d), of a correlation length.
 
-    Attributes
-    ----------
-    places
-        Shape (places, d).
-    length
-        Correlation length.
-    known
-        How many of the places, the first ones, are those where the field is zero.
+    The field is zero at the first `known` of the places.
     """
 
     places: Array

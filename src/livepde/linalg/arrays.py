@@ -24,9 +24,8 @@ R = TypeVar("R")
 class nonfinite_allowed:
     """A context, or a decorator, without warnings of numbers that are not finite.
 
-    Not `np.errstate` as a decorator: that is one object for all calls, which with NumPy 1 keeps the
-    old state of all threads in one place. This one makes an object for each call. Nor
-    `contextlib.contextmanager`, whose generator costs a step of a small model more.
+    Not `np.errstate` as a decorator, which with NumPy 1 keeps the old state of all threads in one
+    place; nor `contextlib.contextmanager`, whose generator costs a step of a small model more.
     """
 
     def __enter__(self) -> None:
@@ -89,10 +88,7 @@ MOST_DIAGONALS = 5
 class RowProduct(ABC):
     """The product of a matrix M, (m, n), with rows.
 
-    Attributes
-    ----------
-    separate
-        True if the numbers of a row do not depend on the other rows, not even in their rounding.
+    If `separate`, the numbers of a row do not depend on the other rows, not even in their rounding.
     """
 
     separate: ClassVar[bool] = False

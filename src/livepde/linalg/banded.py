@@ -146,10 +146,8 @@ class BlockFactor(NamedTuple):
     bad
         Numbers of the blocks that could not be factorised.
     lu, pivots
-        LAPACK's LU factors of the whole matrix, in the order of the band; None if `symmetric` are
-        there.
-    symmetric
-        Main diagonal of D and lower diagonal of L of L D L^T.
+        LAPACK's LU factors of the whole matrix, in the order of the band; None if `symmetric`, the
+        main diagonal of D and lower diagonal of L of L D L^T, is there.
     """
 
     solver: BandedSolver
@@ -191,14 +189,9 @@ class BandedBlocks:
     """Banded factorisation of many matrices with one sparsity pattern.
 
     The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block: no pivot
-    is taken from another block, because the coupling entries are zero. LU with partial pivoting; L
-    D L^T for symmetric positive definite tridiagonal matrices, at a third of the cost.
-
-    Attributes
-    ----------
-    symmetric
-        True if all matrices are symmetric and tridiagonal: storage is the main diagonal, and the
-        lower one with a zero at the end.
+    is taken from another block, because the coupling entries are zero. LU with partial pivoting. If
+    all are `symmetric` and tridiagonal, L D L^T costs a third; storage is then the main diagonal,
+    and the lower one with a zero at the end.
     """
 
     solver: BandedSolver

@@ -58,8 +58,6 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
 
     Parameters
     ----------
-    pattern
-        Sparsity pattern of the matrices.
     symmetric
         True if every matrix is symmetric positive definite.
     approximate

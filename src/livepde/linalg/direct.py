@@ -64,14 +64,9 @@ class Solver(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Leading:
-    """Factor of the Schur complement on the leading unknowns of a factorised matrix.
+    """Factor of the Schur complement on the leading `size` unknowns of a factorised matrix.
 
-    Parameters
-    ----------
-    factor
-        Factor of the larger matrix, shape (total, total).
-    size, total
-        Number of leading unknowns, and of all unknowns.
+    `factor` is of the larger matrix, shape (total, total).
     """
 
     factor: Factor
@@ -81,12 +76,9 @@ class Leading:
     def solve(self, b: Array) -> Array:
         """Return the leading unknowns; the right-hand sides of the other equations are zero."""
         # [[E, F], [F^T, H]] (x, y) = (b, 0) gives (E - F H^-1 F^T) x = b.
-        return self.factor.solve(self._padded(b))[: self.size]
-
-    def _padded(self, b: Array) -> Array:
         padded = np.zeros((self.total, *b.shape[1:]))
         padded[: self.size] = b
-        return padded
+        return self.factor.solve(padded)[: self.size]
 
 
 SYMMETRIC: dict[str, Any] = {
@@ -128,7 +120,6 @@ class SuperLUSolver:
 
     @property
     def name(self) -> str:
-        """Name of the solver for messages."""
         return "SuperLU (SciPy)" + (", symmetric mode" if self.symmetric else "")
 
     @property
@@ -193,13 +184,9 @@ class CholmodFactor:
 class CholmodSolver:
     """Sparse Cholesky of one pattern with a fixed fill-reducing order; needs scikit-sparse.
 
-    A successful factorisation proves that the matrix is positive definite.
-
-    Parameters
-    ----------
-    blocks
-        Whether the factor has dense blocks (supernodal, L L^T) or none (simplicial, L D L^T).
-        Blocks are faster to compute for wide bands, and slower to solve with at any size.
+    A successful factorisation proves that the matrix is positive definite. With `blocks` the factor
+    has dense blocks (supernodal, L L^T), else none (simplicial, L D L^T): blocks are faster to
+    compute for wide bands, and slower to solve with at any size.
     """
 
     pattern: Pattern
@@ -209,7 +196,6 @@ class CholmodSolver:
 
     @property
     def name(self) -> str:
-        """Name of the solver for messages."""
         return f"CHOLMOD (scikit-sparse), {'supernodal' if self.blocks else 'simplicial'}"
 
     @cached_property
@@ -291,12 +277,10 @@ class PardisoSolver:
 
     @property
     def name(self) -> str:
-        """Name of the solver for messages."""
         return "Pardiso (MKL)" + (", symmetric positive definite" if self.symmetric else "")
 
     @property
     def price(self) -> float:
-        """Approximate cost of a factorisation in triangular solves."""
         return 4.0 if self.symmetric else 15.0
 
     @property

@@ -28,10 +28,8 @@ def conjugate_gradients(
         Products with the matrix and with the approximate inverse, for arrays like b.
     b
         Shape (n,) or (n, k).
-    tolerance
-        Bound on the residual, relative to each right-hand side.
-    limit
-        Maximum number of iterations.
+    tolerance, limit
+        Bound on the residual, relative to each right-hand side; maximum number of iterations.
     remedy
         Advice for the message of the error if they do not suffice.
 
@@ -88,20 +86,8 @@ def gmres(
     """Solve with any nonsingular matrix by GMRES with a left preconditioner.
 
     In contrast to SciPy's, it applies the preconditioner only once for b and once per iteration.
-
-    Parameters
-    ----------
-    apply, precondition, limit, remedy
-        As for `conjugate_gradients`; there is no restart.
-    b
-        Shape (n,).
-    tolerance
-        Bound on the preconditioned residual, an estimate of the error, relative to that of x = 0.
-
-    Returns
-    -------
-    x, iterations
-        The solution, and how many it took.
+    Parameters and results are those of `conjugate_gradients`, with b of shape (n,), but `tolerance`
+    bounds the preconditioned residual, an estimate of the error, relative to that of x = 0.
 
     Raises
     ------

@@ -16,15 +16,7 @@ DENSE = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Positions of the structural non-zeros of a matrix, in CSR order.
-
-    Parameters
-    ----------
-    shape
-        Rows and columns.
-    indptr, indices
-        CSR structure; column indices sorted within each row.
-    """
+    """Structural non-zeros of a matrix, in CSR order; columns are sorted in each row."""
 
     shape: tuple[int, int]
     indptr: IntArray
@@ -117,13 +109,6 @@ def compact(matrix: sp.csr_array) -> sp.csr_array | Array:
     return matrix.toarray() if np.prod(matrix.shape) <= DENSE else matrix
 
 
-def _expand(counts: IntArray) -> tuple[IntArray, IntArray]:
-    """Return (owner, rank within owner) of `counts[i]` items of each owner i."""
-    owner = np.repeat(np.arange(len(counts)), counts)
-    first = np.cumsum(counts) - counts
-    return owner, np.arange(len(owner)) - first[owner]
-
-
 def sandwich(
     left: Sparse, inner: Pattern, right: Sparse
 ) -> tuple[IntArray, IntArray, sp.csr_array]:
@@ -134,13 +119,15 @@ def sandwich(
     rows, cols
         Rows and columns of the entries of the product, repeated if several terms contribute.
     weights
-        Sparse matrix of shape (len(rows), inner.nnz): values of those entries from `inner`'s data.
+        Sparse matrix (len(rows), inner.nnz): values of those entries from the data of `inner`.
     """
     a, b = sp.csc_array(left), sp.csr_array(right)
     i, j = inner.rows, inner.indices
     # An entry (i, j) of `inner` meets every entry of column i of `left` and of row j of `right`.
     count_a, count_b = np.diff(a.indptr)[i], np.diff(b.indptr)[j]
-    item, rank = _expand(count_a * count_b)
+    counts = count_a * count_b
+    item = np.repeat(np.arange(len(counts)), counts)
+    rank = np.arange(len(item)) - (np.cumsum(counts) - counts)[item]
     at_a = a.indptr[i[item]] + rank // np.maximum(count_b[item], 1)
     at_b = b.indptr[j[item]] + rank % np.maximum(count_b[item], 1)
     values = a.data[at_a] * b.data[at_b]
@@ -240,12 +227,11 @@ class _MatrixBlock:
         return rows[kept], cols[kept], sp.csr_array((scale[kept], kept, starts), shape=shape)
 
     def _product(self, left: Sparse, right: Sparse) -> tuple[IntArray, IntArray, sp.csr_array]:
-        if self.transposed:
-            # left K^T right is the transpose of right^T K left^T.
-            a, b = sp.csr_array(right).T, sp.csr_array(left).T
-            cols, rows, weights = sandwich(a, self.inner, b)
-        else:
-            rows, cols, weights = sandwich(left, self.inner, right)
+        if not self.transposed:
+            return sandwich(left, self.inner, right)
+        # left K^T right is the transpose of right^T K left^T.
+        a, b = sp.csr_array(right).T, sp.csr_array(left).T
+        cols, rows, weights = sandwich(a, self.inner, b)
         return rows, cols, weights
 
     def mapped(self, pattern: Pattern) -> sp.csr_array:

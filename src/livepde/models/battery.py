@@ -91,9 +91,7 @@ def battery_particle(
         M=lambda c, v, x: (x[0] / R) ** 2 * c * v,
         f=On("right", lambda x, _: -x.inputs["I"] / (FARADAY * area)),
         inputs=["I"],
-        time_unit="s",
-        length_unit="m",
-        formula=BATTERY_PARTICLE.written(),
+        **BATTERY_PARTICLE.about(),
     )
 
 

@@ -58,9 +58,7 @@ def borehole(
             M=lambda u, v, x: rho_c * x[0] * u * v,
             f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
             inputs=["Q"],
-            time_unit="s",
-            length_unit="m",
-            formula=BOREHOLE.written(),
+            **BOREHOLE.about(),
         )
     # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
     return Model(
@@ -73,9 +71,7 @@ def borehole(
         coefficients=lambda q: {"diffusivity": q.k / q.rho_c, "per_capacity": 1 / q.rho_c},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=BOREHOLE.written(),
+        **BOREHOLE.about(),
     )
 
 
@@ -230,9 +226,7 @@ def grouted_borehole(
         ],
         f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=GROUTED_BOREHOLE.written(),
+        **GROUTED_BOREHOLE.about(),
     )
 
 

@@ -15,14 +15,10 @@ from livepde.model import Model
 
 @dataclass(frozen=True)
 class Variable:
-    """Unknown, state, or input of an equation.
+    """Unknown, state, or input of an equation, with unit and meaning.
 
     Attributes
     ----------
-    unit, text
-        Unit and meaning.
-    optional
-        Whether it may be left out.
     transform
         Transform of an unknown in a case that `livepde init` writes: "log" for a positive quantity,
         "logit" for a share between 0 and 1; empty for a quantity that may be negative.
@@ -60,8 +56,6 @@ class Quantity:
 
     Attributes
     ----------
-    text
-        Meaning of the quantity.
     at
         Function (left end, right end) of the mesh -> position at which the state is read.
     direct
@@ -75,14 +69,7 @@ class Quantity:
 
 
 class Fluxes(NamedTuple):
-    """Units of boundary fluxes and sources in a case.
-
-    Attributes
-    ----------
-    flux, transfer, source
-        Units of D u_n, of the coefficient h of an exchange h (ambient - u), and of a source per
-        volume and time.
-    """
+    """Units in a case: of D u_n, of h in an exchange h (ambient - u), and of a source density."""
 
     flux: str
     transfer: str
@@ -144,8 +131,8 @@ class Equation:
     components: tuple[str, ...] = ()
     dimension: Literal[1, 2] = 1
 
-    def written(self, unknowns: Collection[str] = ()) -> str:
-        """Return the formula without the terms of optional unknowns that a model does not have."""
+    def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
+        """Return units and formula of a model, without terms of unknowns that it does not have."""
         left = [
             name for name, one in self.unknowns.items() if one.optional and name not in unknowns
         ]
@@ -156,19 +143,18 @@ class Equation:
         kept = [
             (sign, term) for sign, term in parts if not set(left) & set(re.findall(r"\w+", term))
         ]
-        return "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
+        formula = "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
+        units = {"time_unit": self.time_unit, "length_unit": self.length_unit}
+        return {**units, "formula": formula}
 
     @property
     def takes_values(self) -> bool:
         """Whether a case may give values of the state on boundaries."""
-        return not isinstance(self.build, _Closed)
+        return not isinstance(self.build, closed)
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
-    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords.
-
-    Without boundary values `dirichlet` is None, the default of the function.
-    """
+    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords."""
 
     def build(
         mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
@@ -179,7 +165,7 @@ def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
 
 
 @dataclass(frozen=True)
-class _Closed:
+class closed:
     """The `build` of a function without boundary values; raises `ModelError` with the reason."""
 
     function: Callable[..., Model]
@@ -197,11 +183,6 @@ class _Closed:
                 f"{self.function.__name__} {self.why}: leave out the values on {sorted(dirichlet)}."
             )
         return self.function(mesh, **unknowns, **options)
-
-
-def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
-    """Return the `build` of a function without boundary values; it raises the reason."""
-    return _Closed(function, why)
 
 
 Number: TypeAlias = Unknown | float
@@ -224,7 +205,7 @@ def autonomous(
     coefficients: Mapping[str, Number],
     u0: Unknown | None,
     form: Callable[[Any, Any, Any], Any],
-    formula: str,
+    about: Mapping[str, Any],
 ) -> Model:
     """Return u_t + A(u) = 0 with A by a form (c, u, v) of its coefficients c, known or unknown."""
     known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
@@ -234,14 +215,13 @@ def autonomous(
     def A(q: Any, u: Any, v: Any, x: Any) -> Any:
         return form(SimpleNamespace(**known, **{k: getattr(q, k) for k in unknown}), u, v)
 
-    return Model(u, {**unknown, **begun}, A=A, initial=initial, formula=formula)
+    return Model(u, {**unknown, **begun}, A=A, initial=initial, **about)
 
 
 def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
     """Return an unknown initial state by name, and the form `initial` of a model.
 
-    A field inherits the boundaries of the state: periodic, or zero where the state is fixed at
-    zero.
+    A field inherits the boundaries of the state: periodic, or zero where that is fixed at zero.
     """
     if u0 is None:
         return {}, None

@@ -177,9 +177,7 @@ def _model(
         A=terms,
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
-        time_unit="s",
-        length_unit="m",
-        formula=(HEAT if name == "heat" else CONDUCTION).written(given),
+        **(HEAT if name == "heat" else CONDUCTION).about(given),
     )
 
 

@@ -57,9 +57,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         coefficients=lambda q: {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=PUMPING_TEST.written(),
+        **PUMPING_TEST.about(),
     )
 
 
@@ -135,32 +133,21 @@ def groundwater(
             rate = rate + x.inputs[name] * well(x, at, radius)
         return rate / q.S * v
 
-    # The well sources are polynomials of degree four.
-    state = Field(
-        mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit="m", quadrature=4
-    )
+    held = dict(dirichlet or {})
     return Model(
-        state,
+        # The well sources are polynomials of degree four.
+        Field(mesh, element or linear(mesh), dirichlet=held, unit="m", quadrature=4),
         {"T": T, "S": S},
         A=[flow, taken],
         inputs=tuple(sources),
-        time_unit="s",
-        length_unit="m",
-        formula=GROUNDWATER.written(),
+        **GROUNDWATER.about(),
     )
 
 
 def well(x: Place, at: Sequence[float], radius: float) -> Array:
     """Return the density of a round source of mass one, 3/(pi R^2) (1 - r^2/R^2)^2, in 1/m^2.
 
-    Parameters
-    ----------
-    x
-        Argument x of the form.
-    at
-        Position (x, y) of the well in m.
-    radius
-        R in m; beyond it the density is zero.
+    It is zero beyond the radius R in m around the position (x, y) of the well.
     """
     distance = ((x[0] - at[0]) ** 2 + (x[1] - at[1]) ** 2) / radius**2
     return 3 / (pi * radius**2) * np.maximum(1 - distance, 0.0) ** 2
@@ -187,23 +174,14 @@ def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[fl
 
 def _build_plane(
     mesh: Any,
-    unknowns: Mapping[str, Unknown],
+    unknowns: Mapping[str, Any],
     dirichlet: Mapping[str, Any],
     *,
     x: float,
     y: float,
-    radius: float,
-    recharge: float,
+    **options: Any,
 ) -> Model:
-    return groundwater(
-        mesh,
-        unknowns["T"],
-        unknowns["S"],
-        dirichlet,
-        wells={"Q": (x, y)},
-        radius=radius,
-        recharge=recharge,
-    )
+    return groundwater(mesh, dirichlet=dirichlet, wells={"Q": (x, y)}, **unknowns, **options)
 
 
 PUMPING_TEST = Equation(
@@ -303,9 +281,7 @@ def advection_dispersion(
         B=lambda c, w, x: decay * c * w,
         M=lambda c, w, x: R * c * w,
         inputs=["c_in"],
-        time_unit="h",
-        length_unit="cm",
-        formula=ADVECTION_DISPERSION.written(),
+        **ADVECTION_DISPERSION.about(),
     )
 
 
@@ -368,9 +344,7 @@ def mobile_immobile(
             "into_immobile": q.omega / (1 - q.phi),
         },
         inputs=["c_in"],
-        time_unit="h",
-        length_unit="cm",
-        formula=MOBILE_IMMOBILE.written(),
+        **MOBILE_IMMOBILE.about(),
     )
 
 
@@ -419,7 +393,6 @@ ADVECTION_DISPERSION = Equation(
     length_unit="cm",
     time_unit="h",
 )
-"""Advection-dispersion."""
 
 MOBILE_IMMOBILE = Equation(
     name="mobile_immobile",
@@ -439,4 +412,3 @@ MOBILE_IMMOBILE = Equation(
     length_unit="cm",
     time_unit="h",
 )
-"""Advection-dispersion with an immobile zone."""

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Field, Unknown, dot, grad, hermite, linear, positive
-from livepde.model import Model, Source
+from livepde.fem import Field, Source, Unknown, dot, grad, hermite, linear, positive
+from livepde.model import Model
 from livepde.models.description import (
     INITIAL,
     Equation,
@@ -58,7 +58,7 @@ def reaction_diffusion(
         A=lambda q, u, v, x: q.q * u * v,
         B=lambda u, v, x: diffusivity(x) * dot(grad(u), grad(v)),
         f=f,
-        formula=REACTION_DIFFUSION.written(),
+        **REACTION_DIFFUSION.about(),
     )
 
 
@@ -116,9 +116,7 @@ def fisher_kpp(
         _state(mesh, dirichlet, element, unit),
         {"D": D, "r": r},
         A=lambda q, u, v, x: q.D * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v,
-        time_unit="d",
-        length_unit="mm",
-        formula=FISHER_KPP.written(),
+        **FISHER_KPP.about(),
     )
 
 
@@ -161,9 +159,7 @@ def porous_fisher(
         A=lambda q, u, v, x: (
             q.D * positive(u / K) ** m * dot(grad(u), grad(v)) - q.r * u * (1 - u / K) * v
         ),
-        time_unit="d",
-        length_unit="mm",
-        formula=POROUS_FISHER.written(),
+        **POROUS_FISHER.about(),
     )
 
 
@@ -195,7 +191,6 @@ FISHER_KPP = Equation(
     length_unit="mm",
     time_unit="d",
 )
-"""Fisher-KPP."""
 
 POROUS_FISHER = Equation(
     name="porous_fisher",
@@ -203,16 +198,12 @@ POROUS_FISHER = Equation(
     formula="u_t = div(D (u/K)^m grad u) + r u (1 - u/K)",
     state=DENSITY,
     unknowns={"D": Variable("mm^2/d", "diffusivity at u = K"), "r": RATE},
-    options={
-        "K": CAPACITY,
-        "m": Option("", "exponent of the diffusivity, at least 1", 1.0),
-    },
+    options={"K": CAPACITY, "m": Option("", "exponent of the diffusivity, at least 1", 1.0)},
     build=by_name(porous_fisher),
     element=linear,
     length_unit="mm",
     time_unit="d",
 )
-"""Porous Fisher."""
 
 
 def allen_cahn(
@@ -230,10 +221,8 @@ def allen_cahn(
     ----------
     mesh
         Any mesh. A front is about 4 (2 D/r)^(1/2) wide and must be resolved by several cells.
-    D
-        Diffusivity: unknown or a number.
-    r
-        Rate of reaction: unknown or a number.
+    D, r
+        Diffusivity and rate of reaction: unknown or numbers.
     u0
         Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     dirichlet
@@ -248,7 +237,7 @@ def allen_cahn(
         {"D": D, "r": r},
         u0,
         lambda c, u, v: c.D * dot(grad(u), grad(v)) + c.r * (u**3 - u) * v,
-        ALLEN_CAHN.written(),
+        ALLEN_CAHN.about(),
     )
 
 

@@ -6,9 +6,20 @@ from collections.abc import Mapping
 from typing import Any
 
 from livepde.errors import ModelError
-from livepde.fem import Field, Unknown, absolute, dot, grad, hermite, hess, linear, smooth
-from livepde.fem.fields import upwind
-from livepde.model import Model, Source
+from livepde.fem import (
+    Field,
+    Source,
+    Unknown,
+    absolute,
+    dot,
+    grad,
+    hermite,
+    hess,
+    linear,
+    smooth,
+    upwind,
+)
+from livepde.model import Model
 from livepde.models.description import (
     INITIAL,
     Equation,
@@ -66,7 +77,7 @@ def advection_diffusion(
         Ratio of velocity to flux: for heat the volumetric heat capacity of water over that of the
         saturated bed (about 1.5), for a solute 1/porosity.
     stabilise
-        True: add the artificial diffusion of `livepde.fem.fields`, for flows with a cell Peclet
+        True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
         number |w| h/(2 kappa) above 1.
     element
         Element of the state; default of first order.
@@ -118,9 +129,7 @@ def advection_diffusion(
         unknowns,
         A=transport,
         inputs=["dH"] if K is not None else [],
-        time_unit="s",
-        length_unit="m",
-        formula=ADVECTION_DIFFUSION.written(unknowns),
+        **ADVECTION_DIFFUSION.about(unknowns),
     )
 
 
@@ -222,9 +231,7 @@ def wave(
         A=stiffness if known else lambda q, u, v, x: stiffness(q, u, v, x) + q.d * u.p * v.p,
         B=lambda u, v, x: -u.p * v.w + level * u.p * v.p,
         f={"p": f},
-        time_unit="s",
-        length_unit="m",
-        formula=WAVE.written(),
+        **WAVE.about(),
     )
 
 
@@ -276,7 +283,7 @@ def burgers(
         {"advection": advection, "nu": nu},
         u0,
         lambda c, u, v: c.advection * u * grad(u)[0] * v + c.nu * dot(grad(u), grad(v)),
-        BURGERS.written(),
+        BURGERS.about(),
     )
 
 
@@ -322,7 +329,7 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
         lambda c, u, v: (
             c.advection * u * grad(u)[0] * v - c.dispersion * hess(u)[0, 0] * grad(v)[0]
         ),
-        KDV.written(),
+        KDV.about(),
     )
 
 
@@ -374,7 +381,7 @@ def kuramoto_sivashinsky(
             - c.instability * grad(u)[0] * grad(v)[0]
             + c.damping * hess(u)[0, 0] * hess(v)[0, 0]
         ),
-        KURAMOTO_SIVASHINSKY.written(),
+        KURAMOTO_SIVASHINSKY.about(),
     )
 
 

@@ -89,14 +89,10 @@ class ForwardStage:
 
     @cached_property
     def symmetric(self) -> bool:
-        """True if the matrix of a stage is expected to be symmetric for all q and h.
-
-        M is symmetric, and the rest is tested at one random q. `_factorise` tests each matrix
-        again.
-        """
+        """True if the matrix of a stage is expected to be symmetric for all q and h."""
         if not self.keeps:
             return False
-        # One random parameter suffices, with probability one, if the matrix is linear in q;
+        # M is symmetric. One random q suffices, with probability one, if the matrix is linear in q;
         # `_factorise` tests every matrix again.
         model, rows = self.model, self._free[1]
         some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
@@ -114,11 +110,9 @@ class ForwardStage:
         return pattern.positions(pattern.indices, pattern.rows)
 
     def _mirrored(self, data: Array) -> bool:
-        """Return True if data of the free block are symmetric, relative to the diagonal.
-
-        The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj), which gives a
-        tolerance that does not depend on the units of the state's components.
-        """
+        """Return True if data of the free block are symmetric, relative to the diagonal."""
+        # The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj): a tolerance
+        # that does not depend on the units of the state's components.
         pattern = self._free[0]
         scale = np.sqrt(np.abs(pattern.matrix(data).diagonal()))
         allowed = LINEAR * scale[pattern.rows] * scale[pattern.indices]
@@ -311,8 +305,6 @@ class ForwardStage:
             State and tangents at the beginning of the stage, shape (n, 1 + r).
         directions
             Derivative of the latent coefficients of q along each tangent, shape (m, r).
-        kept
-            Warm-start data of the previous stage.
         tolerance
             Bound on the error of the tangents, relative to the norm of all of them; a hundredth of
             their change is a second bound.

@@ -41,13 +41,10 @@ ESTIMATE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class KeptFactors:
-    """Warm-start data of each member, as `Kept` of a single process.
+    """Warm-start data of each member, as `Kept`, with the members as first axis.
 
-    Attributes
-    ----------
-    q, h, spent, trend
-        Shapes (members, m), (members,), (members,) and (members, n); h = 0 for a member without a
-        cached factor. For stages that cache no factors, q and trend have no columns.
+    h = 0 for a member without a cached factor. For stages that cache none, q and trend have no
+    columns.
     """
 
     q: Array
@@ -86,9 +83,8 @@ class StageOfMembers(NamedTuple):
     kept
         Warm-start data of the previous stage.
     off_centre
-        Mask of members whose last tangent is the offset of the estimated mean from the
-        linearisation point, which has to be more accurate than a covariance square root; shape
-        (members,).
+        Mask of members, (members,), whose last tangent is the offset of the estimated mean from the
+        linearisation point, which has to be more accurate than a covariance square root.
     factors
         Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
         step of a time scheme; a stage may read it and add to it.
@@ -121,12 +117,7 @@ class MemberStage(ABC):
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
-        """Return states and tangents at the end of a stage, and its warm-start data.
-
-        Parameters
-        ----------
-        columns
-            States and tangents at the beginning of the stage, shape (1 + r, members, n).
+        """Return states and tangents, (1 + r, members, n), at the end of a stage; warm-start data.
 
         Raises
         ------
@@ -201,17 +192,8 @@ NO_RESPONSE = np.zeros((0, 0))  # of a stage that does not depend on inputs
 class BandedStep(NamedTuple):
     """What stages of one length with the same unknowns share.
 
-    Attributes
-    ----------
-    factor
-        The factorised matrices.
-    amounts
-        h q of the unknowns in which A is linear, shape (members, unknowns).
-    slopes
-        Their derivatives in the physical unknowns, (members, unknowns, m); None if these are the
-        same.
-    forced
-        See `BandedStage`.
+    `amounts` are h q of the unknowns in which A is linear, (members, unknowns), `slopes` their
+    derivatives in the physical unknowns, (members, unknowns, m), None if these are the same.
     """
 
     factor: BlockFactor
@@ -230,9 +212,8 @@ class BandedStage(MemberStage):
     def __init__(self, model: Model) -> None:
         self.model = model
         form, zero, free = model.linear_A, np.zeros(model.X.dim), model.X.free
-        fields = [block.field for block in model.state_space.fields.values()]
-        values = [value for field in fields for value in field.boundary_values]
-        fixed_in_time = all(isinstance(value, int | float | Channel) for value in values)
+        known = (int, float, Channel)
+        fixed_in_time = all(isinstance(value, known) for value in model.boundary_values)
         units = np.eye(form.spaces["q"].dim)
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
@@ -413,18 +394,10 @@ def member_stage(model: Model) -> MemberStage:
 
 
 class DrivenVector:
-    """A vector v(t, inputs), usually affine in the inputs and usually independent of time.
+    """A vector v(t, inputs), (n,), usually affine in the inputs and independent of time.
 
-    In that case it is assembled once, and its evaluation is one small matrix product.
-
-    Parameters
-    ----------
-    vector
-        Function moment -> coefficients, shape (n,).
-    channels
-        Names of the input channels.
-    timed
-        Function () -> True if the vector has read the time so far.
+    In that case it is assembled once, and its evaluation is one small matrix product. `timed`
+    returns True if the vector has read the time so far.
     """
 
     def __init__(

@@ -77,12 +77,10 @@ class StageEquation(Protocol[Point]):
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """Predictor of a stage: starting value and cached Jacobian factor.
+    """Predictor of a stage: starting value y and cached Jacobian factor.
 
     Attributes
     ----------
-    y
-        The prediction.
     factor
         Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
     refresh
@@ -96,16 +94,9 @@ class Near:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[Point]):
-    """Solution of a stage with iteration statistics.
+    """Solution `at` of a stage, with the number of Newton updates.
 
-    Attributes
-    ----------
-    at
-        The solution, with its residual, which is below the tolerance.
-    updates
-        Number of Newton updates.
-    made
-        Iterate of the last factorised Jacobian, and its factor; None without a factorisation.
+    `made` is the iterate of the last factorised Jacobian, and its factor; None without one.
     """
 
     at: Point
@@ -158,12 +149,8 @@ class Newton:
     ) -> Solution[Point]:
         """Return the solution of a stage.
 
-        Parameters
-        ----------
-        start
-            Initial iterate, or a function that returns it: with `near` it may not be needed.
-        near
-            Predicted solution.
+        `start` is the initial iterate, or a function that returns it: with `near`, the predicted
+        solution, it may not be needed.
 
         Raises
         ------
@@ -194,14 +181,7 @@ class _Iteration(Generic[Point]):
     def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
         """Return the solution; raise `StepFailed` without convergence.
 
-        Parameters
-        ----------
-        at, near
-            Initial iterate and its predictor data.
-        allowed
-            Accepted relative residual.
-        factors
-            Maximum number of factorisations.
+        `allowed` is the accepted relative residual, `factors` the maximum number of factorisations.
         """
         newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
@@ -282,19 +262,12 @@ SLOW = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Warm-start data of a stage: parameter and step of its cached factor, trend of the state.
+    """Warm-start data of a stage: q, (m,), and step h of its cached factor, trend of u, (n,).
 
     The factor itself is not stored: it is recomputed from these data if it is missing, as after a
-    restart, and the subsequent numbers are the same.
-
-    Attributes
-    ----------
-    q, h
-        Latent parameter, shape (m,), and step of the cached factor; q is empty if there is none.
-    spent
-        Excess solves since the factor was computed, beyond those expected with a nearby q.
-    trend
-        Rate of change of the state, for the predictor of the next stage, shape (n,).
+    restart, and the subsequent numbers are the same. q is empty if there is no factor. `spent` are
+    the excess solves since the factor was computed, beyond those expected with a nearby q; the
+    trend is the rate of change for the predictor of the next stage.
     """
 
     q: Array
@@ -323,19 +296,8 @@ class At(NamedTuple):
 class Corrections:
     """Iterative refinement with the matrix of one stage and the factor of another.
 
-    Attributes
-    ----------
-    matrix, at, free
-        Matrix of the stage, its (q, h), and the mask of free coefficients: one if free, zero if
-        fixed.
-    factor
-        Function (q, h) -> factorised matrix.
-    price
-        Cost of a factorisation in triangular solves.
-    factor_at
-        Parameter and step of the factor in use.
-    spent
-        Excess solves, as in `Kept`.
+    `matrix`, `at` and the mask `free` are of the stage; `factor` returns the factorised matrix of
+    (q, h), at a `price` in triangular solves, and is used at `factor_at`. `spent` is as in `Kept`.
     """
 
     matrix: sp.csr_array | Array
@@ -349,26 +311,19 @@ class Corrections:
     def once(self, start: Array, b: Array) -> Array:
         """Return the solution of matrix x = b after a single correction.
 
-        The remaining error is at most `SLOW` of the initial one, since the factor would have been
-        replaced otherwise; usually less than a hundredth.
+        The error left is at most `SLOW` of the initial one, since the factor would be replaced
+        otherwise.
         """
         r = (b - self.matrix @ start) * self.free[:, None]
         return start + solved(self.factor(*self.factor_at), r)
 
     def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
-        """Return the solution of matrix x = b on the free coefficients.
+        """Return the solution of matrix x = b on the free coefficients, shape (n,) or (n, r).
 
-        Parameters
-        ----------
-        before
-            Value of x at the beginning of the stage.
-        start
-            Initial guess of x, exact on the fixed coefficients, shape (n,) or (n, r).
-        tolerance
-            Bound on the error relative to x, both in the Frobenius norm over all columns, which is
-            invariant under rotations of the columns of a covariance square root.
-        passes
-            Expected number of corrections; only those beyond it count as excess solves.
+        `before` is x at the beginning of the stage, `start` an initial guess, exact on the fixed
+        coefficients. `tolerance` bounds the error relative to x, both in the Frobenius norm over
+        all columns, which is invariant under rotations of the columns of a covariance square root.
+        Only corrections beyond `passes` count as excess solves.
         """
         free = self.free.reshape(-1, *[1] * (b.ndim - 1))
         width = b[0].size

@@ -174,28 +174,18 @@ class Advance:
         return sum(longest < h / 2**k for k in range(MOST_GRADES))
 
 
-def _unwatched(t: float, h: float) -> None:
-    pass
-
-
 def advance(
     control: Advance,
     stage: Stage,
     y: Array,
     t0: float,
     t1: float,
-    begin: Callable[[float, float], None] = _unwatched,
+    begin: Callable[[float, float], object] = lambda t, h: None,
 ) -> tuple[Array, int, StepFailed | None]:
-    """Advance y from t0 to t1.
+    """Advance y from t0 to t1 by the substeps of a control.
 
-    Times are computed from integer counts, never accumulated.
-
-    Parameters
-    ----------
-    control, stage, y, t0, t1
-        Step control and implicit stage; the solution at t0; the interval.
-    begin
-        Is told start and length of each substep before it is tried.
+    Times are computed from integer counts, never accumulated. `begin` receives start and length of
+    each substep before it is tried.
 
     Returns
     -------
