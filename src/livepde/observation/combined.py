@@ -36,11 +36,8 @@ from livepde.spaces import HilbertSpace
 class Combined(Observation):
     """Sensors of several kinds, concatenated.
 
-    Parameters
-    ----------
-    parts
-        Observations; the names of all their sensors differ. Each has its own `noise`, unless
-        `noise` is given here for all sensors, and its own `unit` likewise.
+    The names of all sensors of the `parts` differ. Each part has its own `noise`, unless `noise` is
+    given here for all sensors, and its own `unit` likewise.
 
     Examples
     --------
@@ -106,17 +103,11 @@ class CombinedObserved(Observed):
 
     observation: Combined
 
-    def __init__(
-        self,
-        observation: Combined,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        self.parts = [part.bind(state, X, parameter) for part in observation.parts]
+    def _prepare(self) -> None:
+        spaces = self.state, self.X, self.parameter
+        self.parts = [part.bind(*spaces) for part in self.observation.parts]
         ends = np.cumsum([0] + [part.size for part in self.parts])
         self.slices = [slice(a, b) for a, b in pairwise(ends)]
-        super().__init__(observation, state, X, parameter)
 
     def _names(self) -> tuple[str, ...]:
         return tuple(name for part in self.parts for name in part.names)
@@ -232,15 +223,8 @@ class CalibratedObserved(Observed):
 
     observation: Calibrated
 
-    def __init__(
-        self,
-        observation: Calibrated,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        self.base = observation.base.bind(state, X, parameter)
-        super().__init__(observation, state, X, parameter)
+    def _prepare(self) -> None:
+        self.base = self.observation.base.bind(self.state, self.X, self.parameter)
 
     def _names(self) -> tuple[str, ...]:
         return self.base.names

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ModelError, ObservationError
-from livepde.fem import Field, FieldBlock, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
+from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
 from livepde.fem.field_blocks import base_name
 from livepde.fem.measure import Measure
 from livepde.fem.space import LocalSpace
@@ -70,20 +70,13 @@ class FunctionalsObserved(Observed):
 
     observation: Functionals
 
-    def __init__(
-        self,
-        observation: Functionals,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        super().__init__(observation, state, X, parameter)
+    def _prepare(self) -> None:
         # State and parameter form one nonlinear argument, so that one complex step differentiates
         # with respect to both.
-        unknowns = {STATE + name: unknown for name, unknown in state.unknowns.items()}
-        unknowns |= {PARAMETER + name: unknown for name, unknown in parameter.unknowns.items()}
+        unknowns = {STATE + name: unknown for name, unknown in self.state.unknowns.items()}
+        unknowns |= {PARAMETER + name: one for name, one in self.parameter.unknowns.items()}
         spaces = {"w": FunctionSpace.of(Normal(), "w"), "uq": FunctionSpace(unknowns, False)}
-        self.forms = [self._form(name, spaces) for name in self.names]
+        self.forms = [self._form(name, spaces) for name in self.observation.integrands]
 
     def _names(self) -> tuple[str, ...]:
         return self.observation.names(len(self.observation.integrands))
@@ -97,9 +90,8 @@ class FunctionalsObserved(Observed):
             return g(q, _jets(uq, STATE, self.state), x) * w
 
         form = integrand if where is None else On(where, integrand)
-        mesh = next(iter(self.state.fields.values())).field.mesh
         try:
-            return Form(name, form, spaces, mesh, self._order, "uq", inputs=inputs)
+            return Form(name, form, spaces, self.state.mesh, self._order, "uq", inputs=inputs)
         except ModelError as error:
             raise ObservationError(f"Functionals, sensor '{name}': {error}") from error
 
@@ -108,7 +100,10 @@ class FunctionalsObserved(Observed):
         if self.observation.order is not None:
             return self.observation.order
         fields = [block.field for block in self.state.fields.values()]
-        orders = [_quadrature(field) for field in fields]
+        orders = [
+            2 * int(field.element.maxdeg) if field.quadrature is None else field.quadrature
+            for field in fields
+        ]
         degrees = [int(block.field.element.maxdeg) for block in self.parameter.fields.values()]
         return max(orders) + max(degrees, default=0)
 
@@ -128,10 +123,6 @@ class FunctionalsObserved(Observed):
         return sp.csr_array(rows[:, : len(u)]), rows[:, len(u) :].toarray()
 
 
-def _quadrature(field: Field) -> int:
-    return 2 * int(field.element.maxdeg) if field.quadrature is None else field.quadrature
-
-
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
     """Return state or parameter in the form of weak-form arguments."""
     jets = {name: getattr(uq, prefix + name) for name in space.names}
@@ -139,13 +130,7 @@ def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
 
 
 def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
-    """Return the matrix from q to the mean of an unknown over each cell, shape (cells, m).
-
-    Raises
-    ------
-    ObservationError
-        There is no such unknown.
-    """
+    """Return the matrix from q to the mean of an unknown over each cell, shape (cells, m)."""
     if name not in parameter.names:
         raise ObservationError(
             f"FluxPlates: the model has no unknown '{name}'; it has {list(parameter.names)}."
@@ -219,14 +204,8 @@ class FluxPlatesObserved(Observed):
 
     observation: FluxPlates
 
-    def __init__(
-        self,
-        observation: FluxPlates,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        super().__init__(observation, state, X, parameter)
+    def _prepare(self) -> None:
+        observation, state, parameter = self.observation, self.state, self.parameter
         block = observation.scalar_block(state)
         if len(block.field.mesh.p) != 1:
             raise ObservationError(

@@ -24,11 +24,7 @@ NEAR = 1e-6
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:
-    """Return the names of a sensor's shifts: its own in 1D, else one for each coordinate.
-
-    >>> shift_names("T", 2)
-    ['T.x', 'T.y']
-    """
+    """Return the names of a sensor's shifts: "T" in 1D, else "T.x", "T.y" and so on."""
     return [sensor] if dimension == 1 else [f"{sensor}.{axis}" for axis in AXES[:dimension]]
 
 
@@ -36,18 +32,11 @@ def shift_names(sensor: str, dimension: int) -> list[str]:
 class _Shift:
     """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
 
-    The quadratic interpolates the values at -a, 0 and b, about a standard deviation to each side. A
-    derivative is not used because u has none at a node of linear elements. At the end of the mesh a
-    or b is 0, and the interpolant is the straight line to the other side.
-
-    Attributes
-    ----------
-    sensor, column
-        Number of the sensor, and position of the shift in q.
-    below, above
-        Distances a and b.
-    low, high
-        Rows that evaluate the differences of u there to u at 0, shape (1, n).
+    The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
+    deviation to each side. A derivative is not used because u has none at a node of linear
+    elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
+    other side. The rows `low` and `high` evaluate the differences of u there to u at 0, shape (1,
+    n); `column` is the position of the shift in q.
     """
 
     sensor: int
@@ -75,16 +64,9 @@ class _Shift:
 class PlacedObserved(Observed):
     """Bound point sensors at uncertain positions: linear in u, quadratic in the shifts.
 
-    Parameters
-    ----------
-    observation, state, X, parameter
-        As for `Observed`.
-    rows
-        Matrix of the values that some sensors would measure at other places (`Points.rows`).
-    at
-        Stated coordinates of all sensors, shape (sensors, d).
-    uncertain, std
-        Names of the sensors whose positions are uncertain, and the standard deviation of a shift.
+    `rows` is the matrix of the values that some sensors would measure at other places
+    (`Points.rows`), `at` the stated coordinates of all sensors, shape (sensors, d). The positions
+    of the sensors in `uncertain` have shifts of standard deviation `std`.
     """
 
     def __init__(
@@ -165,10 +147,7 @@ class PlacedObserved(Observed):
 
     @cached_property
     def _parts(self) -> tuple[sp.csr_array, Array]:
-        """Pattern of G at shifted positions, and the values on it of G and of each difference.
-
-        Shapes (sensors, n) and (1 + 2 shifts, entries).
-        """
+        """Pattern of G at shifted positions, and values on it of G and of each difference."""
         rows = self._sensors
         sums = sp.csr_array(
             (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
@@ -184,11 +163,8 @@ class PlacedObserved(Observed):
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
-    """Return start + step along an axis, or the last point on the way that is in the mesh.
-
-    A distance below `NEAR` of the step counts as zero: the sensor lies on the end of the mesh.
-    """
-    least, most = 0.0, 1.0
+    """Return start + step along an axis, or the last point on the way that is in the mesh."""
+    least, most = 0.0, 1.0  # a share below `NEAR` counts as zero: on the end of the mesh
 
     def at(share: float) -> Array:
         point: Array = start.copy()
@@ -257,17 +233,10 @@ class MovingObserved(Observed):
 
     observation: Moving
 
-    def __init__(
-        self,
-        observation: Moving,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        super().__init__(observation, state, X, parameter)
-        self.block = observation.scalar_block(state)
+    def _prepare(self) -> None:
+        self.block = self.observation.scalar_block(self.state)
         dimension = self.block.field.mesh.dim()
-        for name, channels in zip(self.names, observation.channels, strict=True):
+        for name, channels in zip(self._names(), self.observation.channels, strict=True):
             if len(channels) != dimension:
                 raise ObservationError(
                     f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "

@@ -37,12 +37,10 @@ class Split:
     R, P
         Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
         belong to P.
-    inverse
-        G^+ on the present sensors, shape (n, present).
+    inverse, G
+        G^+ on the present sensors, shape (n, present), and their rows of G, shape (present, n).
     present
         Mask of the sensors used, shape (sensors,).
-    G
-        Rows of G of these sensors, shape (present, n).
     vectors
         Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
     omega
@@ -90,12 +88,8 @@ class Split:
     def reconstruct(self, z: Array, boundary: Array | None) -> Array:
         """Return the observed part R u* = G^+ z of the state in X, shape (n,).
 
-        Parameters
-        ----------
-        z
-            Measurements, shape (sensors,); missing ones (NaN) are ignored.
-        boundary
-            Coefficient vector with the Dirichlet values, zero elsewhere; None: zero.
+        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
+        Dirichlet values, zero elsewhere; None: zero.
         """
         known = z if self._complete else z[self.present]
         if boundary is not None and boundary.any():
@@ -123,12 +117,10 @@ MOST_SENSORS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """Reconstruction of the observed part of the state, with its regularisation data.
+    """Reconstruction u = u_alpha = G_alpha z of the observed part of the state, shape (n,).
 
     Attributes
     ----------
-    u
-        u_alpha = G_alpha z in X, shape (n,).
     alpha
         Regularisation parameter; 0 for G^+.
     misfit
@@ -148,16 +140,10 @@ class Alpha(ABC):
 
     @abstractmethod
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
-        """Return alpha >= 0 for one sample.
+        """Return alpha >= 0 for one sample with noise level delta in Z.
 
-        Parameters
-        ----------
-        misfit
-            Function alpha -> ||G u_alpha - z||_Z, nondecreasing.
-        delta
-            Noise level of the sample in Z.
-        scale
-            Value of alpha at which both terms have equal weight.
+        `misfit` is the function alpha -> ||G u_alpha - z||_Z, nondecreasing; `scale` the alpha at
+        which both terms have equal weight.
         """
 
     @property
@@ -176,15 +162,9 @@ def _check(owner: str, **values: float | None) -> None:
 class Apriori(Alpha):
     """A priori parameter choice, alpha = factor · delta^power.
 
-    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2.
-
-    Parameters
-    ----------
-    power, factor
-        Exponent and factor of the rule.
-    delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
-        of the observation.
+    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2. The noise level
+    ||z^delta - z||_Z is `delta`, or `level` relative to ||z^delta||_Z; default given by `noise` of
+    the observation.
     """
 
     power: float = 1.0
@@ -214,15 +194,9 @@ class Discrepancy(Alpha):
 
     One scalar equation is solved for each sample; G is factorised once for each set of present
     sensors. If no alpha attains tau · delta because redundant sensors disagree by more, alpha is
-    the lower end of the search interval; if every misfit is below it, the upper end.
-
-    Parameters
-    ----------
-    tau
-        > 1 in theory, so that alpha is never chosen too small for the noise.
-    delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
-        of the observation.
+    the lower end of the search interval; if every misfit is below it, the upper end. In theory tau
+    > 1, so that alpha is never chosen too small for the noise. `delta` and `level` are as for
+    `Apriori`.
     """
 
     tau: float = 1.1
@@ -250,35 +224,21 @@ class Discrepancy(Alpha):
 
 
 class BoundSensors(Protocol):
-    """Protocol of sensors bound to a state space, for reconstructions; see `Observed`.
-
-    Attributes
-    ----------
-    state, X
-        The state space, with and without its components.
-    """
+    """Sensors bound to a state space, for reconstructions: see `Observed`."""
 
     state: FunctionSpace
     X: HilbertSpace
 
     @property
-    def G(self) -> sp.csr_array:
-        """Matrix of the sensors, shape (sensors, n)."""
-        ...
+    def G(self) -> sp.csr_array: ...
 
     @property
-    def noise(self) -> Array | None:
-        """Noise standard deviation of each sensor, shape (sensors,); None if unknown."""
-        ...
+    def noise(self) -> Array | None: ...
 
     @property
-    def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, False if in the inner product of X."""
-        ...
+    def nodal(self) -> bool: ...
 
-    def split(self, present: Array | None = None) -> Split:
-        """Return R, P and G^+ for the sensors present."""
-        ...
+    def split(self, present: Array | None = None) -> Split: ...
 
 
 class Reconstructor(ABC):
@@ -286,16 +246,10 @@ class Reconstructor(ABC):
 
     @abstractmethod
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        """Return the reconstruction u_alpha.
+        """Return the reconstruction u_alpha from measurements of shape (sensors,).
 
-        Parameters
-        ----------
-        z
-            Measurements, shape (sensors,); those of absent sensors are ignored.
-        boundary
-            Coefficient vector with the Dirichlet values, zero elsewhere.
-        delta
-            Noise level ||z^delta - z||_Z; default that of the rule or the observation.
+        `boundary` is a coefficient vector with the Dirichlet values, zero elsewhere; `delta` the
+        noise level ||z^delta - z||_Z, default that of the rule or the observation.
         """
 
 
