@@ -433,8 +433,7 @@ class Model(Shown):
     def order(self) -> int:
         """Quadrature order: the state's, or exact for A(u) q with polynomial factors."""
         states = [block.field for block in self.state_space.fields.values()]
-        given = [field.quadrature for field in states if field.quadrature is not None]
-        if given:
+        if given := [field.quadrature for field in states if field.quadrature is not None]:
             return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
         own = max(int(field.element.maxdeg) for field in states)

@@ -49,24 +49,20 @@ def check_observation(
     For linear sensors, with R = G^+ G and P = I - R: R and P are idempotent, R P = 0, P maps into
     the null space of G, G G^+ G = G, R is self-adjoint in the inner product in which G^+ is taken,
     `reconstruct` returns R u from z = G u, and missing sensors only remove rows of G. For
-    `Transformed` sensors all this holds for their linear part G_0.
+    `Transformed` sensors all this holds for their linear part G_0. Print the report, or call
+    `raise_if_failed`, which raises `ObservationError`.
 
     Parameters
     ----------
     observed
         A bound observation (`identifier.observed`), or an observation and its model.
-    seed
-        Seed of the random vectors and times.
     at
         Size of the state at which the derivatives are compared with differences.
     inputs
         Mapping from channel to value, for sensors that read channels (default 1); positions of
         moving sensors must lie in the mesh.
-
-    Returns
-    -------
-    CheckReport
-        Print it, or call `raise_if_failed`, which raises `ObservationError`.
+    seed
+        Seed of the random vectors and times.
 
     Examples
     --------
@@ -122,10 +118,7 @@ def _projections(observed: Observed, rng: np.random.Generator) -> list[Check]:
 
 
 def _taylor(observed: Observed, at: float, moment: Moment, rng: np.random.Generator) -> list[Check]:
-    """Compare the derivatives with central differences of the readings.
-
-    Only sensors with a reading are compared, and at least one must have a reading.
-    """
+    """Compare the derivatives of sensors with a reading with central differences."""
     n, latent = observed.X.dim, Latent(observed.parameter)
     size = max(abs(at), 1e-300)
     u = at * (1.0 + 0.1 * rng.uniform(-1.0, 1.0, n))
@@ -207,30 +200,22 @@ def _lines(
 
 
 def check_law(
-    law: AnyLaw,
-    build: Callable[[AnyLaw], Identifier],
-    samples: Iterable[Any],
+    law: AnyLaw, build: Callable[[AnyLaw], Identifier], samples: Iterable[Any]
 ) -> CheckReport:
     """Check an update law on a few samples of a problem.
 
     The law must be deterministic; its state must be a value of arrays and numbers that no step
     changes in place; a run continued from a saved state must give bit-identical numbers; estimates
     must be finite and within their bounds; missing samples must not be errors; a failed step must
-    keep the state and leave the stream usable.
+    keep the state and leave the stream usable. Print the report, or call `raise_if_failed`, which
+    raises `LawError`.
 
     Parameters
     ----------
-    law
-        The law.
     build
         Function that returns a new identifier with the law passed to it.
     samples
         At least four items of a stream: (t, z), (t, z, inputs), or `Sample`.
-
-    Returns
-    -------
-    CheckReport
-        Print it, or call `raise_if_failed`, which raises `LawError`.
 
     Examples
     --------
@@ -258,7 +243,7 @@ def check_law(
         identifier = build(law)
         return [_step(identifier, item) for item in items]
 
-    middle = len(items) // 2
+    middle, names = len(items) // 2, build(law).observed.names
     lines = [
         _count(
             "two runs agree (numbers that differ)",
@@ -290,14 +275,12 @@ def check_law(
         ),
         _count(
             "all sensors missing (failures)",
-            lambda: sum(map(_unusable, run(_without(items, middle, build(law), all_of_them=True)))),
+            lambda: sum(map(_unusable, run(_without(items, middle, names)))),
             "with no sensor present a step must predict and not update.",
         ),
         _count(
             "one sensor missing (failures)",
-            lambda: sum(
-                map(_unusable, run(_without(items, middle, build(law), all_of_them=False)))
-            ),
+            lambda: sum(map(_unusable, run(_without(items, middle, names, names[:1])))),
             "use the sensors of interval.present alone: z is NaN elsewhere.",
         ),
         _count(
@@ -359,12 +342,10 @@ def _restarted(
 
 
 def _without(
-    items: list[Sample], at: int, identifier: Identifier, *, all_of_them: bool
+    items: list[Sample], at: int, names: tuple[str, ...], gone: tuple[str, ...] | None = None
 ) -> list[Sample]:
-    """Return the samples with one or all of the sensors missing in two of them."""
-    names = identifier.observed.names
-    gone = names if all_of_them else names[:1]
-    changed = list(items)
+    """Return the samples with the first or all of the sensors missing in two of them."""
+    gone, changed = names if gone is None else gone, list(items)
     for k in (at, at + 1):
         z = items[k].z
         if isinstance(z, Mapping):

@@ -93,10 +93,7 @@ class Spaces:
     def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:
         """Return the images of the two parts under C', for `Part.lipschitz`.
 
-        Parameters
-        ----------
-        jacobian
-            Function that returns the matrix of C' on some elements; None: on all.
+        `jacobian` returns the matrix of C' on some elements; None: on all.
         """
         if self._regions is None:
             whole = [(self.model.X, jacobian(None))]
@@ -109,13 +106,7 @@ class Spaces:
         return seen, [(inside, sp.csr_array(J @ self._unseen)), outside]
 
     def observed_A(self, w: Array, moment: Moment = START, q: Array | None = None) -> sp.csr_array:
-        """Return A(w) over omega, if it is a subdomain: dual vectors in columns, shape (n, m).
-
-        Parameters
-        ----------
-        q
-            As in `Model.A`.
-        """
+        """Return A(w) over omega, if it is a subdomain: dual vectors in columns, shape (n, m)."""
         model, form = self.model, self.model.form_A
         if self._regions is not None:
             form = form.on(self._regions[0])

@@ -50,8 +50,6 @@ class Errors:
 
     Attributes
     ----------
-    t
-        Time.
     e
         ||q - q*||_Q, gain-scaled.
     r, p, d, r_alpha
@@ -104,15 +102,11 @@ class TwinTracker:
 
     Parameters
     ----------
-    twin
-        The truth.
     spaces
         Spaces that define the norms; `Spaces.of(model, observed, law)` for those of the law's
         operators.
-    gain
-        Gain of the law; ||e||_Q^2 is divided by it.
-    damping
-        The law's rule, for theta.
+    gain, damping
+        Those of the law: ||e||_Q^2 is divided by the gain, and the rule gives theta.
     reconstruct
         Function z -> u_alpha as used by the law; default that of the observation.
 
@@ -159,13 +153,7 @@ class TwinTracker:
         self._last: tuple[float, Array] | None = None
 
     def add(self, estimate: Estimate, z: Any) -> Errors:
-        """Compare one estimate with the truth and record the errors.
-
-        Parameters
-        ----------
-        z
-            The sample's measurements, shape (sensors,).
-        """
+        """Compare one estimate with the truth and record the errors; z has the shape (sensors,)."""
         twin, spaces = self.twin, self.spaces
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
@@ -267,8 +255,6 @@ def conditions(
     ----------
     errors
         Of a `TwinTracker`.
-    c
-        Constants.
     data
         Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
         (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
@@ -477,13 +463,8 @@ def noise_size(
 def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Array:
     """Return the matrix of z -> u_alpha with all sensors present, shape (n, sensors).
 
-    Parameters
-    ----------
-    observed
-        Bound observation with its reconstruction rule.
-    alpha
-        Regularisation parameter if the rule has one; for the discrepancy principle that of the
-        sample (`observed.reconstruct(z).alpha`), at which the map is linearised.
+    `alpha` is the regularisation parameter if the rule has one; for the discrepancy principle that
+    of the sample (`observed.reconstruct(z).alpha`), at which the map is linearised.
     """
     rule = observed.observation.reconstruction
     if not rule.regularises:
@@ -504,16 +485,10 @@ def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Arr
 
 @dataclass(frozen=True)
 class StoppingState:
-    """State of `OnlineStopping`.
+    """State of `OnlineStopping` after the sample at t.
 
-    Attributes
-    ----------
-    t
-        Time of the last sample.
-    T
-        Time of the first sample that violated the surrogate condition; infinity if none yet.
-    margin
-        Ratio of right to left side of (cond_d) at the last sample; below 1 it is violated.
+    T is the time of the first sample that violated the surrogate condition, infinity if none yet;
+    `margin` the ratio of right to left side of (cond_d) at the last sample: below 1 it is violated.
     """
 
     t: float = -np.inf
@@ -528,12 +503,7 @@ class OnlineStopping:
     (cond_d) contains the unknown d and r. Here ||d||_V~ is replaced by its root mean square for the
     noise level (`noise_size`), and the true residual by the observed one minus the noise: r_alpha =
     r - d, so for noise that the estimate does not follow yet ||r||^2 = ||r_alpha||^2 - ||d||^2 in
-    the mean, in X as in VX~.
-
-    Parameters
-    ----------
-    constants
-        Constants of the model; only C_M/c_M is used.
+    the mean, in X as in VX~. Of the constants only C_M/c_M is used.
 
     Examples
     --------

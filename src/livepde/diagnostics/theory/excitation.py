@@ -74,16 +74,12 @@ class ExcitationState:
 
     Attributes
     ----------
-    t
-        Time of the last sample; NaN before the first.
-    begun
-        Start time of the open window.
+    t, begun
+        Times of the last sample and of the start of the open window; NaN before the first.
     last
         A(w) at t for latent coefficients, dual vectors of X in columns, shape (n, m).
-    integral
-        Integral over the open window.
-    latest
-        Integral over the last whole window, None before.
+    integral, latest
+        Integrals over the open window, and over the last whole one, None before.
     gram
         Sum over whole windows of their Gramians, shape (m, m); None beyond 1000 parameters.
     windows
@@ -248,16 +244,10 @@ STEADY = 1.5
 
 @dataclass(frozen=True)
 class Link:
-    """A link condition with its fitted exponent.
+    """A link condition with its fitted exponent, lambda or kappa, in [1, inf).
 
-    Attributes
-    ----------
-    exponent
-        lambda or kappa, in [1, inf): the fit of theta ~ x^exponent.
-    constant
-        C_lambda or C_kappa, the largest value over all windows.
-    first, second
-        The constant over the first and over the second half of the windows.
+    `constant` is C_lambda or C_kappa, the largest value over all windows; `first` and `second` are
+    the constant over the first and over the second half of the windows.
     """
 
     exponent: float

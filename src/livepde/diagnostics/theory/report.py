@@ -273,6 +273,8 @@ def theory_report(
 ) -> TheoryReport:
     """Run an identifier and evaluate the quantities of the paper's theory along the run.
 
+    Quantities that cannot be evaluated are listed in a note, never guessed.
+
     Parameters
     ----------
     identifier
@@ -285,12 +287,6 @@ def theory_report(
         Standard deviation of the sensors, for the surrogate of T*; default that of the observation.
     twin
         Twin with the truth, if available; its samples are then used.
-
-    Returns
-    -------
-    TheoryReport
-        Tables and a Markdown page. Quantities that cannot be evaluated are listed in a note, never
-        guessed.
 
     Raises
     ------
