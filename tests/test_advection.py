@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from factories import broad, last_state
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import livepde as lp
 from livepde.cases import load
-from livepde.diagnostics import check_model
 from livepde.errors import CaseError, ModelError
 from livepde.models import advection_diffusion
 
@@ -74,28 +71,6 @@ def test_flux_and_head_add_up():
     one = advection_diffusion(mesh, broad(0.1), sides, v=broad(0.75))
     found = last_state(both, 0.0, times, lambda t: {"dH": 0.5})
     assert np.allclose(found, last_state(one, 0.0, times))
-
-
-@pytest.mark.slow
-@settings(max_examples=10, deadline=None)
-@given(st.floats(1e-7, 1e-5), st.floats(-1e-4, 1e-4), st.floats(1e-4, 1e-1), st.integers(0, 99))
-def test_random_columns_pass_the_checks(kappa, flux, dispersivity, seed):
-    mesh = lp.interval(0.0, 0.5, 10)
-    halves = {"gravel": lambda x: x[0] < 0.2, "clay": lambda x: x[0] >= 0.2}
-    model = advection_diffusion(
-        mesh,
-        lp.Piecewise(halves, lp.LogNormal(kappa, kappa / 2)),
-        {"left": lp.Channel("T"), "right": 12.0},
-        v=lp.Normal(flux, 1e-5),
-        K=lp.Normal(1e-5, 1e-5),
-        dispersivity=lp.LogNormal(dispersivity, dispersivity),
-        source=lp.Scalar(lp.Normal(0.0, 1e-5), evolution=lp.MeanReverting(3600.0)),
-        stabilise=bool(seed % 2),
-        L=0.5,
-        ratio=1.5,
-    )
-    inputs = {"T": 14.0, "dH": 0.03}
-    check_model(model, u=13.0, inputs=inputs, seed=seed).raise_if_failed()
 
 
 def test_what_cannot_be_is_said():

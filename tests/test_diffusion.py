@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from factories import broad, last_state
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import livepde as lp
-from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import conduction, heat
 from livepde.stepping import Advance, Alexander2, simulate
@@ -75,38 +72,6 @@ def test_conduction_is_heat_in_other_units():
     one = last_state(heat(mesh, lp.Normal(5e-7, 1e-7), sides), 0.0, times)
     two = last_state(conduction(mesh, lp.Normal(1.25, 1.0), sides, C=2.5e6), 0.0, times)
     assert np.allclose(one, two, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.long
-@settings(max_examples=10, deadline=None)
-@given(st.floats(1e-8, 1e-5), st.floats(1e-7, 1e-3), st.floats(1e-7, 1e-4), st.integers(0, 99))
-def test_random_heat_passes_the_checks(alpha, loss, transfer, seed):
-    mesh = lp.interval(0.0, 0.5, 10)
-    halves = {"a": lambda x: x[0] < 0.2, "b": lambda x: x[0] >= 0.2}
-
-    def positive(value):
-        return lp.LogNormal(value, value)
-
-    model = heat(
-        mesh,
-        lp.Piecewise(halves, lp.LogNormal(alpha, alpha / 2)),
-        {"left": lp.Channel("T")},
-        loss=positive(loss),
-        transfer=positive(transfer),
-        source=lp.Piecewise(halves, lp.Normal(0.0, 1e-5), evolution=lp.MeanReverting(3600.0)),
-    )
-    inputs = {"T": 12.0, "ambient": 9.0}
-    check_model(model, u=10.0, inputs=inputs, seed=seed).raise_if_failed()
-
-
-@pytest.mark.long
-@settings(max_examples=5, deadline=None)
-@given(st.floats(0.1, 5.0), st.floats(5e5, 5e6), st.integers(0, 99))
-def test_random_conduction_passes_the_checks(k, C, seed):
-    mesh = lp.rectangle((0.0, 1.0), (0.0, 0.5), (3, 2))
-    one = lp.LogNormal(k, k)
-    model = conduction(mesh, one, {"left": 5.0}, C=lambda x: C * (1 + x[0]), transfer=broad(5.0))
-    check_model(model, u=10.0, inputs={"ambient": 3.0}, seed=seed).raise_if_failed()
 
 
 def test_what_cannot_be_is_said():

@@ -6,13 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 import livepde as lp
 from livepde import cases
-from livepde.diagnostics import check_model
-from livepde.models import EQUATIONS, fisher_kpp, porous_fisher
+from livepde.models import fisher_kpp, porous_fisher
 from livepde.stepping import Advance, Alexander2, simulate
 
 ONE = lp.Normal(1.0, 1.0)
@@ -51,35 +48,6 @@ def test_the_sharp_wave_of_porous_fisher():
     assert np.abs(fine).max() < 3e-3  # at the foot
     assert np.abs(fine).mean() < 5e-5
     assert np.abs(coarse).mean() / np.abs(fine).mean() > 8
-
-
-@settings(deadline=None, max_examples=8)
-@given(
-    D=st.floats(1e-4, 1.0),
-    r=st.floats(0.01, 5.0),
-    K=st.floats(1.0, 2000.0),
-    m=st.floats(1.0, 3.0),
-    porous=st.booleans(),
-)
-@pytest.mark.slow
-def test_checks_pass_for_random_parameters(D, r, K, m, porous):
-    unknowns = (lp.LogNormal(value, value) for value in (D, r))
-    options = {"m": m} if porous else {}
-    function = porous_fisher if porous else fisher_kpp
-    model = function(lp.interval(0.0, 2.0, 10), *unknowns, K=K, **options)
-    check_model(model, u=lambda x: K * (0.5 + 0.3 * np.sin(3 * x[0]))).raise_if_failed()
-
-
-@pytest.mark.parametrize("name", ["fisher_kpp", "porous_fisher"])
-def test_the_equations_build_by_region_and_in_the_plane(name):
-    equation = EQUATIONS[name]
-    halves = {"a": lambda x: x[0] < 1.0, "b": lambda x: x[0] >= 1.0}
-    unknowns = {"D": lp.Piecewise(halves, lp.LogNormal(0.01, 0.01)), "r": lp.Normal(1.0, 0.5)}
-    mesh = lp.rectangle((0.0, 2.0), (0.0, 1.0), (4, 2))
-    options = {"K": 1700.0} | ({"m": 1.5} if name == "porous_fisher" else {})
-    model = equation.build(mesh, unknowns, {"left": 100.0}, **options)
-    assert list(model.parameter_space.labels) == ["D[a]", "D[b]", "r"]
-    check_model(model, u=800.0).raise_if_failed()
 
 
 def test_what_is_refused():

@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.special import exp1
 from skfem import ElementQuad1, MeshQuad
 
@@ -18,7 +16,7 @@ from benchmarks.cases import bench_cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.fem import grid
-from livepde.models import EQUATIONS, groundwater, pumping_test
+from livepde.models import groundwater, pumping_test
 from livepde.stepping import Advance, Alexander2, simulate
 
 ROOT = Path(__file__).parents[1]
@@ -132,41 +130,6 @@ def test_a_constant_field_of_storativity_is_a_number():
     assert np.allclose(*values)
 
 
-@pytest.mark.slow
-@settings(deadline=None, max_examples=10)
-@given(st.floats(-7, -1), st.floats(-7, -1), st.integers(0, 1000))
-def test_radial_flow_passes_the_checks(log_k: float, log_Ss: float, seed: int):
-    mesh = lp.interval(0.1, 1000.0, 12, geometric=True)
-    model = pumping_test(mesh, positive(10**log_k), positive(10**log_Ss), b=5.0)
-    rng = np.random.default_rng(seed)
-    check_model(model, u=rng.normal(), inputs={"Q": rng.normal()}, seed=seed).raise_if_failed()
-
-
-@pytest.mark.long
-@settings(deadline=None, max_examples=10)
-@given(st.floats(-5, 0), st.floats(-5, 0), st.booleans(), st.integers(0, 1000))
-def test_flow_in_the_plane_passes_the_checks(log_T: float, log_S: float, field: bool, seed: int):
-    mesh = lp.rectangle((0.0, 60.0), (0.0, 60.0), (4, 4))
-    element = ElementQuad1()
-
-    def unknown(value: float) -> Any:
-        if field:
-            return lp.Field(mesh, element, prior=lp.LogNormal(value, std=0.5 * value))
-        return positive(value)
-
-    model = groundwater(
-        mesh,
-        unknown(10**log_T),
-        unknown(10**log_S),
-        {"left": 1.0},
-        wells={"Q1": (20.0, 20.0), "Q2": (40.0, 35.0)},
-        radius=25.0,
-        recharge=1e-8,
-    )
-    inputs = {"Q1": 1e-3, "Q2": -2e-3}
-    check_model(model, u=1.0, inputs=inputs, seed=seed).raise_if_failed()
-
-
 def test_what_is_wrong_is_said():
     mesh, T = lp.rectangle((0.0, 60.0), (0.0, 60.0), (4, 4)), positive(1e-2)
     with pytest.raises(ModelError, match=r"'Q' at \(70.0, 0.0\) lies outside"):
@@ -179,11 +142,6 @@ def test_what_is_wrong_is_said():
         pumping_test(lp.interval(0.1, 10.0, 5, geometric=True), T, T, b=0.0)
     with pytest.raises(ModelError, match="needs a mesh of a plane"):
         groundwater(lp.interval(0.0, 1.0, 5), T, T, wells={"Q": (0.5,)})
-
-
-def test_they_are_ready_made():
-    for name in ("groundwater", "pumping_test"):
-        assert EQUATIONS[name].name == name
 
 
 @pytest.mark.study

@@ -81,20 +81,6 @@ def test_mass_term():
         _ = reaction(mesh, ElementLineP1(), M=lambda u, v, x: (x[0] > 0.5) * u * v).X.factor
 
 
-def test_affine_and_constant():
-    mesh, element = line(6), ElementLineP1()
-    assert reaction(mesh, element).affine
-    assert reaction(mesh, element).constant
-    assert not reaction(mesh, element, B=lambda u, v, x: u**3 * v).affine
-    assert not reaction(mesh, element, A=lambda q, u, v, x: q * u**2 * v).affine
-    assert not reaction(mesh, element, B=lambda u, v, x: x.t * u * v).constant
-    wind = reaction(mesh, element, B=lambda u, v, x: x.inputs["w"] * u * v, inputs=["w"])
-    assert not wind.constant
-    u = np.ones(7)
-    moment = Moment(0.0, Inputs({"w": 2.0}))
-    np.testing.assert_allclose(wind.B(u, moment), 2.0 * wind.mass @ u)
-
-
 def test_quadrature_order():
     mesh = line(6)
     assert reaction(mesh, ElementLineHermite()).order == 9

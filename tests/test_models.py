@@ -92,14 +92,6 @@ def test_reaction_diffusion_is_the_papers_example():
     assert np.abs(model.state_block.at_vertices @ u - exact).max() < 1e-5
 
 
-def test_registry_says_what_it_needs():
-    for name, equation in EQUATIONS.items():
-        assert equation.name == name
-        assert equation.summary
-        assert equation.formula
-        assert equation.unknowns
-
-
 def test_geometric_interval():
     mesh = lp.interval(0.1, 10.0, 4, geometric=True)
     x = np.sort(mesh.p[0])

@@ -181,16 +181,6 @@ def test_regions_that_are_none_are_refused_in_a_sentence():
             lp.Averages(regions)
 
 
-def test_averages_are_integrals():
-    mesh = MeshTri().refined(4)
-    model = reaction(mesh, ElementTriP1(), dirichlet={})
-    observed = observe(
-        model, lp.Averages({"left": lambda x: x[0] < 0.5, "all": lambda x: x[0] < 2})
-    )
-    z = observed.G @ model.initial(lambda x: 3 * x[0] + x[1])
-    np.testing.assert_allclose(z, [3 * 0.25 + 0.5, 2.0], atol=1e-12)
-
-
 def test_missing_samples_shrink_G():
     model = reaction(line(), ElementLineP1())
     observed = observe(model, lp.Points({"a": 0.2, "b": 0.5, "c": 0.5}))

@@ -45,7 +45,7 @@ def test_gain_scales_the_adjoint():
     u, r = rng.standard_normal((2, model.X.dim))
     A = model.A(u)
     Q = lp.spaces.HilbertSpace(model.Q.gram / 50.0, "Q", model.Q.fixed)
-    scaled = lp.operators.DualOperator(A.matrix, Q, model.X)
+    scaled = lp.spaces.DualOperator(A.matrix, Q, model.X)
     np.testing.assert_allclose(scaled.adjoint(r), 50.0 * A.adjoint(r), rtol=1e-9)
 
 
@@ -113,7 +113,7 @@ def test_operator_must_fit_its_spaces():
     model = CASES["line P2 / P1"].model()
     A = model.A(np.ones(model.X.dim))
     with pytest.raises(lp.errors.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
-        lp.operators.DualOperator(A.matrix, model.X, model.Q)
+        lp.spaces.DualOperator(A.matrix, model.X, model.Q)
 
 
 def test_norms_and_duals():

@@ -6,24 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.special import erfc, erfcx
 
 import livepde as lp
 from livepde import cases
-from livepde.diagnostics import check_model
-from livepde.models import EQUATIONS, advection_dispersion, mobile_immobile
+from livepde.models import advection_dispersion, mobile_immobile
 from livepde.stepping import Advance, Alexander2, simulate
 
 D, V = 0.15, 2.5
 ONE = lp.Normal(1.0, 1.0)
 CASE = Path(__file__).parents[1] / "cases" / "soil_column.toml"
 SHARE = lp.LogitNormal(0.5, 0.2, bounds=(0.0, 1.0))
-
-
-def positive(value):
-    return lp.LogNormal(value, value)
 
 
 def ogata_banks(x, t, R=1.0):
@@ -104,41 +97,6 @@ def test_nothing_is_lost():
     whole = {"c": phi, "s": 1 - phi}
     stored = model.X.inner(u, model.state_space.interpolate(whole))
     assert stored == pytest.approx(V * 6.0, rel=1e-9)
-
-
-@pytest.mark.long
-@settings(deadline=None, max_examples=10)
-@given(
-    dispersion=st.floats(0.02, 5.0),
-    v=st.floats(-3.0, 3.0),
-    phi=st.floats(0.1, 0.9),
-    omega=st.floats(0.01, 5.0),
-    which=st.sampled_from(["flux", "fixed", "immobile"]),
-)
-def test_checks_pass_for_random_parameters(dispersion, v, phi, omega, which):
-    mesh = lp.interval(0.0, 10.0, 10)
-    spread, speed = positive(dispersion), lp.Normal(v, 1.0)
-    if which == "immobile":
-        share = lp.LogitNormal(phi, 0.1, bounds=(0.0, 1.0))
-        model = mobile_immobile(mesh, spread, speed, share, positive(omega))
-    else:
-        model = advection_dispersion(mesh, spread, speed, R=1.5, decay=0.1, inlet=which)
-    wave = lambda x: 0.5 + 0.3 * np.sin(x[0])  # noqa: E731
-    u = {"c": wave, "s": 0.4} if which == "immobile" else wave
-    check_model(model, u=u).raise_if_failed()
-
-
-def test_the_equations_build():
-    mesh = lp.interval(0.0, 10.0, 5)
-    pair = {"D": positive(0.1), "v": ONE}
-    options = {"R": 1.0, "decay": 0.0, "inlet": "fixed"}
-    column = EQUATIONS["advection_dispersion"].build(mesh, pair, {}, **options)
-    assert column.channels == ("c_in",)
-    four = {**pair, "phi": SHARE, "omega": ONE}
-    both = EQUATIONS["mobile_immobile"].build(mesh, four, {}, inlet="flux")
-    assert list(both.state_space.blocks) == ["c", "s"]
-    with pytest.raises(lp.errors.ModelError, match="fed by the input c_in"):
-        EQUATIONS["mobile_immobile"].build(mesh, four, {"left": 1.0}, inlet="flux")
 
 
 def test_what_is_refused():

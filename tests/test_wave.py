@@ -62,12 +62,6 @@ def test_a_moving_end_needs_its_velocity():
     assert model.state_space.probe(np.array([[0.0]]), of="w") @ u == pytest.approx(np.sin(0.5))
 
 
-def test_shipped_checks():
-    model = wave(STRING, lp.Normal(1.0, 0.5), lp.Normal(0.2, 0.1), FIXED, f=lambda x, t: x[0])
-    lp.diagnostics.check_model(model).raise_if_failed()
-    assert list(model.parameter_space.labels) == ["c2", "d"]
-
-
 @pytest.mark.slow
 def test_speed_and_damping_from_two_points():
     model = wave(STRING, lp.Normal(1.3, 0.3), lp.Normal(0.2, 0.3), FIXED)

@@ -48,7 +48,7 @@ def battery_particle(
     c_max
         Concentration of the full particle in mol/m^3.
     element
-        Element of the state; default of first order.
+        As for `heat`.
 
     Notes
     -----

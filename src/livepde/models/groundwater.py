@@ -80,16 +80,15 @@ def groundwater(
 
     Parameters
     ----------
-    mesh
-        Any mesh of a plane; coordinates in m.
+    mesh, element
+        As for `heat`, in a plane.
     T
         Transmissivity in m^2/s: a number, by region, or a `Field`.
     S
         Storativity, dimensionless: a number or a `Field`. A `Piecewise` would violate the water
         balance where S jumps.
     dirichlet
-        Mapping from boundary to head in m: a number, a function g(x, t), or `Channel`. Other
-        boundaries have no flow.
+        As for `heat`, heads in m. Other boundaries have no flow.
     wells
         Mapping from name to (x, y). The name is the input channel of the rate in m^3/s, positive
         for extraction.
@@ -97,8 +96,6 @@ def groundwater(
         Radius of the wells' sources in m: at least the diameter of the cells around them.
     recharge
         Recharge from above, in m/s.
-    element
-        Element of the state; default of first order.
 
     Raises
     ------
@@ -256,10 +253,8 @@ def advection_dispersion(
         Rate of decay in 1/h.
     inlet
         "flux" or "fixed".
-    element
-        Element of the state; default of first order.
-    unit
-        Unit of c.
+    element, unit
+        As for `heat`.
 
     Raises
     ------

@@ -35,13 +35,10 @@ def reaction_diffusion(
 
     Parameters
     ----------
-    mesh
-        Any mesh of scikit-fem, or `livepde.interval(...)`.
     q
         Reaction coefficient, usually a `Field`.
     dirichlet
-        Mapping from boundary to number, function g(x, t), or `Channel`; default zero on all
-        boundaries.
+        As for `heat`; default zero on all boundaries.
     D
         Diffusivity: a number or a function of x.
     f
@@ -90,19 +87,12 @@ def fisher_kpp(
 
     Parameters
     ----------
-    mesh
-        Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in mm.
+    mesh, dirichlet, element, unit
+        As for `heat`, with coordinates in mm. Boundaries without a value have no flux.
     D, r
         Diffusivity in mm^2/d and growth rate in 1/d: numbers, by region, or fields.
-    dirichlet
-        Mapping from boundary to number, function g(x, t), or `Channel`. The other boundaries have
-        no flux.
     K
         Carrying capacity, the density at which growth ends, in the unit of u.
-    element
-        Element of the state; default of first order.
-    unit
-        Unit of u.
 
     Examples
     --------
@@ -224,10 +214,9 @@ def allen_cahn(
     D, r
         Diffusivity and rate of reaction: unknown or numbers.
     u0
-        Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
+        As for `burgers`.
     dirichlet
-        Mapping from boundary to number, function g(x, t), or `Channel`, {} for no flux everywhere;
-        None: periodic.
+        As for `heat`, {} for no flux everywhere; None: periodic.
     element
         Element of the state; default cubic Hermite on a line, else first order.
     """

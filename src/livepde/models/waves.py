@@ -55,13 +55,12 @@ def advection_diffusion(
 
     Parameters
     ----------
-    mesh
-        `livepde.interval(...)`, or a mesh of more dimensions with the flow along its first; in m.
+    mesh, element, unit
+        As for `heat`, with the flow along the first axis of the mesh.
     kappa
         Diffusivity in m^2/s: a number, a `Piecewise` by layer, or a `Field`.
     dirichlet
-        Mapping from boundary to number, function g(x, t), or `Channel`. Other boundaries have no
-        diffusive flux.
+        As for `heat`. Other boundaries have no diffusive flux.
     v
         Flux in m/s, positive along z; a time-dependent one has an `evolution`. It is a number,
         since the same water passes all layers of a column.
@@ -79,10 +78,6 @@ def advection_diffusion(
     stabilise
         True: add the artificial diffusion of `livepde.fem.upwind`, for flows with a cell Peclet
         number |w| h/(2 kappa) above 1.
-    element
-        Element of the state; default of first order.
-    unit
-        Unit of u.
 
     Raises
     ------
@@ -177,8 +172,8 @@ def wave(
 
     Parameters
     ----------
-    mesh
-        Any mesh of scikit-fem, or `livepde.interval(...)`; coordinates in m.
+    mesh, element
+        As for `heat`; the element is that of both components.
     c2
         Squared speed in m^2/s^2: a number, a `Piecewise`, or a `Field`.
     d
@@ -190,8 +185,6 @@ def wave(
         Mapping from boundary to the value of p where w changes in time: its time derivative.
     f
         Force per mass: a number or f(x, t).
-    element
-        Element of both components; default of first order.
 
     Raises
     ------
@@ -266,14 +259,12 @@ def burgers(
     mesh
         `livepde.interval(...)` or `livepde.fem.line(...)`. A shock is about 4 nu/(a jump) wide and
         must be resolved by several cells of the default element.
-    nu
-        Viscosity: unknown or a number.
-    advection
-        The coefficient a: unknown or a number.
+    nu, advection
+        Viscosity, and the coefficient a: unknown or numbers.
     u0
         Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
     dirichlet
-        Mapping from boundary to number, function g(x, t), or `Channel`; None: periodic.
+        As for `heat`; None: periodic.
     element
         Element of the state; default cubic Hermite.
     """
@@ -317,7 +308,7 @@ def kdv(mesh: Any, advection: Number, dispersion: Number, u0: Unknown | None = N
     advection, dispersion
         The coefficients a and b: unknown or numbers.
     u0
-        Unknown initial state, usually a `Field` on the same mesh; None: given to the `Identifier`.
+        As for `burgers`.
     """
     u = state(mesh, smooth(mesh), None)
     # Integration by parts is applied once to the third derivative, so that second derivatives of u
@@ -369,7 +360,7 @@ def kuramoto_sivashinsky(
     advection, instability, damping
         The coefficients a, b and c: unknown or numbers.
     u0
-        Unknown initial state; None: given to the `Identifier`.
+        As for `burgers`.
     """
     u = state(mesh, smooth(mesh), None)
     return autonomous(
