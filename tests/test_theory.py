@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,9 +31,9 @@ from livepde.reproduce import seed, seed_excited
 from livepde.streams import RelativeNoise, Twin
 
 # The functions of the same names hide these modules in their package.
-constants_module = sys.modules["livepde.diagnostics.theory.constants"]
-parts_module = sys.modules["livepde.diagnostics.theory.state_parts"]
-excitation_module = sys.modules["livepde.diagnostics.theory.excitation"]
+constants_module = importlib.import_module("livepde.diagnostics.theory.constants")
+parts_module = importlib.import_module("livepde.diagnostics.theory.state_parts")
+excitation_module = importlib.import_module("livepde.diagnostics.theory.excitation")
 
 ROOT = Path(__file__).parents[1]
 ZERO = {"boundary": 0.0}
