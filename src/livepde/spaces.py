@@ -15,6 +15,7 @@ from livepde.linalg import (
     Array,
     Factor,
     IntArray,
+    Inverse,
     Leading,
     Pattern,
     analyse,
@@ -159,11 +160,18 @@ class HilbertSpace:
         # A trial solve decides: the condition number of the scaled matrix is not known otherwise. A
         # mass matrix needs few iterations on any mesh, a stiffness matrix more on finer ones.
         probe = np.random.default_rng(0).standard_normal(self.dim) * np.sqrt(diagonal)
+        matrix, remedy = self.tangent_gram, "take a mesh whose cells differ less in size and shape."
+
+        def solve(b: Array, limit: int = 10 * FEW) -> Array:
+            scale = diagonal if b.ndim == 1 else diagonal[:, None]
+            product = matrix.__matmul__
+            return conjugate_gradients(product, lambda r: r / scale, b, ITERATED, limit, remedy)[0]
+
         try:
-            _Diagonal(self.tangent_gram, diagonal, FEW).solve(probe)
+            solve(probe, FEW)
         except LinearAlgebraError:
             return None
-        return _Diagonal(self.tangent_gram, diagonal, 10 * FEW)
+        return Inverse(solve)
 
     def inner(self, x: Array, y: Array) -> float:
         """Return (x, y) = x^T G y for coefficient vectors of shape (n,)."""
@@ -338,27 +346,6 @@ class HilbertSpace:
         return phi, values[order]
 
 
-@dataclass(frozen=True, eq=False)
-class _Diagonal:
-    """Conjugate gradients with a diagonal preconditioner, as a `Factor`."""
-
-    matrix: sp.csr_array
-    diagonal: Array
-    limit: int
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b to a relative residual of 1e-12; raises `LinearAlgebraError`."""
-        scale = self.diagonal if b.ndim == 1 else self.diagonal[:, None]
-        return conjugate_gradients(
-            self.matrix.__matmul__,
-            lambda r: r / scale,
-            b,
-            ITERATED,
-            self.limit,
-            "take a mesh whose cells differ less in size and shape.",
-        )[0]
-
-
 class BorderedSpace(HilbertSpace):
     """A space whose dense Gram matrix is a Schur complement of a sparse matrix.
 
@@ -412,7 +399,8 @@ class BorderedSpace(HilbertSpace):
         E, F, H = self._parts
         if self.dim > LARGEST_EXPLICIT and np.all(H.diagonal() < 0.0):
             try:  # of powers of an operator -H is a mass matrix
-                return E, F, _Negative(self._factorised(sp.csr_array(-H), symmetric=True))
+                negative = self._factorised(sp.csr_array(-H), symmetric=True)
+                return E, F, Inverse(lambda b: -negative.solve(b))
             except SpaceError:
                 pass
         return E, F, self._factorised(H)
@@ -433,7 +421,7 @@ class BorderedSpace(HilbertSpace):
         factor = self._factorised(sp.csr_array(free @ self.border @ free + fixed))
         return Leading(factor, self.dim, self.border.shape[0])
 
-    def _root(self) -> _Root | None:
+    def _root(self) -> Factor | None:
         """Return the inverse of G = -F H^{-1} F with symmetric F, as for H^2; else None.
 
         For large spaces: F admits Cholesky or multigrid, the indefinite K does not.
@@ -443,7 +431,8 @@ class BorderedSpace(HilbertSpace):
             return None
         if abs(F - F.T).max() > 1e-10 * abs(F).max():
             return None
-        return _Root(self._factorised(F, symmetric=True), H)
+        root = self._factorised(F, symmetric=True)
+        return Inverse(lambda b: -root.solve(H @ root.solve(b)))  # G^-1 = -F^-1 H F^-1
 
     def _factorised(self, matrix: sp.csr_array, symmetric: bool = False) -> Factor:
         pattern = Pattern.of(matrix)
@@ -478,30 +467,6 @@ class BorderedSpace(HilbertSpace):
             return self.dual(full)[free]
 
         return LinearOperator((len(free), len(free)), matvec=apply, dtype=float)
-
-
-@dataclass(frozen=True, eq=False)
-class _Negative:
-    """Factor of -K, by the factor of K."""
-
-    factor: Factor
-
-    def solve(self, b: Array) -> Array:
-        """Return the solution for a right-hand side."""
-        return -self.factor.solve(b)
-
-
-@dataclass(frozen=True, eq=False)
-class _Root:
-    """Inverse of -F H^{-1} F, by the factor of F."""
-
-    F: Factor
-    H: sp.csr_array
-
-    def solve(self, b: Array) -> Array:
-        """Return the Riesz representative of b, zero at fixed coefficients."""
-        # G^-1 = -F^-1 H F^-1.
-        return -self.F.solve(self.H @ self.F.solve(b))
 
 
 def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:

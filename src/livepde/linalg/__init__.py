@@ -17,6 +17,7 @@ from livepde.linalg.choice import Choice, analyse, choose
 from livepde.linalg.direct import (
     CholmodSolver,
     Factor,
+    Inverse,
     Leading,
     PardisoSolver,
     Solver,
@@ -36,6 +37,7 @@ __all__ = [
     "CholmodSolver",
     "Factor",
     "IntArray",
+    "Inverse",
     "Leading",
     "Mask",
     "Memo",

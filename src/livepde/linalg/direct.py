@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from threading import Lock
@@ -20,9 +21,16 @@ from livepde.linalg.pattern import Pattern
 class Factor(Protocol):
     """A factorised matrix."""
 
-    def solve(self, b: Array) -> Array:
+    def solve(self, b: Array, /) -> Array:
         """Return x with K x = b; `b` has shape (n,) or, for several right-hand sides, (n, k)."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """A `Factor` by a function, which raises `LinearAlgebraError` where it has no solution."""
+
+    solve: Callable[[Array], Array]
 
 
 class Solver(Protocol):
@@ -60,6 +68,20 @@ class Solver(Protocol):
             The matrix is singular to working precision or holds a value that is not finite.
         """
         ...
+
+
+def check_finite(data: Array) -> None:
+    """Raise `LinearAlgebraError` for data of a matrix that are not finite."""
+    if not np.isfinite(data).all():
+        raise LinearAlgebraError("The matrix holds values that are not finite.")
+
+
+def _refusal(pattern: Pattern, definite: bool) -> LinearAlgebraError:
+    n, more = pattern.shape[0], " or not positive definite" if definite else ""
+    return LinearAlgebraError(
+        f"The {n} by {n} matrix is singular{more}: check the model's forms, or take a smaller "
+        "time step."
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,19 +154,14 @@ class SuperLUSolver:
 
         In symmetric mode it is also raised for an indefinite matrix, unless its factor is accurate.
         """
-        if not np.isfinite(data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        check_finite(data)
         transpose = sp.csc_array(self.pattern.transposed(data))
         options = SYMMETRIC if self.symmetric else {}
-        n, or_so = transpose.shape[0], " or not positive definite" if self.symmetric else ""
-        message = (
-            f"The {n} by {n} matrix is singular{or_so}: check the model's forms, or take a smaller "
-            "time step."
-        )
+        n, refusal = transpose.shape[0], _refusal(self.pattern, self.symmetric)
         try:
             factor = SuperLUFactor(splu(transpose, **options), self.symmetric)
         except RuntimeError as error:
-            raise LinearAlgebraError(message) from error
+            raise refusal from error
         if self.symmetric:
             # Without pivoting, an indefinite matrix can have a factor with large element growth. A
             # test solve detects that; SuperLU itself reports exact zeros only.
@@ -152,7 +169,7 @@ class SuperLUSolver:
             x = factor.solve(b)
             size = np.abs(data).max() * np.abs(x).max() + 1.0
             if not np.abs(self.pattern.matrix(data) @ x - b).max() <= STABLE * size:
-                raise LinearAlgebraError(message)
+                raise refusal
         return factor
 
 
@@ -166,18 +183,6 @@ def positive_definite(matrix: sp.csr_array) -> bool:
     except RuntimeError:
         return False
     return bool(np.array_equal(lu.perm_r, lu.perm_c) and np.all(lu.U.diagonal() > 0))
-
-
-@dataclass(frozen=True, eq=False)
-class CholmodFactor:
-    """Cholesky factor of CHOLMOD."""
-
-    inner: Any
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b."""
-        x: Array = self.inner(b)
-        return x
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,17 +214,12 @@ class CholmodSolver:
         # A symmetric matrix is its transpose; scikit-sparse knows no sparse arrays.
         return sp.csc_matrix((data, self.pattern.indices, self.pattern.indptr), self.pattern.shape)
 
-    def factorise(self, data: Array) -> CholmodFactor:
+    def factorise(self, data: Array) -> Inverse:
         """Factorise; raise `LinearAlgebraError` unless positive definite and finite."""
         from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-        if not np.isfinite(data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
-        n = self.pattern.shape[0]
-        failure = LinearAlgebraError(
-            f"The {n} by {n} matrix is singular or not positive definite: check the model's "
-            "forms, or take a smaller time step."
-        )
+        check_finite(data)
+        failure = _refusal(self.pattern, True)
         try:
             factor = self._order.cholesky(self._matrix(data))
         except CholmodNotPositiveDefiniteError as error:
@@ -227,7 +227,7 @@ class CholmodSolver:
         # L D L^T also exists for indefinite matrices.
         if not (self.blocks or (factor.D() > 0.0).all()):
             raise failure
-        return CholmodFactor(factor)
+        return Inverse(factor)
 
 
 POSITIVE_DEFINITE, GENERAL = 2, 11  # Pardiso's types of a matrix
@@ -304,8 +304,7 @@ class PardisoSolver:
         from pypardiso import PyPardisoSolver
         from pypardiso.pardiso_wrapper import PyPardisoError
 
-        if not np.isfinite(data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        check_finite(data)
         kept, pattern = self._stored
         matrix = pattern.matrix(data[kept])
         kind = POSITIVE_DEFINITE if self.symmetric else GENERAL
@@ -319,11 +318,7 @@ class PardisoSolver:
             handle._call_pardiso(matrix, np.zeros(len(matrix.indptr) - 1))
         except PyPardisoError as error:
             _release([handle])
-            n = pattern.shape[0]
-            raise LinearAlgebraError(
-                f"The {n} by {n} matrix is singular{' or not positive definite' * self.symmetric}: "
-                "check the model's forms, or take a smaller time step."
-            ) from error
+            raise _refusal(pattern, self.symmetric) from error
         factor = PardisoFactor(self, handle, matrix)
         weakref.finalize(factor, self._idle.append, handle).atexit = False
         return factor

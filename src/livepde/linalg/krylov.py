@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError, optional
 from livepde.linalg.arrays import Array
-from livepde.linalg.direct import Factor
+from livepde.linalg.direct import Factor, check_finite
 from livepde.linalg.pattern import Pattern
 
 Map = Callable[[Array], Array]
@@ -172,8 +172,7 @@ class MultigridSolver:
         with optional("solvers", "Multigrid needs PyAMG"):
             from pyamg import ruge_stuben_solver
 
-        if not np.isfinite(data).all():
-            raise LinearAlgebraError("The matrix holds values that are not finite.")
+        check_finite(data)
         matrix = self.pattern.matrix(data)
         if not np.all(matrix.diagonal() > 0):
             raise LinearAlgebraError(
