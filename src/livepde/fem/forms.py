@@ -215,7 +215,11 @@ class Form(FormMatrices):
         for term in self.terms:
             read = set().union(*(self._read(piece, rng) for piece in term.samples()))
             used |= read
-            self._moving.append(bool(read) and self._involves_state(term.integrand))
+            # A term that ignores the nonlinear argument does not move its derivative.
+            moves = self.nonlinear is not None and not ignores(
+                term.integrand, list(self.spaces).index(self.nonlinear)
+            )
+            self._moving.append(bool(read) and moves)
         return frozenset(used)
 
     def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
@@ -305,12 +309,6 @@ class Form(FormMatrices):
     def constant(self) -> bool:
         """True if the form reads neither time nor inputs."""
         return not self.uses
-
-    def _involves_state(self, integrand: Integrand) -> bool:
-        """Return False if an integrand ignores its nonlinear argument."""
-        if self.nonlinear is None:
-            return False
-        return not ignores(integrand, list(self.spaces).index(self.nonlinear))
 
     @property
     def steady(self) -> bool:

@@ -203,12 +203,6 @@ def _values(errors: Sequence[Errors], get: Callable[[Errors], float]) -> Array:
     return np.array([get(item) for item in errors])
 
 
-def _integral(errors: Sequence[Errors], get: Callable[[Errors], float]) -> float:
-    times = _values(errors, lambda item: item.t)
-    values = _values(errors, get)  # by hand: NumPy 1.26 has no `trapezoid`
-    return float((np.diff(times) * (values[1:] + values[:-1]) / 2.0).sum())
-
-
 def _asked(
     data: Data, c: Constants, sigma: float
 ) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
@@ -386,7 +380,9 @@ def bounds(
     elif largest_p == 0.0:
         lines.append(Check.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
     if sigma == 0 and c.L_C > 0:
-        part = _integral(kept, lambda item: item.p.V * residual(item))
+        values = _values(kept, lambda item: item.p.V * residual(item))
+        widths = np.diff(_values(kept, attrgetter("t")))  # by hand: NumPy 1.26 has no `trapezoid`
+        part = float((widths * (values[1:] + values[:-1]) / 2.0).sum())
         lines.append(
             Check.at_most(
                 f"3. integral of ||p||_V ||{label}||_X",
