@@ -334,10 +334,10 @@ class Model(Shown):
                 return [bound(item) for item in part]
             return with_constants(part, values) if callable(part) else part
 
-        fixed = {"coefficients": self._parts["coefficients"]}  # they read no channels
-        fixed["inputs"] = [name for name in self.inputs if name not in values]
-        parts = {name: bound(part) for name, part in self._parts.items()} | fixed
-        return Model(self.state, self.parameter, **parts, **self._about)
+        left = [name for name in self.inputs if name not in values]
+        kept = {"inputs": left, "coefficients": self._parts["coefficients"]}  # read no channels
+        parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
+        return Model(self.state, self.parameter, **parts, **kept, **self._about)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
