@@ -30,9 +30,9 @@ def battery_particle(
 
         -D(c) c_r = I/(F area)  at the surface,      D(c) = D exp(slope (c/c_max - 1/2)).
 
-    I > 0 extracts lithium, as in the negative electrode during discharge. The concentration at the
-    surface is the state at the right end of the mesh; a voltage is a function of it, see
-    `livepde.observation.Calibrated`.
+    The current in A is the input channel "I"; I > 0 extracts lithium, as in the negative electrode
+    during discharge. The concentration at the surface is the state at the right end of the mesh; a
+    voltage is a function of it, see `livepde.observation.Calibrated`.
 
     Parameters
     ----------
@@ -49,10 +49,6 @@ def battery_particle(
         Concentration of the full particle in mol/m^3.
     element
         As for `heat`.
-
-    Notes
-    -----
-    The current in A is the input channel "I".
 
     Raises
     ------

@@ -20,7 +20,8 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
 
     At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
     and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)); Q
-    may also change (step tests, recovery). Both unknowns are positive: use `LogNormal`.
+    may also change (step tests, recovery): in m^3/s, positive for extraction, it is the input
+    channel "Q". Both unknowns are positive: use `LogNormal`.
 
     Parameters
     ----------
@@ -33,10 +34,6 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         Specific storage in 1/m.
     b
         Thickness of the aquifer in m; for 1 m the unknowns are transmissivity and storativity.
-
-    Notes
-    -----
-    The rate in m^3/s, positive for extraction, is the input channel "Q".
 
     Raises
     ------

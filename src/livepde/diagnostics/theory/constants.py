@@ -258,16 +258,8 @@ def constants(
     embeddings, ratios
         See `Constants`; the ratios are Kantorovich's bounds.
 
-    Parameters
-    ----------
-    spaces
-        Norms.
-    q
-        Coefficients of the (physical) parameter at which C is taken, q* in a twin, shape (m,).
-    states
-        Coefficients of states along the run, at least one.
-    gain
-        Gain of the law: it divides the inner product of Q, so C_A grows with its square root.
+    C is taken at the (physical) parameter q, q* in a twin, shape (m,), and at states along the run,
+    at least one. The gain of the law divides the inner product of Q: C_A grows with its root.
 
     Raises
     ------

@@ -247,13 +247,9 @@ def conditions(
 
     Parameters
     ----------
-    errors
-        Of a `TwinTracker`.
     data
         Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
         (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
-    nu, sigma
-        Coefficients of the law.
     c1
         Constant of the stronger bound on mu for the convergence of the state.
     floor
@@ -331,23 +327,9 @@ def bounds(
     3. The integral of ||p||_V^ ||r||_X <= (||e(0)||_Q^2 + ||r(0)||_X^2)/(2 L_C), as in the proofs
        (sigma = 0; prop:welldefine prints twice that).
 
-    Time integrals are trapezoidal sums over the samples.
-
-    Parameters
-    ----------
-    errors
-        Of a `TwinTracker`.
-    nu, sigma
-        Those of the law.
-    q_true
-        ||q*||_Q, gain-scaled, for sigma > 0.
-    until
-        T*, for noisy data.
-
-    Returns
-    -------
-    CheckReport
-        One line for each bound; their hypotheses are checked by `conditions`.
+    Time integrals are trapezoidal sums over the samples. `q_true` is ||q*||_Q, gain-scaled, for
+    sigma > 0; `until` is T*, for noisy data. The report has one line for each bound; their
+    hypotheses are checked by `conditions`.
     """
     # For noisy data the bounds hold before T*; they are made of the errors at the first sample.
     kept = [item for item in errors if item.t < until or item is errors[0]]
@@ -429,8 +411,6 @@ def noise_size(
 
     Parameters
     ----------
-    spaces
-        Norms.
     std
         Standard deviation of each sensor, shape (sensors,); errors are independent.
     reconstruction

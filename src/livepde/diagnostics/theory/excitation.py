@@ -106,8 +106,6 @@ class Excitation:
 
     Parameters
     ----------
-    spaces
-        Model and projections.
     window
         Length gamma_0, in the unit of time. Contributions that cancel within a window do not count,
         so it should be shorter than the periods of the excitation.
@@ -283,16 +281,8 @@ def link(
     C >= sup x/theta for a = 1. For lambda x = ||p||_V^ (with noise + ||d||_V~), which needs the
     truth; for kappa x = mu.
 
-    Parameters
-    ----------
-    times, x, theta
-        Values along the run, shapes (samples,); theta = mu ||r||_VX~^2/||r||_V~ as in the paper.
-    window
-        gamma_0.
-    exponent
-        Given exponent, instead of the fitted one.
-    start
-        T_lambda or T_kappa: earlier times are ignored.
+    Values along the run have the shape (samples,); theta = mu ||r||_VX~^2/||r||_V~ as in the paper.
+    The window is gamma_0; times before `start`, T_lambda or T_kappa, are ignored.
 
     Examples
     --------

@@ -76,12 +76,10 @@ class TheoryReport:
 
     Attributes
     ----------
-    tables
-        Quantities that could be evaluated.
+    tables, notes
+        Quantities that could be evaluated, and those that could not, with reasons.
     reports
         Conditions and error bounds; only with a truth.
-    notes
-        Quantities that could not be evaluated, with reasons.
     constants, spectrum, stopping
         The numbers behind the tables; None if they could not be computed. `stopping` is the
         surrogate of T*, infinity if it was not reached.
