@@ -132,6 +132,7 @@ def papers_constants(spaces):
 
 
 @pytest.mark.long
+@pytest.mark.filterwarnings("ignore:the diffusion of the model is negative")
 @pytest.mark.parametrize("D", [1.0, -1.0, 0.1])
 @pytest.mark.parametrize("nodes", HERMITE_NODES)
 def test_the_papers_lipschitz_constant_is_one_on_every_mesh(nodes, D):
