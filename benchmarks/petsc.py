@@ -25,7 +25,7 @@ from benchmarks import ROOT
 from livepde.diagnostics.check_report import Check, Table
 from livepde.errors import ConfigurationError
 from livepde.petsc import DolfinxModel, ImplicitStep, PetscFilter, PetscObserver, number_modes
-from livepde.petsc.vectors import gathered
+from livepde.petsc.petsc_model import gathered
 from livepde.runs import Outcome
 
 STEP = 0.05

@@ -9,7 +9,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 
 from livepde import petsc
-from livepde.petsc.vectors import gathered
+from livepde.petsc.petsc_model import gathered
 
 STEP, NOISE, TRUTH = 0.05, 0.002, [0.4, 1.5]
 

@@ -28,7 +28,7 @@ from experiments.strict import QUICK, apart_table
 from experiments.strict import SETTINGS as UNFINISHED
 from livepde import paper, plots
 from livepde.diagnostics.check_report import Check, Table
-from livepde.diagnostics.constants import Spaces, constants
+from livepde.diagnostics.theory.constants import Spaces, constants
 from livepde.fem import START, Field, Moment, Normal, dot, grad, hermite, line, linear
 from livepde.identifier import Identifier
 from livepde.laws import (

@@ -19,7 +19,7 @@ from livepde import petsc
 from livepde.errors import LivepdeError
 from livepde.laws.damping import ConstantDamping, ResidualDamping
 from livepde.laws.equation_tests import ExcitationGate
-from livepde.petsc.vectors import gathered
+from livepde.petsc.petsc_model import gathered
 
 COMM = MPI.COMM_WORLD
 

@@ -8,15 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 from factories import observe
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 import livepde as lp
 from benchmarks.control.battery import graphite
-from livepde.diagnostics import check_model
 from livepde.errors import ModelError
-from livepde.models import EQUATIONS, battery_particle
+from livepde.models import battery_particle
 from livepde.models.battery import FARADAY
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams import AbsoluteNoise, Twin
@@ -95,21 +92,6 @@ def test_diffusivity_follows_the_filling():
     _, without = discharged(particle(30, slope=lp.Normal(0.0, 1.0)), TIMES)
     _, constant = discharged(particle(30), TIMES)
     assert np.allclose(without, constant)
-
-
-@pytest.mark.slow
-@settings(max_examples=10, deadline=None)
-@given(
-    value=st.floats(1e-15, 1e-12),
-    slope=st.none() | st.floats(-3.0, 3.0),
-    filling=st.floats(0.1, 0.9),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_forms_pass_the_shipped_checks(value, slope, filling, seed):
-    model = particle(15, slope=None if slope is None else lp.Normal(slope, 0.5))
-    q = {"D": value} | ({} if slope is None else {"slope": slope})
-    u = filling * FULL
-    check_model(model, q=q, u=u, spread=0.1 * FULL, inputs={"I": 1.0}, seed=seed).raise_if_failed()
 
 
 def pulses(t: float) -> dict[str, float]:
@@ -191,12 +173,3 @@ def test_options_that_make_no_sense_are_refused(change, message):
 def test_a_particle_begins_at_its_centre():
     with pytest.raises(ModelError, match="centre"):
         battery_particle(lp.interval(0.1 * R, R, 10), lp.Normal(D, D), area=AREA, c_max=FULL)
-
-
-@pytest.mark.parametrize("names", [("D",), ("D", "slope")])
-def test_the_equation_builds_it(names):
-    unknowns = {name: lp.Normal(1e-14, 1e-14) for name in names}
-    equation = EQUATIONS["battery_particle"]
-    built = equation.build(lp.interval(0.0, R, 10), unknowns, {}, area=AREA, c_max=FULL)
-    assert tuple(built.parameter_space.unknowns) == names
-    assert built.channels == tuple(equation.inputs)

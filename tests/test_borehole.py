@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from factories import observe
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.special import exp1
 
 import livepde as lp
@@ -57,22 +55,6 @@ def final(process: lp.Model, times: Any, q: Any = None) -> Any:
     x = process.state.mesh.p[0]
     order = np.argsort(x)
     return x[order], (process.state_block.at_vertices @ u)[order]
-
-
-@pytest.mark.slow
-@settings(max_examples=10, deadline=None)
-@given(
-    k=st.floats(0.5, 6.0),
-    rho_c=st.floats(1e6, 5e6),
-    R_b=st.floats(0.05, 0.4),
-    share=st.floats(0.1, 0.7),
-    seed=st.integers(0, 2**32 - 1),
-)
-def test_forms_pass_the_shipped_checks(k, rho_c, R_b, share, seed):
-    q = {"k": k, "rho_c": rho_c, "R_b": R_b, "share": share}
-    check_model(
-        model(30, C_c=1900.0), q=q, u=30.0, spread=5.0, inputs={"Q": POWER}, seed=seed
-    ).raise_if_failed()
 
 
 def test_at_rest_the_fluid_is_warmer_by_the_resistances():
@@ -172,14 +154,6 @@ def test_capacity_is_one_number():
     unknowns = {name: unknown(name) for name in TRUTH} | {"rho_c": layers}
     with pytest.raises(ModelError, match="Scalar"):
         grouted_borehole(lp.interval(0.02, 6.0, 40, geometric=True), **unknowns, **KNOWN)
-
-
-def test_the_equation_builds_it():
-    equation = EQUATIONS["grouted_borehole"]
-    mesh = lp.interval(0.02, 6.0, 40, geometric=True)
-    built = equation.build(mesh, {name: unknown(name) for name in TRUTH}, {}, C_c=0.0, **KNOWN)
-    assert tuple(built.parameter_space.unknowns) == tuple(equation.unknowns)
-    assert built.channels == tuple(equation.inputs)
 
 
 def plane(far: float = 12.0, cells: int = 60, **more: float) -> lp.Model:

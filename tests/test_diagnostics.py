@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from factories import CASES, excited, line, observe, reaction
+from factories import excited, line, observe, reaction
 from skfem import ElementLineHermite, ElementLineP1
 
 import livepde as lp
@@ -24,12 +24,6 @@ from livepde.stepping import ForwardStage
 
 def failed(report):
     return [line.name for line in report.failed]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
-def test_good_models_pass(name):
-    check_model(CASES[name].model(f=1.0), u=1.0).raise_if_failed()
 
 
 def test_a_wrong_derivative_is_found():
@@ -93,21 +87,6 @@ def test_an_unsymmetric_mass_is_refused():
     )
     with pytest.raises(lp.errors.SpaceError, match="not symmetric"):
         check_model(model, u=1.0)
-
-
-@pytest.mark.parametrize(
-    "observation",
-    [
-        lp.Full(),
-        lp.Subdomain(lambda x: x[0] > 0.4),
-        lp.Points([0.2, 0.2, 0.7]),
-        lp.Averages({"a": lambda x: x[0] < 0.5}),
-    ],
-)
-def test_good_observations_pass(observation):
-    model = excited(8)
-    check_observation(observation, model).raise_if_failed()
-    check_observation(observe(model, observation)).raise_if_failed()
 
 
 def test_a_projection_that_is_none_is_found():

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import livepde as lp
 from livepde.fem import line, linear
-from livepde.fem.evolution import CONSTANT
+from livepde.fem.priors import CONSTANT
 from livepde.models import EQUATIONS, Option
 
 pytestmark = pytest.mark.slow

@@ -574,7 +574,7 @@ def test_a_ready_made_equation_shows_its_formula():
     heated = with_conditions(lossy, sources={"heater": lp.models.Source(5.0)})
     assert "- loss (u - ambient), with added conditions and sources\n" in repr(heated)
     for equation in EQUATIONS.values():
-        assert equation.written(equation.unknowns) == equation.formula
+        assert equation.about(equation.unknowns)["formula"] == equation.formula
 
 
 def conduction(q, u, v, x):

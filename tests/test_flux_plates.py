@@ -78,17 +78,6 @@ def test_a_field_of_conductivity_counts_where_the_plate_is() -> None:
     assert seen.predict(u, 1.0 + q, NOW)[0] == pytest.approx(3.0)
 
 
-def test_derivatives_are_those_of_the_reading() -> None:
-    model = wall()
-    seen = bound(model, FluxPlates({"l": "left", "m": 0.4}))
-    rng = np.random.default_rng(3)
-    u, q = rng.standard_normal(model.X.dim), np.array([1.7])
-    du, dq, h = rng.standard_normal(model.X.dim), np.array([0.4]), 1e-4
-    H_u, H_q = seen.jacobian(u, q, NOW)
-    ahead, back = (seen.predict(u + s * du, q + s * dq, NOW) for s in (h, -h))
-    np.testing.assert_allclose((ahead - back) / (2 * h), H_u @ du + H_q @ dq, rtol=1e-7)
-
-
 def test_each_sensor_keeps_its_unit() -> None:
     model = wall()
     plates = FluxPlates({"q": "left"}, noise=0.3, unit="W/m^2")

@@ -20,7 +20,7 @@ from livepde.linalg import (
     SuperLUSolver,
 )
 from livepde.stepping import ForwardStage, Kept
-from livepde.stepping import state as state_module
+from livepde.stepping import forward as forward_module
 
 H = 0.1
 
@@ -176,7 +176,7 @@ def test_a_resumed_run_has_the_same_numbers_although_its_factor_is_made_again(
     if module:
         pytest.importorskip(module)
     monkeypatch.setattr(
-        state_module, "choose", lambda pattern, symmetric=False: Choice(make(pattern), "a test")
+        forward_module, "choose", lambda pattern, symmetric=False: Choice(make(pattern), "a test")
     )
     points = lp.Points([(x, y) for x in (0.2, 0.5, 0.8) for y in (0.3, 0.7)])
     exact, times = bump(model, 1.0), [H * k for k in range(13)]
@@ -231,7 +231,7 @@ def test_only_symmetric_matrices_are_factorised_as_such(engine, share, claimed, 
     def chosen(pattern, symmetric=False):
         return Choice(make(pattern) if symmetric else SuperLUSolver(pattern), "a test")
 
-    monkeypatch.setattr(state_module, "choose", chosen)
+    monkeypatch.setattr(forward_module, "choose", chosen)
     moving, h, q = transport(share), 1e15, np.array([20.0])
     forward = ForwardStage(moving)
     assert forward.symmetric is claimed

@@ -21,7 +21,8 @@ from skfem import (
 )
 
 import livepde as lp
-from livepde.diagnostics import Spaces, stopping
+from livepde.diagnostics import Spaces, noise_size, reconstruction_matrix
+from livepde.diagnostics.theory import error_bounds
 from livepde.fem import Form, FunctionSpace, Moment, forms, measure
 from livepde.laws import information
 from livepde.observation import operator, reconstruction
@@ -315,12 +316,12 @@ def test_the_noise_of_many_sensors_is_sampled(monkeypatch):
     observed = observe(model, lp.Full())
     spaces = Spaces(model, observed)
     std = 0.01 * (1.0 + np.arange(observed.size) / observed.size)
-    exact = stopping.noise_size(spaces, std)
-    monkeypatch.setattr(stopping, "MOST_SENSORS", 100)
-    found = stopping.noise_size(spaces, std)
+    exact = noise_size(spaces, std)
+    monkeypatch.setattr(error_bounds, "MOST_SENSORS", 100)
+    found = noise_size(spaces, std)
     for name in ("X", "VX", "V"):
         assert getattr(found, name) == pytest.approx(getattr(exact, name), rel=0.03)
     assert found.X != exact.X
-    monkeypatch.setattr(stopping, "MOST_COLUMNS", 100)
+    monkeypatch.setattr(error_bounds, "MOST_COLUMNS", 100)
     with pytest.raises(lp.errors.ConfigurationError, match="529 sensors, up to 100"):
-        stopping.reconstruction_matrix(observed)
+        reconstruction_matrix(observed)

@@ -1,12 +1,33 @@
-"""Meshes: regions, the size of cells, and files with named groups."""
+"""Mesh files, periodic boundaries, and boundary values of vectors."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import pytest
-from skfem import ElementLineP1, ElementTriP1, MeshQuad, MeshTri
+from factories import observe
+from skfem import (
+    ElementLineHermite,
+    ElementLineP0,
+    ElementLineP1,
+    ElementLineP2,
+    ElementQuad1,
+    ElementQuad2,
+    ElementQuadBFS,
+    ElementTriMorley,
+    ElementTriP1,
+    ElementTriP2,
+    ElementTriRT1,
+    ElementVector,
+    MeshQuad,
+    MeshTri,
+)
 
 import livepde as lp
 from livepde.errors import SpaceError
-from livepde.fem import box, grid, linear
+from livepde.fem import START, FunctionSpace, Inputs, Moment, box, grid, linear
+from livepde.stepping import Advance, Alexander2, ForwardStage, simulate
 
 meshio = pytest.importorskip("meshio")
 
@@ -232,3 +253,277 @@ def test_a_grid_has_the_nodes_it_is_given():
     }
     with pytest.raises(SpaceError, match="two increasing nodes"):
         grid([0.0, 1.0, 1.0], [0.0, 1.0])
+
+
+RING = (("left", "right"),)
+TORUS = (("left", "right"), ("bottom", "top"))
+LINES = [ElementLineP1, ElementLineP2, ElementLineHermite]
+
+
+def ring(element, cells=24, **options):
+    return lp.Field(lp.interval(0.0, 1.0, cells), element, periodic=RING, **options)
+
+
+def square(element, kind="quad"):
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 2.0), (6, 5))
+    if kind == "tri":
+        mesh = MeshTri.init_tensor(np.linspace(0, 1, 7), np.linspace(0, 2, 6))
+        mesh = mesh.with_boundaries(
+            {
+                "left": lambda x: np.isclose(x[0], 0),
+                "right": lambda x: np.isclose(x[0], 1),
+                "bottom": lambda x: np.isclose(x[1], 0),
+                "top": lambda x: np.isclose(x[1], 2),
+            }
+        )
+    return lp.Field(mesh, element, periodic=TORUS)
+
+
+def advection(field, speed=1.0):
+    return lp.Model(
+        field, {"b": lp.Normal(speed, 1.0)}, A=lambda q, u, v, x: q.b * lp.grad(u)[0] * v
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("field", "size"),
+    [
+        (ring(ElementLineP1()), 24),
+        (ring(ElementLineP2()), 48),
+        (ring(ElementLineHermite()), 48),
+        (square(ElementQuad1()), 30),
+        (square(ElementQuad2()), 120),
+        (square(ElementQuadBFS()), 120),
+        (square(ElementTriP1(), "tri"), 30),
+        (square(ElementTriP2(), "tri"), 120),
+    ],
+    ids=lambda value: str(value) if isinstance(value, int) else "",
+)
+def test_both_sides_are_one(field, size):
+    space = FunctionSpace.of(field, "u")
+    block, _ = space.component()
+    assert block.size == size == block.doflocs.shape[1]
+    assert not len(block.fixed)
+    wave = (
+        (lambda x: np.sin(2 * np.pi * x[0]))
+        if len(field.mesh.p) == 1
+        else (lambda x: np.sin(2 * np.pi * x[0]) * np.cos(np.pi * x[1]))
+    )
+    u = space.interpolate(wave)
+    ends = np.array([[0.0, 1.0]]) if len(field.mesh.p) == 1 else np.array([[0.0, 1.0], [0.7, 0.7]])
+    left, right = space.probe(ends) @ u
+    assert left == pytest.approx(right, abs=1e-11)  # BFS inverts a matrix
+    assert np.abs(block.at_vertices @ u - wave(field.mesh.p)).max() < 0.3
+    assert np.allclose(block.at_vertices @ space.interpolate(3.0), 3.0)
+
+
+@pytest.mark.parametrize("element", LINES)
+def test_translation_by_a_cell_commutes_with_the_operators(element):
+    """A shifted function has the shifted image: the seam is like every other vertex."""
+    model = lp.Model(
+        ring(element()),
+        lp.Normal(1.0),
+        A=lambda q, u, v, x: q * lp.dot(lp.grad(u), lp.grad(v)),
+        B=lambda u, v, x: lp.grad(u)[0] * v,
+    )
+    f = lambda x: np.exp(np.sin(2 * np.pi * x[0]) + np.cos(4 * np.pi * x[0]))  # noqa: E731
+    x, h = np.linspace(0.0, 0.9, 37), 1 / 24
+    u, shifted = model.initial(f), model.initial(lambda x: f(x - h))
+    one = np.ones(1)
+    for image in (
+        lambda u: model.X.riesz(model.B(u)),
+        lambda u: model.X.riesz(model.A(u).matrix @ one),
+    ):
+        a = model.state_space.probe(x[None] + h) @ image(shifted)
+        b = model.state_space.probe(x[None]) @ image(u)
+        assert np.abs(a - b).max() < 1e-8 * np.abs(b).max()
+
+
+@pytest.mark.parametrize("element", LINES)
+def test_a_wave_once_around(element):
+    model = advection(ring(element(), 40))
+    f = lambda x: 1.0 + np.sin(2 * np.pi * x[0])  # noqa: E731
+    control = Advance(Alexander2(), 0.01)
+    mass = model.mass @ model.initial(1.0)
+    run = [u for _, u in simulate(model, np.ones(1), f, [0.0, 0.25, 0.5, 1.0], control)]
+    assert np.allclose([mass @ u for u in run], 1.0, atol=1e-11)
+    assert model.X.norm(run[-1] - run[0]) < 0.01
+    assert model.X.norm(run[2] - model.initial(lambda x: f(x + 0.5))) < 0.01
+
+
+@pytest.mark.slow
+def test_the_speed_of_a_wave_is_found():
+    model = advection(ring(ElementLineHermite()), speed=0.7)
+    sensors = lp.Points([0.2, 0.5], noise=0.01)
+    truth = [
+        (t, [np.sin(2 * np.pi * (x - t)) for x in (0.2, 0.5)]) for t in np.arange(0.0, 1.51, 0.02)
+    ]
+    law = lp.SensitivityLaw()
+    start = lambda x: np.sin(2 * np.pi * x[0])  # noqa: E731
+    ident = lp.Identifier(model, sensors, law, u0=start, scheme=Alexander2())
+    for t, z in truth:
+        last = ident.step(t, z)
+    assert last.parameters["b"][0] == pytest.approx(1.0, abs=5e-3)
+
+
+def test_a_periodic_parameter_and_the_observation_of_all():
+    field = ring(ElementLineP1(), inner="H1", prior=lp.Normal(1.0))
+    state = lp.Field(field.mesh, ElementLineP2(), periodic=RING)
+    model = lp.Model(state, field, A=lambda q, u, v, x: q * u * v)
+    assert model.Q.dim == 24
+    lp.diagnostics.check_model(model).raise_if_failed()
+    lp.diagnostics.check_observation(lp.Full(noise=0.1), model).raise_if_failed()
+    lp.diagnostics.check_observation(
+        lp.Averages({"a": lambda x: x[0] < 0.1}, noise=0.1), model
+    ).raise_if_failed()
+
+
+def test_sides_that_do_not_match_are_refused():
+    with pytest.raises(lp.errors.SpaceError, match="no boundary 'top'"):
+        lp.Field(lp.interval(0, 1, 4), ElementLineP1(), periodic=(("left", "top"),))
+    with pytest.raises(lp.errors.SpaceError, match="'left' is periodic and has a Dirichlet value"):
+        ring(ElementLineP1(), dirichlet={"left": 0.0})
+    with pytest.raises(lp.errors.SpaceError, match="ElementLineP0 has no coefficients there"):
+        FunctionSpace.of(ring(ElementLineP0()), "u").dim  # noqa: B018
+    with pytest.raises(lp.errors.SpaceError, match="normal derivatives"):
+        FunctionSpace.of(square(ElementTriMorley(), "tri"), "u").dim  # noqa: B018
+    uneven = lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
+    p = uneven.p.copy()
+    p[1, (p[0] == 1.0) & (p[1] == 0.5)] = 0.55
+    uneven = type(uneven)(p, uneven.t).with_boundaries(uneven.boundaries)
+    with pytest.raises(lp.errors.SpaceError, match=r"do not match.*0\.0[345]"):
+        FunctionSpace.of(lp.Field(uneven, ElementQuad1(), periodic=RING), "u").dim  # noqa: B018
+    pair, mesh = (("bottom", "left"),), lp.rectangle((0.0, 1.0), (0.0, 2.0), (6, 5))
+    with pytest.raises(lp.errors.SpaceError, match="have 7 and 6 coefficients"):
+        FunctionSpace.of(lp.Field(mesh, ElementQuad1(), periodic=pair), "u").dim  # noqa: B018
+
+
+MESH = lp.rectangle((0.0, 1.0), (0.0, 1.0), (4, 4))
+ELEMENTS = {"Q1": ElementVector(ElementQuad1()), "Q2": ElementVector(ElementQuad2())}
+
+
+def stress(q: Any, u: Any, v: Any, x: Any) -> Any:
+    """Linear elasticity with an unknown shear modulus, lambda = 1."""
+    grad, test = lp.grad(u), lp.grad(v)
+    e = 0.5 * (grad + np.swapaxes(grad, 0, 1))
+    divergence = grad[0, 0] + grad[1, 1]
+    return 2.0 * q.mu * lp.fem.ddot(e, test) + divergence * (test[0, 0] + test[1, 1])
+
+
+def elastic(dirichlet: Any, element: Any = ELEMENTS["Q1"]) -> lp.Model:
+    return lp.Model(
+        lp.Field(MESH, element, dirichlet=dirichlet), {"mu": lp.Normal(1.0, 0.5)}, stress
+    )
+
+
+def imposed(dirichlet: Any, moment: Any = START, element: Any = ELEMENTS["Q1"]) -> Any:
+    """Return values at the vertices, (2, vertices), of a field that is NaN where it is free."""
+    model = elastic(dirichlet, element)
+    block = model.state_block
+    u = model.impose(np.full(model.X.dim, np.nan), moment)
+    return u[block.dofs.nodal_dofs]
+
+
+LEFT, RIGHT = (np.flatnonzero(MESH.p[0] == x) for x in (0.0, 1.0))
+Y = MESH.p[1]
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (2.0, (2.0 + 0 * Y, 2.0 + 0 * Y)),
+        ((1.0, -2.0), (1.0 + 0 * Y, -2.0 + 0 * Y)),
+        (np.array([1.0, -2.0]), (1.0 + 0 * Y, -2.0 + 0 * Y)),
+        (lambda x, t: t * x[1], (3.0 * Y, 3.0 * Y)),
+        (lambda x, t: (t * x[1], 5.0), (3.0 * Y, 5.0 + 0 * Y)),
+        (lambda x, t: np.array([t * x[1], 1.0 + x[1]]), (3.0 * Y, 1.0 + Y)),
+        ((lambda x, t: t * x[1], 4.0), (3.0 * Y, 4.0 + 0 * Y)),
+        (lp.Channel("push"), (7.0 + 0 * Y, 7.0 + 0 * Y)),
+        ((0.0, lp.Channel("push")), (0.0 * Y, 7.0 + 0 * Y)),
+        ((None, 4.0), (np.nan * Y, 4.0 + 0 * Y)),
+    ],
+)
+def test_each_component_gets_its_value(element: str, value: Any, expected: Any):
+    found = imposed({"left": value}, Moment(3.0, Inputs({"push": 7.0})), ELEMENTS[element])
+    for row, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(row[LEFT], wanted[LEFT])
+        assert np.isnan(np.delete(row, LEFT)).all()
+
+
+def test_channels_of_components_are_inputs_of_the_model():
+    model = elastic({"left": (lp.Channel("a"), 0.0), "right": (None, lp.Channel("b"))})
+    assert model.channels == ("a", "b")
+    assert not model.homogeneous
+    assert elastic({"left": (0.0, None)}).homogeneous
+    lp.diagnostics.check_model(model, u=0.1, inputs={"a": 0.1, "b": 0.0}).raise_if_failed()
+
+
+@pytest.mark.parametrize("element", ELEMENTS)
+def test_a_linear_displacement_is_exact(element: str):
+    """It is in equilibrium and in the space: what the boundary says holds inside, too."""
+
+    def exact(x: Any, t: float) -> Any:
+        return 0.3 * x[0] - 0.1 * x[1], 0.2 * x[0] + 0.4 * x[1]
+
+    model = elastic({"boundary": exact}, ELEMENTS[element])
+    forward, u = ForwardStage(model), model.initial(0.0)
+    for k in range(40):
+        u = forward.solve(u, np.array([1.0]), 1.0, Moment(k + 1.0))
+    points = np.array([[0.2, 0.55, 0.9], [0.7, 0.35, 0.1]])
+    values = (model.state_block.probe(points) @ u).reshape(2, -1)
+    np.testing.assert_allclose(values, exact(points, 0.0), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_modulus_is_identified_from_a_boundary_that_moves():
+    """Rollers on the left and below, a channel that pulls the right side, sensors on the top."""
+    pulled = {"left": (0.0, None), "bottom": (None, 0.0), "right": (lp.Channel("pull"), None)}
+    model, true = elastic(pulled), 1.6
+    at, axes = np.repeat([[0.3, 0.9], [0.7, 0.9]], 2, axis=0), [0, 1, 0, 1]  # both components
+    points = lp.Points(at, noise=1e-4, component=axes)
+    observed = observe(model, points)
+    forward, u, rng = ForwardStage(model), model.initial(0.0, Moment(0.0, Inputs({"pull": 0.0}))), 0
+    law, scheme = lp.SensitivityLaw(), lp.ImplicitEuler()  # one stage of which makes the truth
+    identifier = lp.Identifier(model, points, law, u0=0.0, scheme=scheme)
+    noise = np.random.default_rng(rng)
+    estimate = None
+    for k in range(60):
+        t = 0.1 * (k + 1)
+        pull = 0.1 * np.sin(t)
+        inputs = Inputs({"pull": pull})
+        u = forward.solve(u, np.array([true]), 0.1, Moment(t, inputs))
+        z = observed.G @ u
+        z = z + 1e-4 * noise.standard_normal(len(z))
+        estimate = identifier.step(t, z, {"pull": pull})
+    assert estimate is not None
+    mu, std = estimate.parameters["mu"]
+    assert abs(mu - true) < 4.0 * std < 0.2
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ((1.0, 2.0, 3.0), "'left' has 3 values; expected 2, one for each component"),
+        (lambda x, t: (1.0, 2.0, 3.0), r"'left': g\(x, t\) has 3 components; expected 2"),
+    ],
+)
+def test_a_wrong_number_of_components_is_one_sentence(value: Any, message: str):
+    with pytest.raises(lp.errors.SpaceError, match=message):
+        imposed({"left": value})
+
+
+def test_fields_without_components_say_so():
+    scalar = lp.Field(MESH, ElementQuad1(), dirichlet={"left": (1.0, 2.0)})
+    with pytest.raises(lp.errors.SpaceError, match=r"a value for each component, .* not a vector"):
+        lp.Model(scalar, lp.Normal(), lambda q, u, v, x: q * u * v)
+    mesh = MeshTri().refined(1)
+    normal = lp.Field(mesh, ElementTriRT1(), dirichlet={"boundary": lambda x, t: (1.0, x[1])})
+    with pytest.raises(lp.errors.SpaceError, match="the field has no components: give a number"):
+        lp.Model(normal, lp.Normal(), lambda q, u, v, x: q * lp.dot(u, v))
+
+
+def test_an_unknown_component_is_refused():
+    with pytest.raises(lp.errors.SpaceError, match="the value on 'left' is unknown"):
+        elastic({"left": (0.0, lp.Normal())})

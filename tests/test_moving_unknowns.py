@@ -19,7 +19,7 @@ from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview
 from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
-from livepde.fem.evolution import CONSTANT
+from livepde.fem.priors import CONSTANT
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
 from livepde.streams import AbsoluteNoise, Twin

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from skfem import ElementLineHermite
 
 import livepde as lp
 from benchmarks.cases import jobs_of, run_job
 from livepde.cases import load
-from livepde.diagnostics import check_model
-from livepde.models import EQUATIONS, allen_cahn, burgers, kdv, kuramoto_sivashinsky
+from livepde.models import allen_cahn, burgers, kdv, kuramoto_sivashinsky
 from livepde.stepping import Advance, Alexander2, simulate
 
 ONE = lp.Normal(1.0, 1.0)
@@ -116,23 +113,6 @@ def unknowns(mesh, *values):
     return *(lp.LogNormal(v, v) for v in values), start
 
 
-@pytest.mark.long
-@settings(deadline=None, max_examples=6)
-@given(st.floats(1e-3, 2.0), st.floats(0.1, 6.0), st.floats(0.1, 3.0))
-def test_checks_pass_for_random_parameters(small, one, other):
-    mesh = lp.interval(0.0, 3.0, 8)
-    wave = lambda x: np.sin(2 * np.pi * x[0] / 3.0)  # noqa: E731
-    small, one, other, start = unknowns(mesh, small, one, other)
-    for model in (
-        burgers(mesh, small, one, start),
-        burgers(mesh, small, 1.0, start, {"left": 0.0, "right": 0.5}),
-        kdv(mesh, one, small, start),
-        kuramoto_sivashinsky(mesh, one, other, small, start),
-        allen_cahn(mesh, small, one, start),
-    ):
-        check_model(model, u=wave).raise_if_failed()
-
-
 def test_an_unknown_start_takes_over_the_sides():
     mesh = lp.interval(0.0, 1.0, 6)
     nu, start = unknowns(mesh, 0.1)
@@ -142,22 +122,6 @@ def test_an_unknown_start_takes_over_the_sides():
     fixed = held.parameter_space.fixed - 1  # behind nu
     assert held.parameter_space.fields["u0"].field.dirichlet == {"left": 0.0}
     assert fixed.tolist() == [0]
-
-
-def test_the_equations_build_and_a_ring_has_no_ends():
-    mesh = lp.interval(0.0, 1.0, 6)
-    for name in ("burgers", "kdv", "kuramoto_sivashinsky", "allen_cahn"):
-        equation = EQUATIONS[name]
-        start = lp.Field(mesh, equation.element(mesh))
-        given = {key: start if key == "u0" else ONE for key in equation.unknowns}
-        model = equation.build(mesh, given, {})
-        assert model.state.periodic
-        assert set(model.parameter_space.unknowns) == set(equation.unknowns)
-    known = EQUATIONS["burgers"].build(mesh, {"nu": ONE}, {"left": 0.0, "right": 0.0})
-    assert known.form_initial is None
-    assert list(known.parameter_space.unknowns) == ["nu"]
-    with pytest.raises(lp.errors.ModelError, match=r"kdv is periodic: leave out .*'left'"):
-        EQUATIONS["kdv"].build(mesh, given, {"left": 0.0})
 
 
 def reader():

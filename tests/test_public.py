@@ -40,7 +40,6 @@ DOCUMENTED = (
     ".errors",
     ".fleet",
     ".forecast",
-    ".operators",
 )
 
 

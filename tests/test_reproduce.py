@@ -9,7 +9,7 @@ import pytest
 
 import livepde as lp
 from livepde import progress
-from livepde.reproduce import EXPERIMENTS, Experiment, seed, seed_excited
+from livepde.reproduce import EXPERIMENTS, seed, seed_excited
 from livepde.reproduce.experiment import track
 from livepde.runs import Outcome
 from livepde.streams import RelativeNoise, Twin
@@ -35,14 +35,6 @@ def excited() -> Outcome:
 def values(outcome: Outcome) -> dict[str, float]:
     assert len({check.name for check in outcome.checks}) == len(outcome.checks)
     return {check.name: check.value for check in outcome.checks}
-
-
-def test_registry_names_its_experiments() -> None:
-    for name, experiment in EXPERIMENTS.items():
-        assert isinstance(experiment, Experiment)
-        assert experiment.name == name
-        assert experiment.summary
-        assert experiment.truths[0] == "discrete"
 
 
 def test_seed_shows_the_table_of_the_design(discrete: Outcome) -> None:

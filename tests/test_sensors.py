@@ -445,13 +445,6 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
     assert np.isfinite(hidden.step(0.2, {"P": 0.0, "T": 1.0, "x": 0.2}).withheld_error).all()
 
 
-def test_the_component_must_exist():
-    with pytest.raises(
-        lp.errors.SpaceError, match=r"of='c': the components of the state are \['u'\]"
-    ):
-        observe(rod(), lp.Points([0.3], of="c"))
-
-
 @pytest.mark.parametrize(
     "build",
     [

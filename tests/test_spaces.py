@@ -1,16 +1,31 @@
-"""Hilbert spaces: Gram matrix, Riesz map, modes, operators with adjoints."""
+"""Hilbert spaces: Gram matrix, Riesz map, modes, operators with adjoints; H^s."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.linalg as sl
 import scipy.sparse as sp
-from factories import CASES, laplace, line, product, reaction
-from skfem import ElementLineHermite, ElementLineP1, ElementTriP1, MeshTri
+from factories import (
+    CASES,
+    excited,
+    excited_q,
+    excited_u,
+    filter_alone,
+    laplace,
+    line,
+    product,
+    reaction,
+)
+from skfem import ElementLineHermite, ElementLineP1, ElementQuadBFS, ElementTriP1, MeshTri
 
 import livepde as lp
 from livepde import spaces
 from livepde.diagnostics import check_space
+from livepde.fem.sobolev import _balakrishnan
+from livepde.linalg import Leading
+from livepde.spaces import BorderedSpace
+from livepde.streams import Twin
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -45,7 +60,7 @@ def test_gain_scales_the_adjoint():
     u, r = rng.standard_normal((2, model.X.dim))
     A = model.A(u)
     Q = lp.spaces.HilbertSpace(model.Q.gram / 50.0, "Q", model.Q.fixed)
-    scaled = lp.operators.DualOperator(A.matrix, Q, model.X)
+    scaled = lp.spaces.DualOperator(A.matrix, Q, model.X)
     np.testing.assert_allclose(scaled.adjoint(r), 50.0 * A.adjoint(r), rtol=1e-9)
 
 
@@ -113,7 +128,7 @@ def test_operator_must_fit_its_spaces():
     model = CASES["line P2 / P1"].model()
     A = model.A(np.ones(model.X.dim))
     with pytest.raises(lp.errors.SpaceError, match=r"shape \(25, 13\).*need \(13, 25\)"):
-        lp.operators.DualOperator(A.matrix, model.X, model.Q)
+        lp.spaces.DualOperator(A.matrix, model.X, model.Q)
 
 
 def test_norms_and_duals():
@@ -271,3 +286,233 @@ def test_large_well_conditioned_spaces_need_no_factor(monkeypatch: pytest.Monkey
         np.testing.assert_allclose(one.riesz(b), other.riesz(b), rtol=1e-8, atol=1e-9)
     assert type(found.X.factor) is not type(factors[0])  # L2
     assert type(found.Q.factor) is type(factors[1])  # H1
+
+
+LENGTH = 0.3
+ORDERS = (0.3, 0.75, 1.25, 1.5, 2.0, 2.5, 3.0)
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.3, 0.5, 0.7, 0.98])
+@pytest.mark.parametrize("largest", [1e1, 1e4, 1e7])
+def test_balakrishnan(sigma, largest):
+    """All weights and poles positive, relative error below 1e-3, at most 15 poles."""
+    c, weights, poles = _balakrishnan(sigma, largest)
+    assert c > 0
+    assert min(weights.min(), poles.min()) > 0
+    assert len(poles) <= 15
+    x = np.geomspace(1.0, largest, 300)
+    power = c + (weights * x[:, None] / (x[:, None] + poles)).sum(axis=1)
+    np.testing.assert_allclose(power, x**sigma, rtol=1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"])
+@pytest.mark.parametrize("zero", [False, True])
+@pytest.mark.parametrize("s", ORDERS)
+def test_gram_is_the_spectral_power(name, zero, s):
+    """G = M (M^-1 K)^s on the free coefficients: exact for whole s, to 1e-3 for others."""
+    options = {"q_dirichlet": {"boundary": 0.0}} if zero else {}
+    model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), **options)
+    Q = model.Q
+    free = np.flatnonzero(Q.free)
+    K = CASES[name].model(inner=lp.Sobolev(1.0, LENGTH)).Q.gram.toarray()[np.ix_(free, free)]
+    M = model.parameter_mass.toarray()[np.ix_(free, free)]
+    values, V = sl.eigh(K, M)
+    exact = M @ V @ np.diag(values**s) @ V.T @ M
+    ratios = sl.eigh(Q.gram.toarray()[np.ix_(free, free)], exact, eigvals_only=True)
+    np.testing.assert_allclose(ratios, 1.0, rtol=1e-7 if s == int(s) else 1e-3)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("s", [0.0, 0.75, 1.0, 1.75, 2.0])
+def test_spaces_pass_their_check(name, s):
+    for zero in ({}, {"boundary": 0.0}):
+        model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), q_dirichlet=zero)
+        lp.diagnostics.check_space(model.Q).raise_if_failed()
+        np.testing.assert_array_equal(model.Q.riesz(np.ones(model.Q.dim))[model.Q.fixed], 0.0)
+
+
+@pytest.mark.parametrize("zero", [{}, {"boundary": 0.0}])
+def test_riesz_map_of_a_large_space_of_second_order_is_two_solves(zero, monkeypatch):
+    Q = CASES["triangles P1"].model(inner=lp.Sobolev(2.0, LENGTH), q_dirichlet=zero).Q
+    functional = np.random.default_rng(0).standard_normal((Q.dim, 3))
+    expected = Q.riesz(functional)
+    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1)
+    large = BorderedSpace(Q.border, Q.dim, Q.name, Q.fixed)
+    assert isinstance(Q.factor, Leading)
+    assert not isinstance(large.factor, Leading)
+    found = large.riesz(functional)
+    np.testing.assert_allclose(found, expected, atol=1e-10 * abs(expected).max())
+    free = functional * Q.free[:, None]
+    np.testing.assert_allclose(Q.free[:, None] * large.dual(found), free, atol=1e-8)
+
+
+@pytest.mark.parametrize("s", [1.5, 2.5, 3.0])
+def test_other_large_spaces_keep_their_border(s, monkeypatch):
+    Q = CASES["triangles P1"].model(inner=lp.Sobolev(s, LENGTH)).Q
+    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1)
+    assert isinstance(BorderedSpace(Q.border, Q.dim).factor, Leading)
+
+
+@pytest.mark.slow
+def test_names_of_orders():
+    """inner="L2" and "H1" are orders 0 and 1; "H2" is order 2, a sparse form on C^1 elements."""
+    for name, s in (("L2", 0.0), ("H1", 1.0), ("H2", 2.0)):
+        one, two = (CASES["line P1"].model(inner=inner).Q for inner in (name, lp.Sobolev(s)))
+        np.testing.assert_allclose(one.gram.toarray(), two.gram.toarray(), rtol=1e-12)
+    mesh = lp.rectangle((0.0, 1.0), (0.0, 1.0), (3, 3))
+    for model in (
+        reaction(line(), ElementLineHermite(), inner="H2"),
+        reaction(mesh, ElementQuadBFS(), inner="H2"),
+    ):
+        assert not isinstance(model.Q, BorderedSpace)
+        lp.diagnostics.check_space(model.Q).raise_if_failed()
+    q = model.parameter_space.interpolate(lambda x: x[0] ** 2 * x[1])
+    # u^2 + 2 |grad u|^2 + |hess u|^2 for u = x^2 y
+    grad = 4 / 9 + 1 / 5
+    hess = 4 * (1 / 3) + 2 * 4 * (1 / 3)
+    assert model.Q.norm(q) ** 2 == pytest.approx(1 / 15 + 2 * grad + hess)
+
+
+def test_the_prior_deviation_scales_the_space():
+    mesh, element = line(), ElementLineP1()
+    fields = [
+        lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), prior=lp.Normal(std=std))
+        for std in (1.0, 2.0)
+    ]
+    one, two = (lp.Model(lp.Field(mesh, element), field, product).Q for field in fields)
+    np.testing.assert_allclose(one.gram.toarray(), 4 * two.gram.toarray(), rtol=1e-9)
+
+
+def test_products_with_other_unknowns():
+    """A field in H^1.5 beside a number and a field in H^1: blocks keep their own inner product."""
+    mesh, element = line(), ElementLineP1()
+    parts = {
+        "a": lp.Field(mesh, element, inner=lp.Sobolev(1.5, LENGTH), dirichlet={"left": 0.0}),
+        "k": lp.Normal(std=0.5),
+        "b": lp.Field(mesh, element, inner="H1"),
+    }
+    model = lp.Model(lp.Field(mesh, element), parts, A=lambda q, u, v, x: (q.a + q.b + q.k) * u * v)
+    lp.diagnostics.check_space(model.Q).raise_if_failed()
+    gram, part = model.Q.gram.toarray(), model.parameter_space.part
+    alone = lp.Model(lp.Field(mesh, element), parts["a"], product).Q
+    np.testing.assert_allclose(gram[part("a"), part("a")], alone.gram.toarray(), rtol=1e-9)
+    assert gram[part("k"), part("k")] == pytest.approx(4.0)
+    np.testing.assert_allclose(gram[part("a"), part("b")], 0.0, atol=1e-12)
+    block = model.parameter_space.fields["a"]
+    restricted = model.Q.restricted(part("a"), block.fixed)
+    phi, variance = restricted.modes(3, model.parameter_mass[part("a"), part("a")])
+    expected, same = alone.modes(3, model.parameter_mass[part("a"), part("a")])
+    np.testing.assert_allclose(variance, same, rtol=1e-9)
+    np.testing.assert_allclose(phi, expected, atol=1e-7)
+    assert not isinstance(model.Q.restricted(part("b"), np.zeros(0, int)), BorderedSpace)
+    sensors = lp.Points([0.3, 0.7], noise=0.01)
+    work = lp.SensitivityLaw(modes=3).prepare(
+        lp.Identifier(model, sensors, lp.GradientLaw()).problem
+    )
+    Phi = work.filter.reduction.Phi
+    np.testing.assert_allclose(Phi.T @ gram @ Phi, np.eye(7), atol=1e-8)
+
+
+@pytest.mark.long
+def test_modes_of_a_large_space_are_powers_of_those_of_H1(monkeypatch):
+    """H^s has the modes of H^1, with their variance to the power s; nothing is written out."""
+    monkeypatch.setattr(spaces, "LARGEST_EXPLICIT", 1000)
+    mesh, element = MeshTri().refined(5), ElementTriP1()
+    one, two = (
+        lp.Model(lp.Field(mesh, element), lp.Field(mesh, element, inner=inner), product)
+        for inner in (lp.Sobolev(1.0, LENGTH), lp.Sobolev(1.5, LENGTH))
+    )
+    assert two.Q.dim > spaces.LARGEST_EXPLICIT
+    _, first = one.Q.modes(4, one.parameter_mass)
+    phi, power = two.Q.modes(4, two.parameter_mass)
+    np.testing.assert_allclose(power, first**1.5, rtol=1e-3)
+    np.testing.assert_allclose(phi.T @ two.Q.dual(phi), np.eye(4), atol=1e-7)
+    with pytest.raises(
+        lp.errors.SpaceError, match="is dense and has 1089 rows; it is written out up to"
+    ):
+        _ = two.Q.gram
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("s", [0.75, 1.5, 2.0])
+def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
+    """The auxiliary unknowns change the linear algebra, not the result."""
+    model = excited(10, ElementLineP1(), inner=lp.Sobolev(s, LENGTH))
+    plain = excited(10, ElementLineP1())
+    plain.__dict__["Q"] = lp.spaces.HilbertSpace(model.Q.gram, "Q", model.Q.fixed)
+    found = []
+    for one in (model, plain):
+        twin = Twin(
+            scheme=lp.ImplicitEuler(),
+            model=one,
+            observation=lp.Full(),
+            q_true=excited_q,
+            u_true=excited_u,
+            times=0.1 * np.arange(11),
+        )
+        strict = lp.stepping.Newton(tolerance=1e-10, share=0.0)
+        law = lp.GradientLaw(gain=100.0, sigma=0.01, newton=strict)
+        start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
+        found.append(lp.Identifier(one, lp.Full(), law, **start).run(twin).last)
+    np.testing.assert_allclose(found[0].q, found[1].q, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(found[0].u, found[1].u, atol=1e-7)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("law", "inner"),
+    [
+        (lp.GradientLaw(gain=1e3), lp.Sobolev(0.75, 0.2)),
+        (lp.GradientLaw(gain=1e3), lp.Sobolev(2, 0.2)),
+        (filter_alone(noise=1e-3), lp.Sobolev(0.75, 0.2)),
+        (filter_alone(noise=1e-3), lp.Sobolev(1.5, 0.2)),
+    ],
+)
+def test_both_laws_identify(law, inner):
+    model = excited(16, ElementLineP1(), inner=inner)
+    times = 0.05 * np.arange(101)
+    twin = Twin(
+        scheme=lp.ImplicitEuler(),
+        model=model,
+        observation=lp.Full(),
+        q_true=excited_q,
+        u_true=excited_u,
+        times=times,
+    )
+    start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
+    last = lp.Identifier(model, lp.Full(), law, **start).run(twin).last
+    assert last.status.ok
+    assert twin.error(last.q) < 0.05
+
+
+def test_bad_orders():
+    for s in (-1.0, np.nan, np.inf):
+        with pytest.raises(lp.errors.SpaceError, match="the order s must be a number >= 0"):
+            lp.Sobolev(s)
+    for length in (0.0, np.nan):
+        with pytest.raises(lp.errors.SpaceError, match="length must be a positive number"):
+            lp.Sobolev(1.0, length)
+    with pytest.raises(lp.errors.SpaceError, match="not symmetric"):
+        BorderedSpace(lp.spaces.HilbertSpace(CASES["line P1"].model().Q.gram).gram * np.nan, 13)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "s"),
+    [
+        (lp.interval(0.0, 1.0, 60), 1),
+        (lp.interval(0.0, 1.0, 60), 2),
+        (lp.rectangle((0.0, 1.0), (0.0, 1.0), (30, 30)), 2),
+    ],
+)
+def test_the_prior_deviation_is_that_at_a_point(mesh, s):
+    inner = lp.Sobolev(s, length=0.1).pointwise(len(mesh.p))
+    field = lp.Field(mesh, lp.linear(mesh), inner=inner, prior=lp.Normal(std=0.7))
+    model = lp.Model(lp.Field(mesh, lp.linear(mesh)), field, A=lambda q, u, v, x: q * u * v)
+    centre = np.argmin(np.abs(mesh.p - 0.5).sum(axis=0))
+    unit = np.zeros(model.Q.dim)
+    unit[centre] = 1.0
+    assert np.sqrt(model.Q.riesz(unit)[centre]) == pytest.approx(0.7, rel=0.05)
+    with pytest.raises(lp.errors.SpaceError, match="take a larger s"):
+        lp.Sobolev(s).pointwise(2 * s)

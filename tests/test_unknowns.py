@@ -17,8 +17,7 @@ import livepde as lp
 from livepde.diagnostics import check_model
 from livepde.errors import ConfigurationError, LawError, SpaceError
 from livepde.fem import FunctionSpace, Latent
-from livepde.fem.evolution import CONSTANT
-from livepde.fem.priors import Log, Logit
+from livepde.fem.priors import CONSTANT, Log, Logit
 from livepde.laws.reduction import Reduction
 from livepde.stepping import ForwardStage
 

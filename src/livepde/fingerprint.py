@@ -43,12 +43,8 @@ EVALUATED = ("model", "sensors")
 class Fingerprint:
     """Texts and numbers of each part of a problem.
 
-    Attributes
-    ----------
-    texts
-        Part -> its options, with a sign in the place of each number.
-    numbers
-        Part -> numbers, and sizes of what they are sums of, shape (numbers, 2).
+    `texts` has the options of a part, with a sign instead of each number; `numbers` the numbers,
+    and sizes of what they are sums of, shape (numbers, 2).
     """
 
     texts: Mapping[str, str]
@@ -72,10 +68,7 @@ class Fingerprint:
     ) -> Fingerprint:
         """Return the fingerprint of members that begin at these parameters and states.
 
-        Parameters
-        ----------
-        errors
-            Those of each state, each of shape (errors, n).
+        `errors` are those of each state, each of shape (errors, n).
         """
         whole = [np.concatenate([np.ravel(one) for one in each]) for each in (q0, u0, errors)]
         start = np.concatenate(_start(*whole))
@@ -106,10 +99,7 @@ def fingerprint(
 ) -> Fingerprint:
     """Return the fingerprint of an identifier.
 
-    Parameters
-    ----------
-    q0, u0
-        Latent parameter and state at the start, without boundary values.
+    q0 and u0 are latent parameter and state at the start, without boundary values.
     """
     probes = _Probes(problem, q0, u0)
     control = replace(problem.control, start=math.nan)
@@ -217,7 +207,7 @@ def _tried(function: Callable[[], Any]) -> Array:
 def _described(value: Any, numbers: list[float]) -> str:
     """Return options as text, with a sign for each number, which is appended to `numbers`.
 
-    Functions have no text: what they return is in the numbers of the part that they belong to.
+    Functions have no text: their values are in the numbers of their part.
     """
     if isinstance(value, bool | str | None):
         return repr(value)

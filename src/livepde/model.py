@@ -6,8 +6,8 @@ import pickle
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, TypeAlias, cast
+from functools import cached_property, partial
+from typing import Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -29,42 +29,24 @@ from livepde.fem import (
     Named,
     On,
     Sobolev,
+    Source,
     Unknown,
     cells,
     compose,
     dot,
     grad,
-    ignores,
+    source_density,
     with_constants,
 )
 from livepde.linalg import Array, IntArray
-from livepde.operators import DualOperator
 from livepde.records import Layout, name_clashes
 from livepde.showing import Shown, expression, listed
-from livepde.spaces import BorderedSpace, HilbertSpace, product
-
-Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
+from livepde.spaces import BorderedSpace, DualOperator, HilbertSpace, product
 
 
 def mass_form(u: Any, v: Any, x: Any) -> Any:
     """The L2 inner product, u v; of several components their sum."""
     return _summed(lambda u, v: u * v, u, v)
-
-
-def _product(space: FunctionSpace) -> Integrand:
-    """Return the L2 inner product of a state: the sum over its components."""
-    products = {name: _pointwise(block) for name, block in space.fields.items()}
-    if space.single:
-        (single,) = products.values()
-        return lambda u, v, x: single(u, v)
-    return lambda u, v, x: sum(
-        form(getattr(u, name), getattr(v, name)) for name, form in products.items()
-    )
-
-
-def _pointwise(block: FieldBlock) -> Callable[[Any, Any], Any]:
-    """Return the product of two functions at a point: u v, of vectors u . v."""
-    return dot if block.vector else lambda u, v: u * v
 
 
 def h1_form(u: Any, v: Any, x: Any) -> Any:
@@ -116,18 +98,16 @@ class Model(Shown):
         them a complex step is taken (exact for analytic integrands).
     inputs
         Names of the channels that forms read as x.inputs["name"].
-    time_unit, length_unit
-        Units of times and coordinates, for tables, figures and sentences.
-    formula
-        The equation as text, which `repr` shows; default the weak form as it is written in code.
+    time_unit, length_unit, formula
+        Units of times and coordinates, and the equation as text; default the weak form in code.
     initial
         Integrand (q, v, x), linear in v: the initial state as a functional, `q.u0 * v` say; its L2
         projection is where u begins. Unknowns in it belong to the initial state.
     coefficients
-        Function q -> {name: value} of further coefficients that A reads as q.name, computed from
-        the unknowns, as in lambda q: {"diffusivity": q.k / q.C}. If all of them are numbers and A
-        is linear in unknowns and coefficients, a step is as fast as with an A that is linear in the
-        unknowns. If an unknown in them varies in space, A is evaluated at each step.
+        Function q -> {name: value} of further coefficients that A reads as q.name, as in
+        lambda q: {"diffusivity": q.k / q.C}. If all of them are numbers and A is linear in unknowns
+        and coefficients, a step is as fast as with an A that is linear in the unknowns. If an
+        unknown in them varies in space, A is evaluated at each step.
 
     Notes
     -----
@@ -173,20 +153,17 @@ class Model(Shown):
         self.state = state
         self.parameter = parameter
         self.time_unit, self.length_unit = time_unit, length_unit
-        self._about: dict[str, Any] = {
-            "time_unit": time_unit,
-            "length_unit": length_unit,
-            "formula": formula,
-        }
+        units = {"time_unit": time_unit, "length_unit": length_unit}
+        self._about: dict[str, Any] = {**units, "formula": formula}
         self.state_space = FunctionSpace.of(state, "u")
-        self.mesh = _common_mesh(self.state_space)
+        self.mesh = self.state_space.mesh
         self.parameter_space = FunctionSpace.of(parameter, "q")
         self.inputs = tuple(inputs)
         self._check_parameter()
         _ = self.state_space.fixed  # refuses boundary values that do not fit their field
         x, q = self.state_space, self.parameter_space
         pair, triple = {"u": x, "v": x}, {"q": q, "u": x, "v": x}
-        self.form_M = self._form("M", _product(x) if M is None else M, pair)
+        self.form_M = self._form("M", x.product if M is None else M, pair)
         self.form_B = self._form("B", B, pair, "u", dB)
         self.latent = Latent(q)
         # A in the parameter as forms see it; `form_A` is the same in latent coefficients.
@@ -200,7 +177,7 @@ class Model(Shown):
             self.linear_A = self._form("A", A, more, "u", None, "q")
         self.form_A = compose(self.physical_A, self.latent)
         sources = f if isinstance(f, Sequence) else [f]
-        integrands = [_as_integrand(item, x) for item in sources]
+        integrands = [source_density(item, x) for item in sources]
         self.form_F = self._form("f", integrands, {"v": x})
         self._source: tuple[Mapping[str, float] | None, Array] | None = None
         self.form_initial: Form | Composed | None = None
@@ -219,7 +196,7 @@ class Model(Shown):
             kind = type(block.field.element).__name__
             rows[f"state {name}"] = f"{kind}, {block.size} coefficients"
             if block.field.dirichlet:
-                rows[f"state {name}"] += f", Dirichlet values {_boundaries(block.field.dirichlet)}"
+                rows[f"state {name}"] += f", Dirichlet values {block.field.boundary_text}"
         formula = self._about["formula"]
         rows["equation"] = formula or _equation(self._parts)
         for name, what in {"M": "mass M(u, v)", "initial": "initial state"}.items():
@@ -229,7 +206,7 @@ class Model(Shown):
             of = f"field, {type(unknown.element).__name__}, " if isinstance(unknown, Field) else ""
             many = [label for label in self.parameter_space.labels if label.startswith(f"{name}[")]
             named = f" for each of {listed(many)}" if many else ""
-            prior = f"{of}{_prior(unknown.prior)} {unknown.unit}".rstrip()
+            prior = f"{of}{unknown.prior.text} {unknown.unit}".rstrip()
             rows[f"unknown {name}"] = prior + named
         if self.inputs:
             rows["inputs"] = listed(self.inputs)
@@ -253,7 +230,7 @@ class Model(Shown):
         ConfigurationError
             A function that pickle cannot find by its name.
         """
-        parts = self.state, self.parameter, {**self._parts, **self._about}
+        parts = self.state, self.parameter, self._parts
         try:
             pickle.dumps(parts)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -263,7 +240,7 @@ class Model(Shown):
                 "at the top of a module, or pickle what builds the model. Estimates and results "
                 "can be pickled."
             ) from error
-        return _rebuilt, parts
+        return partial(Model, self.state, self.parameter, **self._parts, **self._about), ()
 
     def _form(
         self,
@@ -313,14 +290,9 @@ class Model(Shown):
         B: Sequence[Integrand | On] = (),
         inputs: Sequence[str] = (),
     ) -> Model:
-        """Return a process with more terms in A and B: fluxes, sources.
+        """Return a process with more terms in A, (q, u, v, x), and B, (u, v, x): fluxes, sources.
 
-        Parameters
-        ----------
-        A, B
-            Integrands (q, u, v, x) and (u, v, x), linear in v.
-        inputs
-            Names of the channels that these read.
+        `inputs` are the names of the channels that these read.
 
         Raises
         ------
@@ -362,16 +334,13 @@ class Model(Shown):
                 return [bound(item) for item in part]
             return with_constants(part, values) if callable(part) else part
 
-        kept = ("inputs", "coefficients")  # which read no channels
-        parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
-        parts["coefficients"] = self._parts["coefficients"]
         left = [name for name in self.inputs if name not in values]
-        return Model(self.state, self.parameter, **parts, inputs=left, **self._about)
+        kept = {"inputs": left, "coefficients": self._parts["coefficients"]}  # read no channels
+        parts = {name: bound(part) for name, part in self._parts.items() if name not in kept}
+        return Model(self.state, self.parameter, **parts, **kept, **self._about)
 
     def refined(self) -> Model:
         """Return the same process on a mesh whose elements are halved in every direction.
-
-        Forms, boundary values and unknowns are those that were given: forms are evaluated anew.
 
         Raises
         ------
@@ -381,15 +350,11 @@ class Model(Shown):
         mesh = self.mesh.refined()
 
         def finer(part: Any) -> Any:
+            if isinstance(part, Mapping):
+                return {name: finer(item) for name, item in part.items()}
             return replace(part, mesh=mesh) if isinstance(part, Field) else part
 
-        def of(parts: Any) -> Any:
-            if isinstance(parts, Mapping):
-                return {name: finer(part) for name, part in parts.items()}
-            return finer(parts)
-
-        state, parameter = of(self.state), of(self.parameter)
-        return Model(state, parameter, **self._parts, **self._about)
+        return Model(finer(self.state), finer(self.parameter), **self._parts, **self._about)
 
     def _check_parameter(self) -> None:
         both = set(self.parameter_space.blocks) & set(self.state_space.blocks)
@@ -437,9 +402,8 @@ class Model(Shown):
         growing = [k for k in own if all(self._negative(sign, k, u) for u in levels)]
         if not growing:
             return False
-        higher = [k for k, (_, part) in enumerate(owners) if part not in ("value", "grad")]
         others = [k for k in slopes if owners[k][0] != mine]
-        coupled = [*((k, k) for k in higher)]
+        coupled = [(k, k) for k, (_, part) in enumerate(owners) if part not in ("value", "grad")]
         coupled += [pair for k in growing for j in others for pair in ((k, j), (j, k))]
         return not any(self._pairing(*pair, 1.0).any() for pair in coupled)
 
@@ -469,8 +433,7 @@ class Model(Shown):
     def order(self) -> int:
         """Quadrature order: the state's, or exact for A(u) q with polynomial factors."""
         states = [block.field for block in self.state_space.fields.values()]
-        given = [field.quadrature for field in states if field.quadrature is not None]
-        if given:
+        if given := [field.quadrature for field in states if field.quadrature is not None]:
             return max(given)
         degrees = [block.field.element.maxdeg for block in self.parameter_space.fields.values()]
         own = max(int(field.element.maxdeg) for field in states)
@@ -485,10 +448,14 @@ class Model(Shown):
     @cached_property
     def channels(self) -> tuple[str, ...]:
         """Names of all channels the model needs: inputs of forms and Dirichlet channels."""
-        fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.boundary_values]
-        boundary = [value.name for value in values if isinstance(value, Channel)]
+        boundary = [value.name for value in self.boundary_values if isinstance(value, Channel)]
         return tuple(dict.fromkeys([*self.inputs, *boundary]))
+
+    @cached_property
+    def boundary_values(self) -> list[Any]:
+        """Dirichlet values of all components: numbers, functions, channels."""
+        fields = [block.field for block in self.state_space.fields.values()]
+        return [value for field in fields for value in field.boundary_values]
 
     @cached_property
     def mass(self) -> sp.csr_array:
@@ -506,7 +473,7 @@ class Model(Shown):
     @cached_property
     def state_mass(self) -> sp.csr_array:
         """L2 Gram matrix of the state, shape (n, n)."""
-        return self.bilinear(_product(self.state_space))
+        return self.bilinear(self.state_space.product)
 
     @cached_property
     def X(self) -> HilbertSpace:
@@ -545,14 +512,10 @@ class Model(Shown):
     def parameter_mass(self) -> sp.csr_array:
         """L2 Gram matrix of the parameter, in which its modes are ordered; identity for numbers."""
         blocks = [
-            self._on_parameter(unknown, mass_form)
-            if isinstance(unknown, Field)
+            self._on_parameter(block.field, mass_form)
+            if isinstance(block, FieldBlock)
             else sp.eye_array(block.size)
-            for unknown, block in zip(
-                self.parameter_space.unknowns.values(),
-                self.parameter_space.blocks.values(),
-                strict=True,
-            )
+            for block in self.parameter_space.blocks.values()
         ]
         return sp.csr_array(sp.block_diag(blocks, format="csr"))
 
@@ -620,19 +583,17 @@ class Model(Shown):
     @cached_property
     def homogeneous(self) -> bool:
         """True if every Dirichlet value is the number 0: zero boundary values stay zero."""
-        fields = [block.field for block in self.state_space.fields.values()]
-        values = [value for field in fields for value in field.boundary_values]
-        return all(isinstance(value, int | float) and value == 0.0 for value in values)
+        return all(isinstance(one, int | float) and one == 0.0 for one in self.boundary_values)
 
     def impose(self, u: Array, moment: Moment) -> Array:
         """Return u with the Dirichlet values of a moment."""
         return self.state_space.impose(u, moment)
 
     def boundary_readings(self, u0: Any) -> dict[str, float]:
-        """Return the boundary channels whose values an initial state states, with these values.
+        """Return the values of boundary channels that an initial state implies.
 
         Left out are channels on whose boundaries u0 varies by more than a thousandth of its range,
-        and those of components that u0 does not name. None states nothing.
+        and those of components that u0 does not name.
         """
         if u0 is None:
             return {}
@@ -660,8 +621,6 @@ class Model(Shown):
     def initial_values(self, u0: Any) -> Array:
         """Return coefficients of the u0 of a run, before boundary values, checked.
 
-        A number is the value of all components of the state; a mapping names each of them.
-
         Raises
         ------
         ModelError
@@ -682,9 +641,9 @@ class Model(Shown):
 
     def initial_state(self, q: Array, moment: Moment = START) -> Array:
         """Return coefficients of the initial state of a latent parameter."""
-        if self.form_initial is None:
-            return self.impose(np.zeros(self.X.dim), moment)
         boundary = self.impose(np.zeros(self.X.dim), moment)
+        if self.form_initial is None:
+            return boundary
         # Projection onto functions with the Dirichlet values: what these contribute is known.
         functional = self.form_initial.vector("v", moment, q=q) - self._projection.dual(boundary)
         return boundary + self._projection.riesz(functional)
@@ -738,78 +697,3 @@ def _equation(parts: Mapping[str, Any]) -> str:
     ]
     right = f"integral of ({' + '.join(sources)}) * v" if sources else "0"
     return f"integral of {left} = {right}"
-
-
-def _prior(prior: Any) -> str:
-    """Return a prior as text, with bounds where they are not those of its kind."""
-    bounds = (
-        "" if prior.bounds == getattr(type(prior), "bounds", None) else f", bounds={prior.bounds}"
-    )
-    return f"{type(prior).__name__}({prior.centre:g}, std={prior.std:g}{bounds})"
-
-
-def _boundaries(dirichlet: Any) -> str:
-    """Return Dirichlet values as text."""
-    if not isinstance(dirichlet, Mapping):
-        return str(dirichlet)
-    values = {
-        name: f"channel {value.name}"
-        if isinstance(value, Channel)
-        else expression(value)
-        if callable(value)
-        else f"{value}"
-        for name, value in dirichlet.items()
-    }
-    return ", ".join(f"{name} = {value}" for name, value in values.items())
-
-
-def _rebuilt(state: Any, parameter: Any, parts: dict[str, Any]) -> Model:
-    return Model(state, parameter, **parts)
-
-
-def _common_mesh(state: FunctionSpace) -> Any:
-    """Return the mesh of all components of the state."""
-    if len(state.fields) < len(state.blocks):
-        numbers = sorted(set(state.blocks) - set(state.fields))
-        raise ModelError(f"state: {numbers} must be a Field, on the mesh of the others.")
-    meshes = [block.field.mesh for block in state.fields.values()]
-    if any(mesh is not meshes[0] for mesh in meshes):
-        raise ModelError(
-            f"state: the components {list(state.fields)} must share one mesh object; their "
-            "elements may differ."
-        )
-    return meshes[0]
-
-
-def _as_integrand(source: Source | On, state: FunctionSpace) -> Integrand | On:
-    """Return the source density as an integrand (v, x)."""
-    if isinstance(source, On):
-        return On(source.name, _as_density(source.form, state))
-    return _as_density(source, state)
-
-
-def _as_density(source: Source, state: FunctionSpace) -> Integrand:
-    if isinstance(source, Mapping):
-        parts = {
-            name: _single_density(item, state.component(name)[0]) for name, item in source.items()
-        }
-        if state.single:
-            raise ModelError("f: a mapping is for a state of several components.")
-        return lambda v, x: sum(form(getattr(v, name), x) for name, form in parts.items())
-    if not callable(source) and float(source) == 0.0:
-        return lambda v, x: 0.0 * x[0]
-    if not state.single:
-        raise ModelError(
-            f"f: the state has the components {list(state.fields)}; give a mapping, such as "
-            f'f={{"{next(iter(state.fields))}": ...}}.'
-        )
-    return _single_density(source, state.component()[0])
-
-
-def _single_density(source: Any, block: FieldBlock) -> Integrand:
-    product = _pointwise(block)
-    if callable(source):
-        timed = not ignores(source, 1)  # what it reads of x is seen where the form is evaluated
-        return lambda v, x: product(source(x, x.t if timed else 0.0), v)
-    level = float(source)
-    return lambda v, x: level * v

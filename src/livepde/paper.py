@@ -25,15 +25,8 @@ def space(mesh: Any, **options: Any) -> Field:
     """Return a field in the paper's space: cubic Hermite functions phi_j, psi_j, j = 2, ..., N - 1.
 
     The basis has neither value nor slope functions at the ends, so every function of this space has
-    zero values and zero slopes there.
-
-    Parameters
-    ----------
-    mesh
-        Mesh of an interval, or of quadrilaterals for Bogner-Fox-Schmit functions with the same
-        conditions.
-    options
-        Options of `Field`: inner, prior, name.
+    zero values and zero slopes there. On quadrilaterals these are Bogner-Fox-Schmit functions.
+    `options` are those of `Field`: inner, prior, name.
     """
     return Field(mesh, smooth(mesh), dirichlet={"boundary": 0.0}, clamped=True, **options)
 
@@ -77,14 +70,8 @@ def identifier(
 ) -> Identifier:
     """Return the paper's method: its law, by implicit Euler with the steps of the samples.
 
-    Parameters
-    ----------
-    model, observation
-        Model of the process, with fields in `space`, and its observation operator.
-    gain, damping, D, nu, sigma
-        As for `law`.
-    q0, u0
-        Initial estimates (est_exact0), as for `Identifier`.
+    The model has fields in `space`; gain, damping, D, nu and sigma are as for `law`, and the
+    initial estimates q0 and u0 (est_exact0) as for `Identifier`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Hilbert spaces by their Gram matrix."""
+"""Hilbert spaces by their Gram matrix, and linear operators between them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from livepde.linalg import (
     Array,
     Factor,
     IntArray,
+    Inverse,
     Leading,
     Pattern,
     analyse,
@@ -22,7 +23,7 @@ from livepde.linalg import (
     positive_definite,
 )
 
-__all__ = ["BorderedSpace", "HilbertSpace", "product"]
+__all__ = ["BorderedSpace", "DualOperator", "HilbertSpace", "product"]
 
 # Beyond this condition number of the scaled Gram matrix a space counts as singular: fewer than two
 # digits of a Riesz representative would be correct.
@@ -159,11 +160,18 @@ class HilbertSpace:
         # A trial solve decides: the condition number of the scaled matrix is not known otherwise. A
         # mass matrix needs few iterations on any mesh, a stiffness matrix more on finer ones.
         probe = np.random.default_rng(0).standard_normal(self.dim) * np.sqrt(diagonal)
+        matrix, remedy = self.tangent_gram, "take a mesh whose cells differ less in size and shape."
+
+        def solve(b: Array, limit: int = 10 * FEW) -> Array:
+            scale = diagonal if b.ndim == 1 else diagonal[:, None]
+            product = matrix.__matmul__
+            return conjugate_gradients(product, lambda r: r / scale, b, ITERATED, limit, remedy)[0]
+
         try:
-            _Diagonal(self.tangent_gram, diagonal, FEW).solve(probe)
+            solve(probe, FEW)
         except LinearAlgebraError:
             return None
-        return _Diagonal(self.tangent_gram, diagonal, 10 * FEW)
+        return Inverse(solve)
 
     def inner(self, x: Array, y: Array) -> float:
         """Return (x, y) = x^T G y for coefficient vectors of shape (n,)."""
@@ -209,12 +217,8 @@ class HilbertSpace:
         """Return the prior variance of each coefficient outside given modes, shape (n,).
 
         As `variance`, but beyond 20 000 coefficients the remainder is interpolated instead of the
-        whole variance. Values at rounding level are set to zero.
-
-        Parameters
-        ----------
-        modes
-            G-orthonormal columns, shape (n, k).
+        whole variance. Values at rounding level are zero. `modes` are G-orthonormal columns, (n,
+        k).
         """
         held = (modes**2).sum(axis=1)
         if self.dim <= LARGE:
@@ -277,16 +281,10 @@ class HilbertSpace:
     def spread(self, weights: Array, modes: Array) -> float:
         """Return the trace of diag(weights) G^{-1}: the weighted sum of prior variances.
 
-        Beyond 20 000 coefficients the part of `modes` is exact, and the remainder is Hutchinson's
-        estimate with 16 fixed random vectors: its relative standard error is at most 0.35, and
-        decreases with the number of modes that contribute.
-
-        Parameters
-        ----------
-        weights
-            Nonnegative, shape (n,).
-        modes
-            G-orthonormal columns, shape (n, k), as `modes` returns them.
+        Beyond 20 000 coefficients the part of `modes`, G-orthonormal columns, is exact, and the
+        remainder is Hutchinson's estimate with 16 fixed random vectors: its relative standard error
+        is at most 0.35, and decreases with the number of modes that contribute. `weights` are
+        nonnegative, shape (n,).
         """
         if self.dim <= LARGE:
             return float(weights @ self.variance)
@@ -303,21 +301,15 @@ class HilbertSpace:
     def modes(self, count: int, mass: sp.csr_array) -> tuple[Array, Array]:
         """Leading modes of the Gaussian measure with covariance G^{-1}.
 
-        Solves mass phi = lambda G phi for the `count` largest lambda; the columns are
-        G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
-        approximation of G^{-1} of that rank in the norm of `mass`.
+        Solves mass phi = lambda G phi for the `count` largest lambda; the columns of phi, (n,
+        count), are G-orthonormal, so q = Phi a with a ~ N(0, I) has covariance Phi Phi^T, the best
+        approximation of G^{-1} of that rank in the norm of `mass`. The lambda, descending, are the
+        variances.
 
         By Lanczos' method beyond 400 coefficients, with one Riesz solve per iteration and a fixed
         start vector, so that every run finds the same modes. Each lambda is exact to rounding,
         beyond 20 000 coefficients to a relative error of 1e-8. The variance outside of the modes is
         that of the measure minus the sum of theirs (`spread`).
-
-        Returns
-        -------
-        phi
-            Shape (n, count).
-        variance
-            Eigenvalues lambda, descending.
         """
         from scipy.linalg import eigh
         from scipy.sparse.linalg import LinearOperator, eigsh
@@ -354,27 +346,6 @@ class HilbertSpace:
         return phi, values[order]
 
 
-@dataclass(frozen=True, eq=False)
-class _Diagonal:
-    """Conjugate gradients with a diagonal preconditioner, as a `Factor`."""
-
-    matrix: sp.csr_array
-    diagonal: Array
-    limit: int
-
-    def solve(self, b: Array) -> Array:
-        """Return x with K x = b to a relative residual of 1e-12; raises `LinearAlgebraError`."""
-        scale = self.diagonal if b.ndim == 1 else self.diagonal[:, None]
-        return conjugate_gradients(
-            self.matrix.__matmul__,
-            lambda r: r / scale,
-            b,
-            ITERATED,
-            self.limit,
-            "take a mesh whose cells differ less in size and shape.",
-        )[0]
-
-
 class BorderedSpace(HilbertSpace):
     """A space whose dense Gram matrix is a Schur complement of a sparse matrix.
 
@@ -384,16 +355,9 @@ class BorderedSpace(HilbertSpace):
     a law that needs a system with G solves one with K and auxiliary unknowns instead. H^s of
     fractional order and powers of operators have this form (`livepde.fem.Sobolev`).
 
-    `gram` and `tangent_gram` form the dense G, which is possible up to 2000 coefficients.
-
-    Parameters
-    ----------
-    border
-        K, symmetric, shape (n + auxiliary, n + auxiliary); G must be positive definite.
-    dim
-        Number of coefficients n.
-    name, fixed
-        As for `HilbertSpace`. Fixed coefficients may not be coupled with others in K.
+    `gram` and `tangent_gram` form the dense G, which is possible up to 2000 coefficients. `border`
+    is K, symmetric; G, of shape (dim, dim), must be positive definite. Fixed coefficients may not
+    be coupled with others in K.
     """
 
     def __init__(
@@ -435,7 +399,8 @@ class BorderedSpace(HilbertSpace):
         E, F, H = self._parts
         if self.dim > LARGEST_EXPLICIT and np.all(H.diagonal() < 0.0):
             try:  # of powers of an operator -H is a mass matrix
-                return E, F, _Negative(self._factorised(sp.csr_array(-H), symmetric=True))
+                negative = self._factorised(sp.csr_array(-H), symmetric=True)
+                return E, F, Inverse(lambda b: -negative.solve(b))
             except SpaceError:
                 pass
         return E, F, self._factorised(H)
@@ -456,18 +421,18 @@ class BorderedSpace(HilbertSpace):
         factor = self._factorised(sp.csr_array(free @ self.border @ free + fixed))
         return Leading(factor, self.dim, self.border.shape[0])
 
-    def _root(self) -> _Root | None:
+    def _root(self) -> Factor | None:
         """Return the inverse of G = -F H^{-1} F with symmetric F, as for H^2; else None.
 
-        For large spaces: F is positive definite and admits Cholesky or multigrid, the indefinite K
-        does not.
+        For large spaces: F admits Cholesky or multigrid, the indefinite K does not.
         """
         n, (E, F, H) = self.dim, self._parts
         if n <= LARGEST_EXPLICIT or E.count_nonzero() or F.shape != (n, n):
             return None
         if abs(F - F.T).max() > 1e-10 * abs(F).max():
             return None
-        return _Root(self._factorised(F, symmetric=True), H)
+        root = self._factorised(F, symmetric=True)
+        return Inverse(lambda b: -root.solve(H @ root.solve(b)))  # G^-1 = -F^-1 H F^-1
 
     def _factorised(self, matrix: sp.csr_array, symmetric: bool = False) -> Factor:
         pattern = Pattern.of(matrix)
@@ -504,30 +469,6 @@ class BorderedSpace(HilbertSpace):
         return LinearOperator((len(free), len(free)), matvec=apply, dtype=float)
 
 
-@dataclass(frozen=True, eq=False)
-class _Negative:
-    """Factor of -K, by the factor of K."""
-
-    factor: Factor
-
-    def solve(self, b: Array) -> Array:
-        """Return the solution for a right-hand side."""
-        return -self.factor.solve(b)
-
-
-@dataclass(frozen=True, eq=False)
-class _Root:
-    """Inverse of -F H^{-1} F, by the factor of F."""
-
-    F: Factor
-    H: sp.csr_array
-
-    def solve(self, b: Array) -> Array:
-        """Return the Riesz representative of b, zero at fixed coefficients."""
-        # G^-1 = -F^-1 H F^-1.
-        return -self.F.solve(self.H @ self.F.solve(b))
-
-
 def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> HilbertSpace:
     """Return the product of spaces, with its own name and fixed coefficients."""
     whole = sp.csr_array(sp.block_diag([s.augmented for s in spaces], format="csr"))
@@ -543,6 +484,44 @@ def product(spaces: Sequence[HilbertSpace], name: str, fixed: IntArray) -> Hilbe
     # A Schur complement needs the coefficients of all spaces first, auxiliary unknowns last.
     order = np.concatenate([*leading, *rest])
     return BorderedSpace(sp.csr_array(whole[order][:, order]), dim, name, fixed)
+
+
+@dataclass(frozen=True, eq=False)
+class DualOperator:
+    """A linear operator T: source -> target*, given by a weak form.
+
+    Row i of `matrix`, (target.dim, source.dim), is the functional tested with basis function i: the
+    values of the operator are *dual* vectors of `target`.
+    """
+
+    matrix: sp.csr_array
+    source: HilbertSpace
+    target: HilbertSpace
+
+    def __post_init__(self) -> None:
+        expected = (self.target.dim, self.source.dim)
+        if self.matrix.shape != expected:
+            raise SpaceError(
+                f"Operator {self.source.name} -> {self.target.name}*: matrix of shape "
+                f"{self.matrix.shape}, the spaces need {expected}."
+            )
+
+    def __call__(self, x: Array) -> Array:
+        """Return T x, a dual vector of the target, shape (target.dim,)."""
+        value: Array = self.matrix @ x
+        return value
+
+    def transposed(self, y: Array) -> Array:
+        """Return T^T y, a dual vector of the source, for y in the target."""
+        value: Array = self.matrix.T @ y
+        return value
+
+    def adjoint(self, y: Array) -> Array:
+        """Return T* y in the source: (T* y, xi)_source = <T xi, y> for every tangent xi.
+
+        The paper's A(u)^*: Q <- X of (est_exact_q), a transpose and one Riesz solve.
+        """
+        return self.source.riesz(self.transposed(y))
 
 
 def _data(matrix: sp.csr_array) -> Array:

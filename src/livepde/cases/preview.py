@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case import Prepared
-from livepde.diagnostics.identifiability import identifiability
+from livepde.diagnostics.information_gain import identifiability
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier

@@ -35,7 +35,7 @@ from livepde.fem.field_blocks import base_name
 from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
 from livepde.models.boundary_conditions import Amount, Multiple
-from livepde.observation.flux_plates import in_cells
+from livepde.observation.functionals import in_cells
 from livepde.runs.summary import LAYERS, SURFACES
 from livepde.units import conversion
 

@@ -24,10 +24,8 @@ class Check:
         The measured quantity, in words or as an equation.
     value
         The number; NaN never satisfies anything.
-    bound
+    bound, sense
         One number for "<=" and ">=", a pair (low, high) for "in".
-    sense
-        "<=", ">=" or "in".
     remedy
         Advice if the bound is missed.
 
@@ -123,16 +121,7 @@ class Table:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """Measured properties of one object.
-
-    Attributes
-    ----------
-    name
-        Name of the object.
-    lines
-        Measured properties.
-    error
-        Exception class raised by `raise_if_failed`.
+    """Measured properties of one object; `raise_if_failed` raises `error`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Check of weak forms: linearity, derivatives, assembly and mass."""
+"""Checks of Hilbert spaces and of weak forms: linearity, derivatives, assembly and mass."""
 
 from __future__ import annotations
 
@@ -10,15 +10,87 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import Check, CheckReport
-from livepde.diagnostics.space_checks import definite, largest, relative, relative_to
-from livepde.errors import LinearAlgebraError, ModelError
+from livepde.errors import LinearAlgebraError, ModelError, SpaceError
 from livepde.fem import Composed, Form, Inputs, Moment
 from livepde.linalg import Array, Pattern, analyse
 from livepde.model import Model
 from livepde.spaces import HilbertSpace
 
-# Relative error of identities between sums of products.
 ROUNDING = 1e-12
+
+
+def check_space(space: HilbertSpace, *, seed: int = 0) -> CheckReport:
+    """Check symmetry, positivity and the Riesz map of a space, such as `model.X` or `model.Q`.
+
+    Examples
+    --------
+    >>> import scipy.sparse as sp
+    >>> import livepde as lp
+    >>> check_space(lp.spaces.HilbertSpace(sp.csr_array([[2.0, 1.0], [1.0, 2.0]]))).ok
+    True
+    """
+    rng, gram = np.random.default_rng(seed), space.tangent_gram
+    lines = [
+        Check.at_most(
+            "G = G^T",
+            relative(gram - gram.T, gram),
+            ROUNDING,
+            "Write the inner product as a form that does not change when u and v are exchanged.",
+        ),
+        definite(space),
+    ]
+    if lines[-1].ok:
+        x = rng.standard_normal(space.dim) * space.free
+        functional = rng.standard_normal(space.dim)
+        y = space.riesz(functional)
+        size = (space.norm(x) * space.norm(y)) or 1.0
+        singular = (
+            "The Gram matrix is close to singular: add a zero-order term to the inner product or "
+            "fix boundary values."
+        )
+        lines += [
+            Check.at_most(
+                "(riesz(f), x) = f(x)",
+                abs(space.inner(y, x) - float(functional @ x)) / size,
+                ROUNDING,
+                singular,
+            ),
+            Check.at_most(
+                "riesz(dual(x)) = x",
+                space.norm(space.riesz(space.dual(x)) - x) / (space.norm(x) or 1.0),
+                1e-9,
+                singular,
+            ),
+        ]
+    return CheckReport(f"space {space.name}", tuple(lines), SpaceError)
+
+
+def definite(space: HilbertSpace) -> Check:
+    """Return the line on positive definiteness: the Gram matrix can be factorised."""
+    remedy = ""
+    try:
+        _ = space.factor
+    except (SpaceError, LinearAlgebraError) as error:
+        remedy = str(error)
+    return Check.at_most("G positive definite (failures)", bool(remedy), 0, remedy)
+
+
+def relative(difference: sp.csr_array | Array, reference: sp.csr_array | Array) -> float:
+    """Return the largest entry of a difference relative to the largest entry of a reference."""
+    return relative_to(largest(difference), largest(reference))
+
+
+def relative_to(error: float, size: float) -> float:
+    """Return an error relative to a size; the error itself if the size is zero."""
+    return error / size if size > 0 else error
+
+
+def largest(matrix: sp.csr_array | Array) -> float:
+    """Return the largest entry in modulus; NaN if one is not finite."""
+    data = matrix.data if sp.issparse(matrix) else np.asarray(matrix)
+    return float(np.abs(data).max(initial=0.0))
+
+
 # Relative nonlinearity of an integrand; functions such as exp have larger rounding errors.
 LINEARITY = 1e-10
 # Step sizes of the Taylor tests.
@@ -47,12 +119,11 @@ def check_model(
     Linearity in q and in the test function v, transpose and adjoint (A(u)* r, xi)_Q = <A(u) xi, r>,
     derivatives by Taylor tests (the remainder f(u + s du) - f(u) - s f'(u) du falls like s^2, or
     vanishes for affine forms), the assembled matrices against plain quadrature of the integrand,
-    and the mass. Where components have no mass term, their equations must determine them.
+    and the mass. Where components have no mass term, their equations must determine them. Print the
+    report, or call `raise_if_failed`, which raises `ModelError`.
 
     Parameters
     ----------
-    model
-        The model.
     q, u
         A typical parameter (default the prior mean) and a typical state (default the initial state
         of the model, or zero): numbers, functions of x, or coefficients.
@@ -62,11 +133,6 @@ def check_model(
         Time and input channels; channels that are not given are 1.
     seed
         Seed of the random vectors.
-
-    Returns
-    -------
-    CheckReport
-        Print it, or call `raise_if_failed`, which raises `ModelError`.
 
     Examples
     --------
@@ -260,61 +326,41 @@ def _adjoint(model: Model, at: _TestPoint) -> list[Check]:
 
 def _derivatives(model: Model, at: _TestPoint) -> list[Check]:
     A, B, moment = model.form_A, model.form_B, at.moment
-    given = "dA" if any(_plain(A).derivatives) else ""
+    u, q, r, dq = at.u, at.q, at.r, 0.1 * at.dq
+    by_hand = "dA" if any(_plain(A).derivatives) else ""
 
-    def residual(u: Array) -> Array:
-        return A.matrix("v", "q", moment, u=u, q=at.q).T @ at.r
+    def pulled(u: Array, q: Array) -> Array:
+        return A.matrix("v", "q", moment, u=u, q=q).T @ r
 
-    def pulled(q: Array) -> Array:
-        return A.matrix("v", "q", moment, u=at.u, q=q).T @ at.r
-
-    found = [
-        _taylor(
+    in_u: list[tuple[str, str, Callable[[Array], Array], sp.csr_array]] = [
+        (
             "B'(u)",
             "dB" if any(B.derivatives) else "",
             lambda u: B.vector("v", moment, u=u),
-            B.matrix("v", "u", moment, u=at.u) @ at.du,
-            at.u,
-            at.du,
+            B.matrix("v", "u", moment, u=u),
         ),
-        _taylor(
+        (
             "d(A(u) q)/du",
-            given,
-            lambda u: A.vector("v", moment, q=at.q, u=u),
-            A.matrix("v", "u", moment, u=at.u, q=at.q) @ at.du,
-            at.u,
-            at.du,
+            by_hand,
+            lambda u: A.vector("v", moment, q=q, u=u),
+            A.matrix("v", "u", moment, u=u, q=q),
         ),
-        _taylor(
+        (
             "d(A(u)^T r)/du",
-            given,
-            residual,
-            A.matrix("q", "u", moment, u=at.u, v=at.r, q=at.q) @ at.du,
-            at.u,
-            at.du,
+            by_hand,
+            lambda u: pulled(u, q),
+            A.matrix("q", "u", moment, u=u, v=r, q=q),
         ),
     ]
-    if not A.linear_in_parameter:
-        dq = 0.1 * at.dq
-        found += [
-            _taylor(
-                "d(A(u) q)/dq",
-                "",
-                lambda q: A.vector("v", moment, q=q, u=at.u),
-                A.matrix("v", "q", moment, u=at.u, q=at.q) @ dq,
-                at.q,
-                dq,
-            ),
-            _taylor(
-                "d(A(u)^T r)/dq",
-                "",
-                pulled,
-                A.matrix("q", "q", moment, u=at.u, v=at.r, q=at.q) @ dq,
-                at.q,
-                dq,
-            ),
-        ]
-    return found
+    found = [_taylor(name, given, f, J @ at.du, u, at.du) for name, given, f, J in in_u]
+    if A.linear_in_parameter:
+        return found
+    driven, pull = A.matrix("v", "q", moment, u=u, q=q), A.matrix("q", "q", moment, u=u, v=r, q=q)
+    return [
+        *found,
+        _taylor("d(A(u) q)/dq", "", lambda q: A.vector("v", moment, q=q, u=u), driven @ dq, q, dq),
+        _taylor("d(A(u)^T r)/dq", "", lambda q: pulled(u, q), pull @ dq, q, dq),
+    ]
 
 
 def _taylor(

@@ -5,8 +5,6 @@ from __future__ import annotations
 from skfem.helpers import dd as hess
 from skfem.helpers import ddot, div, dot, grad, mul, trace, transpose
 
-from livepde.fem.coefficients import Coefficients, numbers
-from livepde.fem.evolution import Evolution, MeanReverting, Periodic, RandomWalk
 from livepde.fem.field_blocks import FieldBlock, base_name
 from livepde.fem.fields import (
     Channel,
@@ -18,13 +16,21 @@ from livepde.fem.fields import (
     Predicate,
     Scalar,
     Scalars,
+    Source,
     Unknown,
+    absolute,
     declared,
+    ignores,
     interval,
     line,
+    maximum,
+    minimum,
+    positive,
+    upwind,
 )
-from livepde.fem.forms import Form, ignores
-from livepde.fem.latent import Composed, Latent, LatentPart, compose
+from livepde.fem.forms import Form
+from livepde.fem.latent import Coefficients, Composed, Latent, LatentPart, compose, numbers
+from livepde.fem.measure import START, Inputs, Moment, Place, with_constants
 from livepde.fem.meshes import (
     box,
     cells,
@@ -36,12 +42,18 @@ from livepde.fem.meshes import (
     rectangle,
     smooth,
 )
-from livepde.fem.notation import absolute, maximum, minimum, positive, upwind
-from livepde.fem.place import START, Inputs, Moment, Place, with_constants
-from livepde.fem.priors import LogitNormal, LogNormal, Normal, Prior
-from livepde.fem.random_field import random_field
-from livepde.fem.sobolev import Sobolev
-from livepde.fem.space import FunctionSpace, Named
+from livepde.fem.priors import (
+    Evolution,
+    LogitNormal,
+    LogNormal,
+    MeanReverting,
+    Normal,
+    Periodic,
+    Prior,
+    RandomWalk,
+)
+from livepde.fem.sobolev import Sobolev, random_field
+from livepde.fem.space import FunctionSpace, Named, source_density
 
 __all__ = [
     "START",
@@ -74,6 +86,7 @@ __all__ = [
     "Scalar",
     "Scalars",
     "Sobolev",
+    "Source",
     "Unknown",
     "absolute",
     "base_name",
@@ -102,6 +115,7 @@ __all__ = [
     "read_mesh",
     "rectangle",
     "smooth",
+    "source_density",
     "trace",
     "transpose",
     "upwind",

@@ -16,7 +16,7 @@ from skfem import Basis, Dofs
 from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
-from livepde.fem.elements import own
+from livepde.fem.elementwise import scatter, shared
 from livepde.fem.fields import (
     Channel,
     Declaration,
@@ -26,11 +26,9 @@ from livepde.fem.fields import (
     Scalars,
     is_nodal,
 )
-from livepde.fem.measure import Measure
-from livepde.fem.periodic import tied
-from livepde.fem.place import Moment, Place
+from livepde.fem.measure import Measure, Moment, Place, own
+from livepde.fem.meshes import tied
 from livepde.fem.priors import Normal
-from livepde.fem.scatter import scatter, shared
 from livepde.linalg import Array, Factor, IntArray, Pattern, analyse, conjugate_gradients
 
 JETS = ("value", "grad", "hess")
@@ -46,14 +44,9 @@ FINER = "give coefficients, or an element of first order."
 class Local:
     """Shape functions of a block on a measure.
 
-    Attributes
-    ----------
-    dofs
-        Coefficient of each local shape function, shape (local, elements).
-    parts
-        Derivatives passed to a form as (name, tensor shape), such as ("value", ()), ("grad", (d,)).
-    components
-        Number of components of all parts.
+    `dofs` are the coefficients of the local shape functions, shape (local, elements). `parts` are
+    the derivatives passed to a form as (name, tensor shape), such as ("value", ()), ("grad", (d,)),
+    with `components` numbers in total.
     """
 
     def __init__(
@@ -85,6 +78,7 @@ class Block(ABC):
     """One unknown of a function space."""
 
     size: int
+    unknown: Any
 
     def dofs_on(self, measure: Measure) -> IntArray:
         """Return the coefficient of each local shape function, shape (local, elements)."""
@@ -103,9 +97,9 @@ class Block(ABC):
         """Return the matrix from coefficients to those of the same unknown on a finer mesh."""
         return sp.csr_array(sp.eye_array(self.size))
 
-    @abstractmethod
     def prior(self) -> Array:
         """Return the prior mean as coefficients, shape (size,)."""
+        return np.full(self.size, float(self.unknown.prior.centre))
 
     @abstractmethod
     def labels(self, name: str) -> tuple[str, ...]:
@@ -123,14 +117,12 @@ class ScalarBlock(Block):
         masks = np.zeros((self.size, *measure.shape))
         if isinstance(self.unknown, Scalar):
             return masks + 1.0
+        cells = np.arange(measure.mesh.nelements) if measure.cells is None else measure.cells
         for mask, region in zip(masks, self.unknown.regions.values(), strict=True):
             if callable(region):
                 mask[:] = region(measure.points)
             else:
-                members = measure.cells
-                if members is None:
-                    members = np.arange(measure.mesh.nelements)
-                mask[np.isin(members, measure.mesh.subdomains[region])] = 1.0
+                mask[np.isin(cells, measure.mesh.subdomains[region])] = 1.0
         return masks
 
     def local(self, measure: Measure) -> Local:
@@ -146,9 +138,6 @@ class ScalarBlock(Block):
 
     def jet(self, parts: Local, values: Array) -> Any:
         return values[0]
-
-    def prior(self) -> Array:
-        return np.full(self.size, float(self.unknown.prior.centre))
 
     def labels(self, name: str) -> tuple[str, ...]:
         if isinstance(self.unknown, Scalar):
@@ -174,9 +163,6 @@ class NamesBlock(Block):
 
     def jet(self, parts: Local, values: Array) -> dict[str, Array]:
         return dict(zip(self.names, values, strict=True))
-
-    def prior(self) -> Array:
-        return np.full(self.size, float(self.unknown.prior.centre))
 
     def labels(self, name: str) -> tuple[str, ...]:
         return tuple(f"{name}[{item}]" for item in self.names)
@@ -297,8 +283,7 @@ class FieldBlock(Block):
                     basis = measure.facets(self.element, self.dofs).basis
                     functions.extend(function for (function,) in basis)
                 else:
-                    count = len(dofs)
-                    functions.extend(measure.gbasis(self.element, i) for i in range(count))
+                    functions.extend(measure.gbasis(self.element, i) for i in range(len(dofs)))
             stack = np.stack([_jet(function, part) for function in functions], axis=-3)
             return stack.reshape(int(np.prod(stack.shape[:-3])), *shape)
 
@@ -349,10 +334,7 @@ class FieldBlock(Block):
     def project(self, values: Array) -> Array:
         """Return the coefficients of the L2 projection of a function.
 
-        Parameters
-        ----------
-        values
-            Values of the function at the quadrature points of `measure`, one or more per point.
+        `values` are at the quadrature points of `measure`, one or more per point.
         """
         grid = values.reshape(-1, *self.measure.shape)
         return self._projected(lambda at, piece: grid[:, at])
@@ -382,8 +364,8 @@ class FieldBlock(Block):
             Shape (d, points): the nodes of an element of first order, else quadrature points.
         fit
             Function that returns coefficients of the cells, shape (size,), 0 elsewhere, from values
-            at the points, shape (components, points): the values at the nodes, else the L2
-            projection on the cells.
+            at the points, shape (components, points): at the nodes, else by the L2 projection on
+            the cells.
         """
         used = np.unique(self.element_dofs[:, cells])
         found = np.zeros(self.size)
@@ -538,14 +520,8 @@ class FieldBlock(Block):
         return u
 
     def traces(self, value: Any, coefficients: Array) -> Iterator[tuple[str, Array]]:
-        """Yield each channel of a Dirichlet condition, and the values of a function there.
-
-        Parameters
-        ----------
-        value, coefficients
-            The function as it was given, and its coefficients.
-        """
-        # A projection differs from a given function of x at the boundary.
+        """Yield each channel of a Dirichlet condition, and the values of a function there."""
+        # A projection differs from the function of x that was given as `value` at the boundary.
         exact = callable(value) and not self.vector
         for k, (dofs, condition) in enumerate(self.conditions):
             if not isinstance(condition, Channel):
@@ -654,10 +630,7 @@ class FieldBlock(Block):
 
 @dataclass(frozen=True)
 class _Component:
-    """One component of vector boundary values g(x, t).
-
-    The function g returns a sequence or array with a row for each component, or one common row.
-    """
+    """One component of vector boundary values g(x, t), which have a row for each, or one row."""
 
     g: Callable[[Array, float], Any]
     axis: int

@@ -1,4 +1,9 @@
-"""Declarations of unknowns: fields on a mesh, scalars, values per region, named scalars."""
+"""Declarations of unknowns, and functions for weak forms: branches and upwinding.
+
+NumPy's abs of a complex number is its modulus, and max compares imaginary parts: both lose the
+derivative of a complex step. The functions here select the branch by the real part, so that the
+complex step differentiates that branch.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from inspect import signature
 from itertools import chain
 from typing import Any, TypeAlias
 
@@ -14,10 +20,10 @@ from skfem import Mesh, MeshLine
 from skfem.element import Element
 
 from livepde.errors import SpaceError
-from livepde.fem.evolution import CONSTANT, Evolution, RandomWalk
-from livepde.fem.priors import Normal, Prior
+from livepde.fem.priors import CONSTANT, Evolution, Normal, Prior, RandomWalk
 from livepde.fem.sobolev import Sobolev
 from livepde.linalg import Array
+from livepde.showing import expression
 
 # Half width of the default trust region in prior standard deviations: a Gaussian value exceeds it
 # with a probability of 2e-23.
@@ -26,6 +32,9 @@ STANDARD = Normal()
 
 Integrand: TypeAlias = Callable[..., Any]
 """A weak form's integrand; see `Model` for the arguments."""
+
+Source: TypeAlias = float | Callable[[Any, float], Any] | Mapping[str, Any]
+"""A source density: a number or f(x, t); for several components a mapping of names to those."""
 
 Predicate: TypeAlias = Callable[[Array], Any]
 """A subset of the domain: x of shape (d, ...) -> booleans of shape (...)."""
@@ -53,6 +62,21 @@ class On:
     form: Integrand
 
 
+def ignores(function: Any, position: int) -> bool:
+    """Return whether a function declares by the name `_` that it ignores an argument.
+
+    Probing could not tell: a term may use an argument only at some times.
+
+    >>> ignores(lambda u, v, x: -x.t * v, 0), ignores(lambda _, v, x: -x.t * v, 0)
+    (False, True)
+    """
+    try:
+        names = [*signature(function).parameters]
+    except (TypeError, ValueError):  # of a function that is not written in Python
+        return False
+    return position < len(names) and names[position] == "_"
+
+
 def interval(
     start: float,
     stop: float,
@@ -66,15 +90,10 @@ def interval(
 
     Parameters
     ----------
-    start, stop
-        End points, in the unit of length of the model.
-    cells
-        Number of elements.
     regions
         Named subdomains, each a predicate on the midpoints of the elements.
     geometric
         True for elements that grow by a constant ratio, as in radial problems; needs start > 0.
-        False for a uniform mesh.
     through
         Points that must be nodes of the mesh: the nearest inner node is moved to each, so that a
         `Subdomain`, a layer or a sensor ends at a node.
@@ -153,13 +172,9 @@ class _Declared:
     def interval(self, value: Any, std: Any, level: float = 0.95) -> tuple[Array, Array]:
         """Return the ends of the central interval that holds the unknown with probability `level`.
 
-        Those of the prior's kind of distribution (`Prior.interval`), for a `LogNormal` and a
-        `LogitNormal` also cut off at the ends of the latent values (`within`).
-
-        Parameters
-        ----------
-        value, std
-            Estimates and their standard deviations, of equal shape.
+        Those of the prior's kind of distribution (`Prior.interval`) for estimates `value` with
+        standard deviations `std`, for a `LogNormal` and a `LogitNormal` also cut off at the ends of
+        the latent values (`within`).
         """
         low, high = self.prior.interval(value, std, level)
         if not isinstance(self.prior, Normal):
@@ -245,8 +260,18 @@ class Field(_Declared):
         return [item for value in self.dirichlet.values() for item in _each_value(value)]
 
     @property
+    def boundary_text(self) -> str:
+        """The Dirichlet values as text."""
+
+        def shown(value: Any) -> str:
+            if isinstance(value, Channel):
+                return f"channel {value.name}"
+            return expression(value) if callable(value) else f"{value}"
+
+        return ", ".join(f"{name} = {shown(value)}" for name, value in self.dirichlet.items())
+
+    @property
     def point_std(self) -> float:
-        """Largest prior standard deviation of a latent value at a point; inf if unknown."""
         pointwise = isinstance(self.inner, Sobolev) and self.inner.factor != 1.0
         return math.sqrt(2.0) * self.prior.latent_std if pointwise else math.inf
 
@@ -401,14 +426,7 @@ class Piecewise(_Declared):
 class Scalars(_Declared):
     """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
-    Forms and sensors see a mapping, q.offset["T_10"].
-
-    Parameters
-    ----------
-    names
-        Their names.
-    prior, unit, evolution, within
-        As for `Scalar`.
+    Forms and sensors see a mapping, q.offset["T_10"]. The other options are those of `Scalar`.
     """
 
     names: Sequence[str]
@@ -440,3 +458,83 @@ def declared(unknown: Unknown) -> Declaration:
             "Scalars or Field."
         )
     return unknown
+
+
+SERIES = (1 / 3, -1 / 45, 2 / 945, -1 / 4725, 2 / 93555, -1382 / 638512875)
+# Square of the Peclet number below which the truncated series is exact to rounding.
+SMALL = 0.01
+
+
+def absolute(a: Any) -> Any:
+    """Return |a|; its derivative is the sign of a."""
+    a = np.asarray(a)
+    return np.where(a.real < 0.0, -a, a)
+
+
+def maximum(a: Any, b: Any) -> Any:
+    """Return the larger of two values, pointwise, with its derivative."""
+    a, b = np.asarray(a), np.asarray(b)
+    return np.where(a.real >= b.real, a, b)
+
+
+def minimum(a: Any, b: Any) -> Any:
+    """Return the smaller of two values, pointwise, with its derivative."""
+    a, b = np.asarray(a), np.asarray(b)
+    return np.where(a.real <= b.real, a, b)
+
+
+def positive(a: Any) -> Any:
+    """Return max(a, 0)."""
+    return maximum(a, 0.0)
+
+
+def upwind(b: Any, kappa: Any, h: Any) -> Any:
+    """Return the optimal artificial diffusion, |b| h/2 (coth Pe - 1/Pe) with Pe = |b| h/(2 kappa).
+
+    Added to kappa, it makes elements of first order on a uniform line exact at the vertices for
+    the steady -kappa u'' + b u' = 0, however large the cell Peclet number Pe (Brooks and Hughes
+    1982, section 2); it vanishes like h^2 on fine meshes. In more dimensions it acts along
+    the streamlines only. Smooth also at b = 0, so that derivatives by complex steps hold.
+
+    Parameters
+    ----------
+    b
+        Velocity: a number or array in 1D, else a tuple or list of d components.
+    kappa
+        Diffusivity, positive.
+    h
+        Size of the cells, `x.h` in a form.
+
+    Returns
+    -------
+    A number for each point in 1D, else the tensor b b^T/|b|^2 times it, shape (d, d, ...).
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> k = 0.01
+    >>> line = lambda u, v, x: (k + upwind(2.0, k, x.h)) * lp.dot(lp.grad(u), lp.grad(v))
+    >>> def plane(u, v, x):
+    ...     return lp.dot(lp.fem.mul(upwind((2.0, x[0]), k, x.h), lp.grad(u)), lp.grad(v))
+    >>> round(float(upwind(2.0, k, 0.1)), 6)  # nearly |b| h/2
+    0.09
+    """
+    components = list(b) if isinstance(b, Sequence) else [b]
+    square = sum(part * part for part in components)
+    factor = h * h / (4.0 * kappa) * _even(square * (h / (2.0 * kappa)) ** 2)
+    if not isinstance(b, Sequence):
+        return factor * square
+    rows = [[factor * p * q for q in components] for p in components]
+    flat = np.broadcast_arrays(*(entry for row in rows for entry in row))
+    return np.stack(flat).reshape(len(rows), len(rows), *flat[0].shape)
+
+
+def _even(w: Any) -> Any:
+    """Return (coth z - 1/z)/z with w = z^2: analytic in w, also at zero."""
+    w = np.asarray(w)
+    small = np.abs(w) < SMALL
+    z = np.sqrt(np.where(small, 1.0, w))
+    decay = np.exp(-2.0 * z)
+    far = ((1.0 + decay) / (1.0 - decay) - 1.0 / z) / z
+    near = np.polynomial.polynomial.polyval(np.where(small, w, 0.0), SERIES)
+    return np.where(small, near, far)

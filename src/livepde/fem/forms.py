@@ -23,18 +23,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from inspect import signature
 from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import LivepdeError, ModelError
-from livepde.fem.elementwise import ElementProducts, ElementTensor
-from livepde.fem.fields import Integrand, On
-from livepde.fem.measure import Measure
-from livepde.fem.place import START, Inputs, Moment, Place
-from livepde.fem.scatter import Scatter, scatter
+from livepde.fem.elementwise import ElementProducts, ElementTensor, Scatter, scatter
+from livepde.fem.fields import Integrand, On, ignores
+from livepde.fem.measure import START, Inputs, Measure, Moment, Place
 from livepde.fem.space import FunctionSpace, LocalSpace
 from livepde.linalg import Array, IntArray, Pattern
 
@@ -88,25 +85,17 @@ class _Term:
         for _, piece in thin.pieces():
             yield piece
 
+    def drawn(self, rng: np.random.Generator) -> dict[str, Array]:
+        """Return random component values of each argument at all points."""
+        return {
+            key: rng.standard_normal((local.components, *local.shape))
+            for key, local in self.spaces.items()
+        }
+
     def evaluate(self, values: Mapping[str, Array], moment: Moment) -> tuple[Any, Place]:
         place = self.measure.place(moment)
         jets = [self.spaces[name].jets(array) for name, array in values.items()]
         return self.integrand(*jets, place), place
-
-
-def ignores(function: Any, position: int) -> bool:
-    """Return whether a function declares by the name `_` that it ignores an argument.
-
-    Probing could not tell: a term may use an argument only at some times.
-
-    >>> ignores(lambda u, v, x: -x.t * v, 0), ignores(lambda _, v, x: -x.t * v, 0)
-    (False, True)
-    """
-    try:
-        names = [*signature(function).parameters]
-    except (TypeError, ValueError):  # of a function that is not written in Python
-        return False
-    return position < len(names) and names[position] == "_"
 
 
 class FormMatrices(ABC):
@@ -193,7 +182,7 @@ class Form(FormMatrices):
         for slot in self.spaces:
             if slot not in (nonlinear, parameter):
                 self._check_linear(slot)
-        self.linear_in_parameter = parameter is None or self._linear(parameter)
+        self.linear_in_parameter = parameter is None or self._affine(parameter, homogeneous=True)
         curved = {nonlinear} if self.linear_in_parameter else {nonlinear, parameter}
         self._curved = frozenset(key for key in curved if key is not None)
 
@@ -210,11 +199,6 @@ class Form(FormMatrices):
 
         Terms without such cells are omitted. The coefficients are those of the whole mesh; the
         patterns contain only the couplings of these cells.
-
-        Parameters
-        ----------
-        cells
-            Numbers of the cells.
         """
         part = copy(self)
         measures = [term.measure.on(cells) for term in self.terms]
@@ -231,18 +215,18 @@ class Form(FormMatrices):
         for term in self.terms:
             read = set().union(*(self._read(piece, rng) for piece in term.samples()))
             used |= read
-            self._moving.append(bool(read) and self._involves_state(term.integrand))
+            # A term that ignores the nonlinear argument does not move its derivative.
+            moves = self.nonlinear is not None and not ignores(
+                term.integrand, list(self.spaces).index(self.nonlinear)
+            )
+            self._moving.append(bool(read) and moves)
         return frozenset(used)
 
     def _read(self, term: _Term, rng: np.random.Generator) -> set[str]:
         """Evaluate a term at random values and return the names of time and inputs it reads."""
-        values = {
-            key: rng.standard_normal((local.components, *local.shape))
-            for key, local in term.spaces.items()
-        }
         try:
             with np.errstate(all="ignore"):  # roots and logarithms of random numbers
-                density, place = term.evaluate(values, Moment(0.0, self._inputs))
+                density, place = term.evaluate(term.drawn(rng), Moment(0.0, self._inputs))
             shape = np.broadcast_shapes(np.shape(density), term.measure.shape)
         except LivepdeError:
             raise
@@ -260,20 +244,11 @@ class Form(FormMatrices):
         return place.used
 
     def _check_linear(self, slot: str) -> None:
-        """Refuse a term that is not linear in an argument, such as one without the test function.
-
-        Raises
-        ------
-        ModelError
-            Naming the term, if there are several.
-        """
+        """Refuse a term that is not linear in an argument: one without the test function, say."""
         rng = np.random.default_rng(3)
         for number, whole in enumerate(self.terms):
             for term in whole.samples():
-                values = {
-                    key: rng.standard_normal((local.components, *local.shape))
-                    for key, local in term.spaces.items()
-                }
+                values = term.drawn(rng)
                 place, one = Moment(0.3, self._inputs), values[slot]
 
                 def at(
@@ -307,12 +282,8 @@ class Form(FormMatrices):
         """Return the factor of component `of` of u and `tested` of v, at points of all elements.
 
         Of the terms on the whole mesh, where the fields of the state have the value u and all their
-        derivatives are zero. Components are those of `LocalSpace.owners`.
-
-        Parameters
-        ----------
-        coefficients
-            Of the arguments beside u and v.
+        derivatives are zero; `coefficients` are of the other arguments. Components are those of
+        `LocalSpace.owners`.
         """
         moment, total = Moment(0.3, self._inputs), np.zeros(1)
         for whole in (term for term in self.terms if term.measure.name is None):
@@ -339,12 +310,6 @@ class Form(FormMatrices):
         """True if the form reads neither time nor inputs."""
         return not self.uses
 
-    def _involves_state(self, integrand: Integrand) -> bool:
-        """Return False if an integrand ignores its nonlinear argument."""
-        if self.nonlinear is None:
-            return False
-        return not ignores(integrand, list(self.spaces).index(self.nonlinear))
-
     @property
     def steady(self) -> bool:
         """True if the derivative in the nonlinear argument reads neither time nor inputs."""
@@ -355,9 +320,6 @@ class Form(FormMatrices):
         """True if the form is affine in its nonlinear argument (probed at several magnitudes)."""
         return self.nonlinear is None or self._affine(self.nonlinear, homogeneous=False)
 
-    def _linear(self, slot: str) -> bool:
-        return self._affine(slot, homogeneous=True)
-
     def _affine(self, slot: str, homogeneous: bool) -> bool:
         """Return True if the form is affine (linear, if homogeneous) in an argument."""
         # Probing has a fixed seed: whether a form counts as affine must not differ between two
@@ -365,10 +327,7 @@ class Form(FormMatrices):
         rng = np.random.default_rng(1)
         probe = Moment(0.3, self._inputs)
         for term in (piece for whole in self.terms for piece in whole.samples()):
-            values = {
-                key: rng.standard_normal((local.components, *local.shape))
-                for key, local in term.spaces.items()
-            }
+            values = term.drawn(rng)
 
             def at(x: Array, term: _Term = term, values: dict[str, Array] = values) -> Array:
                 density, _ = term.evaluate({**values, slot: x}, probe)
@@ -407,12 +366,8 @@ class Form(FormMatrices):
         self, term: _Term, slot: str, test: str, scale: float, rng: np.random.Generator
     ) -> bool:
         """Return True if derivatives of an argument matter at one magnitude."""
-
-        def drawn(local: LocalSpace) -> Array:
-            return rng.standard_normal((local.components, *local.shape))
-
-        values = {key: drawn(local) for key, local in term.spaces.items()}
-        here, there = scale * values[slot], scale * drawn(term.spaces[slot])
+        values = term.drawn(rng)
+        here, there = scale * values[slot], scale * rng.standard_normal(values[slot].shape)
         steep = np.where(term.spaces[slot].derivatives[:, None, None], there, here)
         flux = np.where(term.spaces[test].derivatives[:, None, None], values[test], 0.0)
 
@@ -443,7 +398,14 @@ class Form(FormMatrices):
                 return self._slopes[slot] @ coefficients[others[0]] + self._offset(slot)
             rest = {key: coefficients[key] for key in others if key != linear[0]}
             return self.product(slot, linear[0], coefficients[linear[0]], moment, **rest)
-        return self._vector(slot, moment, coefficients)[0]
+        return self.traced(slot, moment, **coefficients)[0]
+
+    def _offset(self, slot: str) -> Array:
+        """Return the vector of an affine form at zero, cached."""
+        if slot not in self._offsets:
+            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
+            self._offsets[slot] = self.traced(slot, START, **zero)[0]
+        return self._offsets[slot]
 
     def traced(
         self, slot: str, moment: Moment = START, **coefficients: Array
@@ -453,18 +415,6 @@ class Form(FormMatrices):
         The result is reusable as long as the values of these names are the same, on any branch of
         the integrand.
         """
-        return self._vector(slot, moment, coefficients)
-
-    def _offset(self, slot: str) -> Array:
-        """Return the vector of an affine form at zero, cached."""
-        if slot not in self._offsets:
-            zero = {key: np.zeros(space.dim) for key, space in self.spaces.items()}
-            self._offsets[slot] = self._vector(slot, START, zero)[0]
-        return self._offsets[slot]
-
-    def _vector(
-        self, slot: str, moment: Moment, coefficients: Mapping[str, Array]
-    ) -> tuple[Array, frozenset[str]]:
         read: set[str] = set()
         result = np.zeros(self.spaces[slot].dim)
         for term in (piece for whole in self.terms for _, piece in whole.pieces()):
@@ -488,7 +438,6 @@ class Form(FormMatrices):
         return self._scatters[rows, cols]
 
     def pattern(self, rows: str, cols: str) -> Pattern:
-        """Return the sparsity of the matrices `data(rows, cols)`."""
         return self._scatter(rows, cols).pattern
 
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
@@ -554,10 +503,10 @@ class Form(FormMatrices):
     ) -> Array:
         """Return the integrand's derivative in `rows`, `cols`: (components, components, E, P).
 
-        Unit jets are used in arguments in which the form is linear, and a complex step in a
-        nonlinear one. If both are nonlinear (only Jacobians of iterations need this), a central
-        difference of complex steps is used, in the argument in which the form is affine if there is
-        one: then it is exact.
+        By unit jets in arguments in which the form is linear, and a complex step in a nonlinear
+        one. If both are nonlinear (only Jacobians of iterations need this), by a central difference
+        of complex steps, in the argument in which the form is affine if there is one: then it is
+        exact.
         """
         place = term.measure.place(moment)
         if self.nonlinear not in (rows, cols):
@@ -617,8 +566,7 @@ class Form(FormMatrices):
     def _scale(self, key: str, local: LocalSpace, values: Array) -> Array:
         """Return the step scale of each component at each point: (components, 1, 1, E, P).
 
-        It is bounded from below, for the parameter by its prior standard deviation: the magnitude
-        of a value near zero is no scale.
+        It is bounded from below, for the parameter by its prior standard deviation.
         """
         size = np.abs(values)
         whole = size.max(axis=(1, 2), keepdims=True)

@@ -1,37 +1,122 @@
 """Latent coefficients a with a Gaussian prior, the unknowns of laws: q = V T(a).
 
-Without transforms and evolutions, latent coefficients equal those of q.
+Without transforms and evolutions, latent coefficients equal those of q. `Coefficients` are numbers
+computed from q in which a form is linear, such as k/C.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, wraps
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import SpaceError
-from livepde.fem.evolution import Evolution
-from livepde.fem.forms import Form, FormMatrices
-from livepde.fem.place import START, Moment
-from livepde.fem.priors import Identity, Transform
-from livepde.fem.space import FunctionSpace
+from livepde.fem.fields import Integrand, On, Scalars
+from livepde.fem.forms import STEP, Form, FormMatrices
+from livepde.fem.measure import START, Moment
+from livepde.fem.priors import Evolution, Identity, Normal, Transform
+from livepde.fem.space import FunctionSpace, Named
 from livepde.linalg import Array, IntArray, Pattern, sandwich
+
+
+def numbers(parameter: FunctionSpace, q: Array) -> Any:
+    """Return the parameter in the form of sensor functions: numbers, arrays, mappings by name."""
+    seen: dict[str, Any] = {}
+    for name in parameter.names:
+        part = q[parameter.part(name)]
+        unknown = parameter.unknowns.get(name)
+        if isinstance(unknown, Scalars):
+            seen[name] = dict(zip(unknown.names, part, strict=True))
+        else:
+            seen[name] = part[0] if len(part) == 1 else part
+    if parameter.single:
+        return next(iter(seen.values()))
+    return Named(**seen)
+
+
+@dataclass(frozen=True, eq=False)
+class Coefficients:
+    """Unknowns q followed by numbers c(q) of which a form reads q.name.
+
+    Parameters
+    ----------
+    parameter
+        Space of the unknowns, each with a name.
+    function
+        q -> {name: value}, of numbers and of what forms see, point by point; analytic.
+    typical
+        Unknowns for which the function has values, shape (m,).
+    """
+
+    parameter: FunctionSpace
+    function: Callable[[Any], Mapping[str, Any]]
+    typical: Array
+
+    @cached_property
+    def _computed(self) -> Mapping[str, Any]:
+        """Values for typical unknowns; arrays of those that are computed from more than numbers."""
+        seen = vars(numbers(self.parameter, self.typical))
+        # Regions of one unknown and nodes of another have no common shape.
+        one = {name: v[:1] if isinstance(v, np.ndarray) else v for name, v in seen.items()}
+        return self.function(Named(**one))
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the numbers."""
+        return list(self._computed)
+
+    @property
+    def numeric(self) -> bool:
+        """False if one of them varies in space, since an unknown does that it is computed from."""
+        return all(np.ndim(value) == 0 for value in self._computed.values())
+
+    @cached_property
+    def space(self) -> FunctionSpace:
+        """Space of the unknowns and of the numbers, of dimension p."""
+        more = dict.fromkeys(self.names, Normal(0.0, std=1.0))
+        return FunctionSpace.of({**self.parameter.unknowns, **more}, "q")
+
+    def value(self, q: Array) -> Array:
+        """Return (q, c(q)), shape (p,), for unknowns of shape (m,)."""
+        computed = self.function(numbers(self.parameter, q)).values()
+        return np.concatenate([q, np.array([*computed], dtype=q.dtype)])
+
+    def slopes(self, q: Array) -> Array:
+        """Return the derivative of `value`, shape (p, m), by a complex step."""
+        found = np.zeros((self.space.dim, len(q)))
+        found[: len(q)] = np.eye(len(q))
+        for column in self.parameter.labels.values():
+            stepped = q.astype(complex)
+            stepped[column] += 1j * STEP
+            found[len(q) :, column] = np.imag(self.value(stepped)[len(q) :]) / STEP
+        return found
+
+    def expanded(self, terms: Integrand | On | Sequence[Integrand | On]) -> list[Integrand | On]:
+        """Return terms of the unknowns alone, which compute the numbers at each point."""
+
+        def one(term: Any) -> Any:
+            if isinstance(term, On):
+                return On(term.name, one(term.form))
+
+            @wraps(term)  # so that the names of its arguments stay
+            def integrand(q: Any, *others: Any) -> Any:
+                return term(Named(**vars(q), **self.function(q)), *others)
+
+            return integrand
+
+        return [one(term) for term in (terms if isinstance(terms, Sequence) else [terms])]
 
 
 @dataclass(frozen=True, eq=False)
 class LatentPart:
     """Latent coefficients of one unknown: `copies` times `size`, copy by copy.
 
-    Attributes
-    ----------
-    name, unknown, block
-        Name, declaration and block of the unknown in the function space.
-    part
-        Slice of its coefficients among all latent ones.
+    `unknown` and `block` are its declaration and block in the function space, `part` is the slice
+    of its coefficients among all latent ones.
     """
 
     name: str
@@ -239,7 +324,7 @@ class Latent:
 
 
 class Composed(FormMatrices):
-    """A form composed with q = V T(a): latent coefficients instead of q."""
+    """A form composed with q = V T(a): `Form` in latent coefficients instead of q."""
 
     def __init__(self, form: Form, latent: Latent) -> None:
         self.form = form
@@ -247,22 +332,18 @@ class Composed(FormMatrices):
         self._maps: dict[tuple[str, str], tuple[Pattern, sp.csr_array | None]] = {}
 
     def on(self, cells: IntArray) -> Composed:
-        """Return the form integrated over some cells of the mesh only."""
         return Composed(self.form.on(cells), self.latent)
 
     @property
     def affine(self) -> bool:
-        """True if the form is affine in u."""
         return self.form.affine
 
     @property
     def constant(self) -> bool:
-        """True if the form reads neither time nor inputs."""
         return self.form.constant
 
     @property
     def steady(self) -> bool:
-        """True if the derivative in u reads neither time nor inputs."""
         return self.form.steady
 
     @property
@@ -271,7 +352,6 @@ class Composed(FormMatrices):
         return self.latent.linear and self.form.linear_in_parameter
 
     def differentiates(self, slot: str, test: str = "v") -> bool:
-        """Return True if, integrated by parts, the form contains derivatives of an argument."""
         return self.form.differentiates(slot, test)
 
     def _physical(self, coefficients: dict[str, Array]) -> dict[str, Array]:
@@ -280,11 +360,9 @@ class Composed(FormMatrices):
         return {**coefficients, "q": self.latent.value(coefficients["q"])}
 
     def vector(self, slot: str, moment: Moment = START, **coefficients: Array) -> Array:
-        """Return the derivative in the linear argument `slot`."""
         return self.form.vector(slot, moment, **self._physical(coefficients))
 
     def pattern(self, rows: str, cols: str) -> Pattern:
-        """Return the sparsity of the matrices `data(rows, cols)`."""
         return self._mapped(rows, cols)[0]
 
     def _mapped(self, rows: str, cols: str) -> tuple[Pattern, sp.csr_array | None]:
@@ -305,7 +383,6 @@ class Composed(FormMatrices):
         return self._maps[rows, cols]
 
     def data(self, rows: str, cols: str, moment: Moment = START, **coefficients: Array) -> Array:
-        """Return the mixed derivative in `rows` and `cols`, as data of `pattern(rows, cols)`."""
         pattern, mapped = self._mapped(rows, cols)
         physical = self._physical(coefficients)
         data = self.form.data(rows, cols, moment, **physical)

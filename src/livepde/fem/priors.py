@@ -1,6 +1,9 @@
-"""Priors of unknowns: normal, log-normal (positive), logit-normal (between two bounds).
+"""Priors of unknowns, and their evolution between two samples.
 
-Each is Gaussian in a latent value a, and q = T(a): laws work with a, weak forms and sensors see q.
+A prior is Gaussian in a latent value a, and q = T(a): laws work with a, weak forms and sensors see
+q. An evolution is a linear stochastic differential equation of a about its prior mean,
+
+    d(a - prior) = K (a - prior) dt + noise.
 """
 
 from __future__ import annotations
@@ -13,6 +16,131 @@ import numpy as np
 
 from livepde.errors import SpaceError
 from livepde.linalg import Array
+
+
+def _positive(what: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise SpaceError(f"{what} must be a positive number; got {value}.")
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """Evolution model of an unknown; this base class, `CONSTANT`, does not move."""
+
+    @property
+    def copies(self) -> int:
+        """Number of components of the evolution; q is a sum of the `visible` ones."""
+        return 1
+
+    @property
+    def visible(self) -> Array:
+        """Weight of each component in q, shape (copies,)."""
+        return np.ones(1)
+
+    @property
+    def generator(self) -> Array:
+        """Drift matrix K of the components, shape (copies, copies)."""
+        return np.zeros((1, 1))
+
+    @property
+    def moves(self) -> bool:
+        """True unless the unknown is constant."""
+        return self != CONSTANT
+
+    def transition(self, h: float) -> Array:
+        """Return exp(K h), shape (copies, copies)."""
+        return np.eye(1)
+
+    def growth(self, h: float, std: float) -> Array:
+        """Return the variance added to each component in h, relative to the prior's, (copies,)."""
+        return np.zeros(1)
+
+
+@dataclass(frozen=True)
+class RandomWalk(Evolution):
+    """Random walk: a standard deviation of rate * sqrt(h) is added in a time h.
+
+    The rate is in the unit of the unknown (of its logarithm for a `LogNormal`) per square root of
+    the model's unit of time.
+    """
+
+    rate: float
+
+    def __post_init__(self) -> None:
+        _positive("RandomWalk: rate", self.rate)
+
+    def growth(self, h: float, std: float) -> Array:
+        # The variance rate^2 h, relative to std^2.
+        return np.array([self.rate**2 * h / std**2])
+
+
+@dataclass(frozen=True)
+class MeanReverting(Evolution):
+    """Ornstein-Uhlenbeck process: relaxation time `time`, stationary law the prior."""
+
+    time: float
+
+    def __post_init__(self) -> None:
+        _positive("MeanReverting: time", self.time)
+
+    @property
+    def generator(self) -> Array:
+        return np.array([[-1.0 / self.time]])
+
+    def transition(self, h: float) -> Array:
+        return np.array([[np.exp(-h / self.time)]])
+
+    def growth(self, h: float, std: float) -> Array:
+        # exp(-2 h/time) of the variance is left; the noise restores that of the prior.
+        return np.array([-np.expm1(-2.0 * h / self.time)])
+
+
+@dataclass(frozen=True)
+class Periodic(Evolution):
+    """A constant and harmonics: q(t) = q_0 + sum over k of a_k cos(2 pi k t/period + phase_k).
+
+    The constant has the prior mean; each harmonic has the prior standard deviation. The amplitudes
+    rotate with time, so that the equation is autonomous and a law needs no clock.
+    """
+
+    period: float
+    harmonics: int = 1
+
+    def __post_init__(self) -> None:
+        _positive("Periodic: period", self.period)
+        if self.harmonics < 1:
+            raise SpaceError(f"Periodic: harmonics must be at least 1; got {self.harmonics}.")
+
+    @property
+    def copies(self) -> int:
+        return 1 + 2 * self.harmonics
+
+    @property
+    def visible(self) -> Array:
+        # A harmonic is a pair (a cos, a sin) that rotates: q contains its first component.
+        return np.array([1.0] + self.harmonics * [1.0, 0.0])
+
+    @property
+    def generator(self) -> Array:
+        K = np.zeros((self.copies, self.copies))
+        for k in range(1, self.harmonics + 1):
+            omega, at = 2.0 * np.pi * k / self.period, 2 * k - 1
+            K[at, at + 1], K[at + 1, at] = -omega, omega
+        return K
+
+    def transition(self, h: float) -> Array:
+        F = np.eye(self.copies)
+        for k in range(1, self.harmonics + 1):
+            angle, at = 2.0 * np.pi * k * h / self.period, 2 * k - 1
+            c, s = np.cos(angle), np.sin(angle)
+            F[at : at + 2, at : at + 2] = [[c, -s], [s, c]]
+        return F
+
+    def growth(self, h: float, std: float) -> Array:
+        return np.zeros(self.copies)
+
+
+CONSTANT = Evolution()
 
 
 class Transform(ABC):
@@ -37,12 +165,9 @@ class Transform(ABC):
     def shifted(self, q: Array, std: Array, z: float) -> Array:
         """Return q shifted by z latent standard deviations: a quantile of T(Gaussian).
 
-        Parameters
-        ----------
-        q, std
-            T of the latent mean, and T' times the latent standard deviation; NaN stays NaN. Where q
-            equals an end of T's range to rounding, the latent standard deviation cannot be
-            recovered, and the end on the side of z is returned.
+        `q` is T of the latent mean, `std` T' times the latent standard deviation; NaN stays NaN.
+        Where q equals an end of T's range to rounding, the latent standard deviation cannot be
+        recovered, and the end on the side of z is returned.
         """
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             latent = self.inverse(q)
@@ -53,13 +178,10 @@ class Transform(ABC):
             return np.where(np.isnan(std), np.nan, self.value(moved))
 
     def moments(self, q: Array, std: Array) -> tuple[Array, Array]:
-        """Return mean and standard deviation of T(Gaussian).
+        """Return mean and standard deviation of T(Gaussian) from `q` and `std` as for `shifted`.
 
-        Parameters
-        ----------
-        q, std
-            As for `shifted`. Where q equals an end of T's range to rounding, that is the mean, and
-            `std` is returned as it is.
+        Where q equals an end of T's range to rounding, that is the mean, and `std` is returned as
+        it is.
         """
         # T is analytic in a strip, so that sums over even steps converge faster than any power of
         # the step; here to 1e-8 for latent standard deviations up to 20.
@@ -158,12 +280,7 @@ class Logit(Transform):
 class Prior(ABC):
     """What is known of a number before the first sample: common base of the distributions.
 
-    Attributes
-    ----------
-    std
-        Standard deviation in the unit of the unknown.
-    bounds
-        (lower, upper), never left by an estimate.
+    `std` is the standard deviation in the unit of the unknown; an estimate never leaves `bounds`.
     """
 
     std: float
@@ -178,6 +295,13 @@ class Prior(ABC):
     @abstractmethod
     def transform(self) -> Transform:
         """The transform q = T(latent)."""
+
+    @property
+    def text(self) -> str:
+        """The prior as text, with bounds where they are not those of its kind."""
+        usual = self.bounds == getattr(type(self), "bounds", None)
+        bounds = "" if usual else f", bounds={self.bounds}"
+        return f"{type(self).__name__}({self.centre:g}, std={self.std:g}{bounds})"
 
     @property
     def latent_mean(self) -> float:
@@ -203,13 +327,8 @@ class Prior(ABC):
         """Return the ends of the central interval that holds q with probability `level`.
 
         Quantiles of the Gaussian belief about the latent values, mapped through the transform and
-        cut off at the bounds.
-
-        Parameters
-        ----------
-        value, std
-            Medians, and standard deviations to first order (the latent one times the slope at the
-            median), of equal shape.
+        cut off at the bounds. `value` are medians, `std` standard deviations to first order (the
+        latent one times the slope at the median), of equal shape.
         """
         from statistics import NormalDist
 
@@ -248,14 +367,9 @@ class Prior(ABC):
 
 @dataclass(frozen=True)
 class Normal(Prior):
-    """Normal distribution of q.
+    """Normal distribution of q with `mean` and `std`, in the unit of the unknown.
 
-    Parameters
-    ----------
-    mean, std
-        Mean and standard deviation, in the unit of the unknown.
-    bounds
-        (lower, upper), to which estimates are clipped.
+    Estimates are clipped to `bounds`, (lower, upper).
     """
 
     mean: float = 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from types import SimpleNamespace
@@ -10,12 +10,23 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from skfem import Mesh
+from skfem.helpers import dot
 
-from livepde.errors import SpaceError
+from livepde.errors import ModelError, SpaceError
 from livepde.fem.field_blocks import FieldBlock, Local, base_name, block_of
-from livepde.fem.fields import Declaration, Piecewise, Scalar, Unknown, declared
-from livepde.fem.measure import Measure
-from livepde.fem.place import Moment
+from livepde.fem.fields import (
+    Declaration,
+    Integrand,
+    On,
+    Piecewise,
+    Scalar,
+    Source,
+    Unknown,
+    declared,
+    ignores,
+)
+from livepde.fem.measure import Measure, Moment
 from livepde.linalg import Array, IntArray, Mask, compact
 
 
@@ -121,10 +132,7 @@ class LocalSpace:
     def paired(self, density: Array, weights: Array, other: LocalSpace) -> Array:
         """Return the integrals of a density against all pairs of functions, shape (i, j, E).
 
-        Parameters
-        ----------
-        density
-            Shape (components, components of `other`, E, P).
+        The density has the shape (components, components of `other`, E, P).
         """
         shape = (self.components, other.components)
         if self.kept:
@@ -205,16 +213,8 @@ class NamedUnknowns:
     """Names of unknowns, their places among the coefficients, and their priors.
 
     An estimate that is pickled holds this instead of a `FunctionSpace`, whose functions (of
-    regions, of boundary values) cannot be pickled.
-
-    Attributes
-    ----------
-    labels, parts
-        As of a `FunctionSpace`.
-    fields
-        Names of the unknowns that are fields, as keys.
-    unknowns
-        Name -> an unknown number with the same prior, evolution and unit.
+    regions, of boundary values) cannot be pickled. Each of `unknowns` is a number with the same
+    prior, evolution and unit; `fields` has the names of fields as keys.
     """
 
     labels: Mapping[str, int]
@@ -228,11 +228,9 @@ class NamedUnknowns:
         return self
 
     def part(self, name: str) -> slice:
-        """Return the slice of an unknown in the coefficients."""
         return self.parts[name]
 
     def unknown_of(self, label: str) -> Scalar:
-        """Return the unknown of a scalar label."""
         return self.unknowns[label if label in self.unknowns else base_name(label)]
 
 
@@ -240,11 +238,8 @@ class NamedUnknowns:
 class FunctionSpace:
     """A product of unknowns, each a field, a scalar, or values per region.
 
-    Parameters
-    ----------
-    unknowns
-        Mapping from name to unknown. With `single`, forms get the unknown itself, not a namespace.
-        Regions with priors of their own are unknowns, "k[soil]", of which forms see the sum, q.k.
+    With `single`, forms get the unknown itself, not a namespace. Regions with priors of their own
+    are unknowns, "k[soil]", of which forms see the sum, q.k.
     """
 
     unknowns: Mapping[str, Declaration]
@@ -275,6 +270,28 @@ class FunctionSpace:
     def blocks(self) -> dict[str, Any]:
         """Block of each unknown, by name."""
         return {name: block_of(unknown) for name, unknown in self.unknowns.items()}
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The mesh of a state, which all components share."""
+        if len(self.fields) < len(self.blocks):
+            numbers = sorted(set(self.blocks) - set(self.fields))
+            raise ModelError(f"state: {numbers} must be a Field, on the mesh of the others.")
+        meshes = [block.field.mesh for block in self.fields.values()]
+        if any(mesh is not meshes[0] for mesh in meshes):
+            raise ModelError(
+                f"state: the components {list(self.fields)} must share one mesh object; their "
+                "elements may differ."
+            )
+        return meshes[0]
+
+    def product(self, u: Any, v: Any, x: Any) -> Any:
+        """Return the L2 inner product of a state as an integrand: the sum over components."""
+        products = {name: _product(block) for name, block in self.fields.items()}
+        if self.single:
+            (single,) = products.values()
+            return single(u, v)
+        return sum(form(getattr(u, name), getattr(v, name)) for name, form in products.items())
 
     @cached_property
     def starts(self) -> tuple[int, ...]:
@@ -355,12 +372,7 @@ class FunctionSpace:
         return {n: block for n, block in self.blocks.items() if isinstance(block, FieldBlock)}
 
     def component(self, of: str = "") -> tuple[FieldBlock, slice]:
-        """Return a component of the state and the slice of its coefficients.
-
-        Parameters
-        ----------
-        of
-            Name of the component; empty stands for the only one.
+        """Return the component `of` the state and the slice of its coefficients.
 
         Raises
         ------
@@ -466,3 +478,42 @@ class FunctionSpace:
         if array.shape != (size,):
             raise SpaceError(f"'{name}': coefficients of shape {array.shape}; expected ({size},).")
         return array.copy()
+
+
+def _product(block: FieldBlock) -> Callable[[Any, Any], Any]:
+    """Return the product of two functions at a point: u v, of vectors u . v."""
+    return dot if block.vector else lambda u, v: u * v
+
+
+def source_density(source: Source | On, state: FunctionSpace) -> Integrand | On:
+    """Return a source density as an integrand (v, x)."""
+    if isinstance(source, On):
+        return On(source.name, _density(source.form, state))
+    return _density(source, state)
+
+
+def _density(source: Source, state: FunctionSpace) -> Integrand:
+    if isinstance(source, Mapping):
+        parts = {
+            name: _single_density(item, state.component(name)[0]) for name, item in source.items()
+        }
+        if state.single:
+            raise ModelError("f: a mapping is for a state of several components.")
+        return lambda v, x: sum(form(getattr(v, name), x) for name, form in parts.items())
+    if not callable(source) and float(source) == 0.0:
+        return lambda v, x: 0.0 * x[0]
+    if not state.single:
+        raise ModelError(
+            f"f: the state has the components {list(state.fields)}; give a mapping, such as "
+            f'f={{"{next(iter(state.fields))}": ...}}.'
+        )
+    return _single_density(source, state.component()[0])
+
+
+def _single_density(source: Any, block: FieldBlock) -> Integrand:
+    product = _product(block)
+    if callable(source):
+        timed = not ignores(source, 1)  # what it reads of x is seen where the form is evaluated
+        return lambda v, x: product(source(x, x.t if timed else 0.0), v)
+    level = float(source)
+    return lambda v, x: level * v

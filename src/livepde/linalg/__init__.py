@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-from livepde.linalg.assembler import Assembler
-from livepde.linalg.banded import BandedSolver
-from livepde.linalg.banded_blocks import BandedBlocks, BlockFactor
+from livepde.linalg.arrays import (
+    Array,
+    IntArray,
+    Mask,
+    Memo,
+    RowProduct,
+    Sparse,
+    nonfinite_allowed,
+    row_product,
+)
+from livepde.linalg.banded import BandedBlocks, BandedSolver, BlockFactor
 from livepde.linalg.choice import Choice, analyse, choose
-from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.krylov import conjugate_gradients, gmres
-from livepde.linalg.leading import Leading
-from livepde.linalg.memo import Memo
-from livepde.linalg.multigrid import MultigridSolver, approximate_inverse
-from livepde.linalg.nonfinite import nonfinite_allowed
-from livepde.linalg.pardiso import PardisoSolver
-from livepde.linalg.pattern import Pattern, compact, sandwich
-from livepde.linalg.protocol import Factor, Solver
-from livepde.linalg.rows import RowProduct, row_product
-from livepde.linalg.superlu import SuperLUSolver, positive_definite
-from livepde.linalg.types import Array, IntArray, Mask, Sparse
+from livepde.linalg.direct import (
+    CholmodSolver,
+    Factor,
+    Inverse,
+    Leading,
+    PardisoSolver,
+    Solver,
+    SuperLUSolver,
+    positive_definite,
+)
+from livepde.linalg.krylov import MultigridSolver, approximate_inverse, conjugate_gradients, gmres
+from livepde.linalg.pattern import Assembler, Pattern, compact, sandwich
 
 __all__ = [
     "Array",
@@ -29,6 +37,7 @@ __all__ = [
     "CholmodSolver",
     "Factor",
     "IntArray",
+    "Inverse",
     "Leading",
     "Mask",
     "Memo",

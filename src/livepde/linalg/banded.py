@@ -1,18 +1,19 @@
-"""Banded LU by LAPACK after a bandwidth-reducing permutation: the solver of 1D problems."""
+"""Banded LU by LAPACK after a bandwidth-reducing permutation: one matrix, or many at once."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import blas, lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from livepde.errors import LinearAlgebraError
+from livepde.linalg.arrays import Array, IntArray
 from livepde.linalg.pattern import Pattern
-from livepde.linalg.types import Array, IntArray
 
 # Number of entries of a triangle up to which copying it costs more than the faster solve saves.
 FEW = 300
@@ -130,3 +131,123 @@ class BandedSolver:
                 "model's forms, or take a smaller time step."
             )
         return BandedFactor(lu, pivots, lower, upper, self.order, self.inverse, self.units)
+
+
+NONE = np.zeros(0, dtype=np.intp)
+
+
+class BlockFactor(NamedTuple):
+    """Factors of the diagonal blocks of a block-diagonal matrix.
+
+    Attributes
+    ----------
+    solver
+        Order of the band and its width.
+    bad
+        Numbers of the blocks that could not be factorised.
+    lu, pivots
+        LAPACK's LU factors of the whole matrix, in the order of the band; None if `symmetric`, the
+        main diagonal of D and lower diagonal of L of L D L^T, is there.
+    """
+
+    solver: BandedSolver
+    bad: IntArray
+    lu: Array | None
+    pivots: IntArray | None
+    symmetric: tuple[Array, Array] | None = None
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b for each block, of shape (columns, blocks, n); overwrites b.
+
+        NaN for blocks with a singular matrix; not finite where b is not. If a solution overflows,
+        other blocks may become NaN with it; finite values are correct.
+        """
+        columns, count, n = b.shape
+        bad = self.bad
+        if count > 1 and not math.isfinite(b.sum()):  # one block has no neighbours to disturb
+            bad = np.union1d(bad, np.flatnonzero(~np.isfinite(b).all(axis=(0, 2))))
+        if len(bad):
+            # A NaN would spread to the neighbouring blocks in the band solve (0 * NaN = NaN): bad
+            # blocks are solved with zeros and marked afterwards.
+            b[:, bad] = 0.0
+        x = b if self.solver.natural else np.take(b, self.solver.order, axis=2)
+        x = x.reshape(columns, count * n).T
+        if self.symmetric is not None:
+            x = lapack.dpttrs(*self.symmetric, x, overwrite_b=1)[0]
+        else:
+            x = lapack.dgbtrs(self.lu, *self.solver.band, x, self.pivots, overwrite_b=1)[0]
+        x = x.T.reshape(b.shape)
+        if not self.solver.natural:
+            x = np.take(x, self.solver.inverse, axis=2)
+        if len(bad):
+            x[:, bad] = np.nan
+        return x
+
+
+@dataclass(frozen=True, eq=False)
+class BandedBlocks:
+    """Banded factorisation of many matrices with one sparsity pattern.
+
+    The matrices are the blocks of one block-diagonal matrix with the bandwidth of a block: no pivot
+    is taken from another block, because the coupling entries are zero. LU with partial pivoting. If
+    all are `symmetric` and tridiagonal, L D L^T costs a third; storage is then the main diagonal,
+    and the lower one with a zero at the end.
+    """
+
+    solver: BandedSolver
+    symmetric: bool = False
+
+    @classmethod
+    def of(cls, solver: BandedSolver, *data: Array) -> BandedBlocks:
+        """Return the blocks of sums of matrices, each with data of shape (nnz,)."""
+        whole = cls(solver)
+        tridiagonal = solver.band == (1, 1)
+        return cls(solver, tridiagonal and all(whole._mirrored(part) for part in data))
+
+    def _mirrored(self, data: Array) -> bool:
+        """Return True if a tridiagonal matrix is symmetric to the bit."""
+        _, upper, _, lower = self.band(data).reshape(self.solver.storage[0]).T
+        return np.array_equal(upper[1:], lower[:-1])
+
+    def band(self, data: Array) -> Array:
+        """Return matrices of shape (..., nnz) in band storage, shape (..., size)."""
+        shape, position = self.solver.storage
+        storage = np.zeros((*data.shape[:-1], shape[0] * shape[1]))
+        storage[..., position] = data
+        if not self.symmetric:
+            return storage
+        rows = storage.reshape(-1, *shape)
+        return rows[:, :, 2:].swapaxes(1, 2).reshape(*data.shape[:-1], 2 * shape[0])
+
+    def factorise(self, storage: Array) -> BlockFactor:
+        """Factorise matrices in band storage, shape (blocks, size), which is overwritten."""
+        (n, height), blocks, bad = self.solver.storage[0], len(storage), NONE
+        if not math.isfinite(np.vdot(storage, storage)):  # one of its squares may overflow, too
+            bad = np.flatnonzero(~np.isfinite(storage).all(axis=1))
+            # A block that is not finite is replaced by the identity, so that the others can be
+            # factorised.
+            storage[bad] = 0.0
+            if self.symmetric:
+                storage.reshape(blocks, 2, n)[bad, 0] = 1.0
+            else:
+                storage.reshape(blocks, n, height)[bad, :, sum(self.solver.band)] = 1.0
+        if self.symmetric:
+            diagonal, side = storage.reshape(blocks, 2, n).swapaxes(0, 1).reshape(2, -1)
+            *factors, info = lapack.dpttrf(diagonal, side[:-1])
+            if info == 0:
+                return BlockFactor(self.solver, bad, None, None, tuple(factors))
+            general = np.zeros((blocks * n, height))
+            general[:, 2], general[:, 3], general[1:, 1] = diagonal, side, side[:-1]
+            return self._lu(general, bad)
+        return self._lu(storage.reshape(blocks * n, height), bad)
+
+    def _lu(self, storage: Array, bad: IntArray) -> BlockFactor:
+        """Return LU factors of a whole matrix in band storage, shape (blocks n, height)."""
+        lower, upper = self.solver.band
+        lu, pivots, info = lapack.dgbtrf(storage.T, lower, upper, overwrite_ab=1)
+        if info > 0:  # a pivot is zero: mark its block, and go on without dividing by it
+            middle = lower + upper
+            zero = lu[middle] == 0.0
+            lu[middle, zero] = 1.0
+            bad = np.union1d(bad, np.flatnonzero(zero) // self.solver.storage[0][0])
+        return BlockFactor(self.solver, bad, lu, pivots)

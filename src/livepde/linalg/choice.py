@@ -28,12 +28,9 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from livepde.linalg.banded import BandedSolver
-from livepde.linalg.cholmod import CholmodSolver
-from livepde.linalg.multigrid import MultigridSolver
-from livepde.linalg.pardiso import PardisoSolver
+from livepde.linalg.direct import CholmodSolver, PardisoSolver, Solver, SuperLUSolver
+from livepde.linalg.krylov import MultigridSolver
 from livepde.linalg.pattern import Pattern
-from livepde.linalg.protocol import Solver
-from livepde.linalg.superlu import SuperLUSolver
 
 # Largest half bandwidth of banded LU; the limits are those of the table above.
 WIDEST_BAND = 48
@@ -61,8 +58,6 @@ def choose(pattern: Pattern, *, symmetric: bool = False, approximate: bool = Fal
 
     Parameters
     ----------
-    pattern
-        Sparsity pattern of the matrices.
     symmetric
         True if every matrix is symmetric positive definite.
     approximate

@@ -1,13 +1,18 @@
-"""Krylov methods with a guaranteed residual tolerance: they reach it or raise an error."""
+"""Krylov methods with a guaranteed residual, and algebraic multigrid (PyAMG) as preconditioner."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
-from livepde.errors import LinearAlgebraError
-from livepde.linalg.types import Array
+from livepde.errors import LinearAlgebraError, optional
+from livepde.linalg.arrays import Array
+from livepde.linalg.direct import Factor, check_finite
+from livepde.linalg.pattern import Pattern
 
 Map = Callable[[Array], Array]
 
@@ -23,10 +28,8 @@ def conjugate_gradients(
         Products with the matrix and with the approximate inverse, for arrays like b.
     b
         Shape (n,) or (n, k).
-    tolerance
-        Bound on the residual, relative to each right-hand side.
-    limit
-        Maximum number of iterations.
+    tolerance, limit
+        Bound on the residual, relative to each right-hand side; maximum number of iterations.
     remedy
         Advice for the message of the error if they do not suffice.
 
@@ -83,20 +86,8 @@ def gmres(
     """Solve with any nonsingular matrix by GMRES with a left preconditioner.
 
     In contrast to SciPy's, it applies the preconditioner only once for b and once per iteration.
-
-    Parameters
-    ----------
-    apply, precondition, limit, remedy
-        As for `conjugate_gradients`; there is no restart.
-    b
-        Shape (n,).
-    tolerance
-        Bound on the preconditioned residual, an estimate of the error, relative to that of x = 0.
-
-    Returns
-    -------
-    x, iterations
-        The solution, and how many it took.
+    Parameters and results are those of `conjugate_gradients`, with b of shape (n,), but `tolerance`
+    bounds the preconditioned residual, an estimate of the error, relative to that of x = 0.
 
     Raises
     ------
@@ -135,3 +126,64 @@ def gmres(
         f"{limit} iterations of GMRES left a residual of {left:.1e}, with {tolerance:.0e} asked "
         f"for: {remedy}"
     )
+
+
+# Residual of a solve relative to the right-hand side.
+TOLERANCE = 1e-10
+ITERATIONS = 200
+REMEDY = (
+    "multigrid serves scalar second-order equations; install CHOLMOD or Pardiso (pip install "
+    "'livepde[solvers]'), so that the matrix is factorised."
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MultigridFactor:
+    """Multigrid hierarchy of a matrix, and the matrix itself."""
+
+    matrix: sp.csr_array
+    levels: Any
+
+    def precondition(self, b: Array) -> Array:
+        """Return one V-cycle for each right-hand side: an approximate solution."""
+        if b.ndim == 1:
+            cycle: Array = self.levels(b)
+            return cycle
+        return np.stack([self.levels(column) for column in b.T], axis=1)
+
+    def solve(self, b: Array) -> Array:
+        """Return x with K x = b to a relative residual of 1e-10; raises `LinearAlgebraError`."""
+        return conjugate_gradients(
+            self.matrix.__matmul__, self.precondition, b, TOLERANCE, ITERATIONS, REMEDY
+        )[0]
+
+
+@dataclass(frozen=True, eq=False)
+class MultigridSolver:
+    """Ruge–Stüben multigrid for symmetric positive definite matrices; needs PyAMG."""
+
+    pattern: Pattern
+    name: str = "multigrid (PyAMG), conjugate gradients"
+    definite: bool = True
+    price: float = 1.0
+
+    def factorise(self, data: Array) -> MultigridFactor:
+        """Build the hierarchy; raises `LinearAlgebraError` for a non-finite or zero diagonal."""
+        with optional("solvers", "Multigrid needs PyAMG"):
+            from pyamg import ruge_stuben_solver
+
+        check_finite(data)
+        matrix = self.pattern.matrix(data)
+        if not np.all(matrix.diagonal() > 0):
+            raise LinearAlgebraError(
+                "The matrix is singular or not positive definite: its diagonal holds values that "
+                "are not positive. Check the model's forms, or take a smaller time step."
+            )
+        levels = ruge_stuben_solver(sp.csr_matrix(matrix, copy=True))
+        return MultigridFactor(matrix, levels.aspreconditioner(cycle="V").matvec)
+
+
+def approximate_inverse(factor: Factor) -> Callable[[Array], Array]:
+    """Return the preconditioner of a factor: one V-cycle of multigrid, else an exact solve."""
+    cycle: Callable[[Array], Array] = getattr(factor, "precondition", factor.solve)
+    return cycle

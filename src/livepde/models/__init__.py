@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
-from livepde.models.advection import ADVECTION_DIFFUSION, advection_diffusion
-from livepde.models.allen_cahn import ALLEN_CAHN, allen_cahn
 from livepde.models.battery import BATTERY_PARTICLE, battery_particle
 from livepde.models.borehole import BOREHOLE, GROUTED_BOREHOLE, borehole, fluid, grouted_borehole
 from livepde.models.boundary_conditions import Exchange, Flux, Source, with_conditions
-from livepde.models.burgers import BURGERS, burgers
 from livepde.models.description import Equation, Fluxes, Option, Quantity, Variable
 from livepde.models.diffusion import CONDUCTION, HEAT, conduction, heat
-from livepde.models.fisher import FISHER_KPP, POROUS_FISHER, fisher_kpp, porous_fisher
-from livepde.models.groundwater import GROUNDWATER, PUMPING_TEST, groundwater, pumping_test
-from livepde.models.kdv import KDV, kdv
-from livepde.models.kuramoto_sivashinsky import KURAMOTO_SIVASHINSKY, kuramoto_sivashinsky
-from livepde.models.reaction import REACTION_DIFFUSION, reaction_diffusion
-from livepde.models.transport import (
+from livepde.models.groundwater import (
     ADVECTION_DISPERSION,
+    GROUNDWATER,
     MOBILE_IMMOBILE,
+    PUMPING_TEST,
     advection_dispersion,
+    groundwater,
     mobile_immobile,
+    pumping_test,
 )
-from livepde.models.wave import WAVE, wave
+from livepde.models.reaction import (
+    ALLEN_CAHN,
+    FISHER_KPP,
+    POROUS_FISHER,
+    REACTION_DIFFUSION,
+    allen_cahn,
+    fisher_kpp,
+    porous_fisher,
+    reaction_diffusion,
+)
+from livepde.models.waves import (
+    ADVECTION_DIFFUSION,
+    BURGERS,
+    KDV,
+    KURAMOTO_SIVASHINSKY,
+    WAVE,
+    advection_diffusion,
+    burgers,
+    kdv,
+    kuramoto_sivashinsky,
+    wave,
+)
 
 __all__ = [
     "EQUATIONS",

@@ -30,9 +30,9 @@ def battery_particle(
 
         -D(c) c_r = I/(F area)  at the surface,      D(c) = D exp(slope (c/c_max - 1/2)).
 
-    I > 0 extracts lithium, as in the negative electrode during discharge. The concentration at the
-    surface is the state at the right end of the mesh; a voltage is a function of it, see
-    `livepde.observation.Calibrated`.
+    The current in A is the input channel "I"; I > 0 extracts lithium, as in the negative electrode
+    during discharge. The concentration at the surface is the state at the right end of the mesh; a
+    voltage is a function of it, see `livepde.observation.Calibrated`.
 
     Parameters
     ----------
@@ -48,11 +48,7 @@ def battery_particle(
     c_max
         Concentration of the full particle in mol/m^3.
     element
-        Element of the state; default of first order.
-
-    Notes
-    -----
-    The current in A is the input channel "I".
+        As for `heat`.
 
     Raises
     ------
@@ -91,9 +87,7 @@ def battery_particle(
         M=lambda c, v, x: (x[0] / R) ** 2 * c * v,
         f=On("right", lambda x, _: -x.inputs["I"] / (FARADAY * area)),
         inputs=["I"],
-        time_unit="s",
-        length_unit="m",
-        formula=BATTERY_PARTICLE.written(),
+        **BATTERY_PARTICLE.about(),
     )
 
 

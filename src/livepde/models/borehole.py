@@ -12,8 +12,7 @@ import numpy as np
 from livepde.errors import ModelError
 from livepde.fem import Field, On, Place, Scalar, Unknown, declared, dot, grad, linear
 from livepde.model import Model
-from livepde.models.common import Number
-from livepde.models.description import Equation, Option, Quantity, Variable, closed
+from livepde.models.description import Equation, Number, Option, Quantity, Variable, closed
 
 
 def borehole(
@@ -28,8 +27,9 @@ def borehole(
 ) -> Model:
     """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole heated by the power Q(t).
 
-    At the wall -2 pi r k H T_r = Q, and T = T0 at the far end. The mean temperature of the fluid is
-    T(wall) + R_b Q/H: observe it with `Points({"T": r_wall}, direct={"T": fluid(H)})`.
+    At the wall -2 pi r k H T_r = Q, and T = T0 at the far end. The power in W is the input channel
+    "Q". The mean temperature of the fluid is T(wall) + R_b Q/H: observe it with
+    `Points({"T": r_wall}, direct={"T": fluid(H)})`.
 
     Parameters
     ----------
@@ -46,8 +46,6 @@ def borehole(
         Volumetric heat capacity of the ground in J/(m^3 K), known or unknown.
     T0
         Undisturbed temperature in degC.
-
-    The power in W is the input channel "Q".
     """
     # Quadrature of order four integrates the weight r with elements of first order exactly.
     state = Field(mesh, element or linear(mesh), dirichlet={"right": T0}, unit="degC", quadrature=4)
@@ -59,9 +57,7 @@ def borehole(
             M=lambda u, v, x: rho_c * x[0] * u * v,
             f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
             inputs=["Q"],
-            time_unit="s",
-            length_unit="m",
-            formula=BOREHOLE.written(),
+            **BOREHOLE.about(),
         )
     # The mass term must not contain unknowns, so the equation is divided by the heat capacity.
     return Model(
@@ -74,9 +70,7 @@ def borehole(
         coefficients=lambda q: {"diffusivity": q.k / q.rho_c, "per_capacity": 1 / q.rho_c},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=BOREHOLE.written(),
+        **BOREHOLE.about(),
     )
 
 
@@ -151,8 +145,8 @@ def grouted_borehole(
     and T = T0 at the right end. The state at the left end of the mesh is the temperature of the
     fluid, for sensors there. On a two-dimensional mesh, radius times height, heat also flows along
     the borehole: the bottom is the plane of its end, where the ground is at T0, and the top that of
-    its middle. The power is distributed evenly, and the mean over "left" is the temperature of the
-    fluid.
+    its middle. The power in W, the input channel "Q", is distributed evenly, and the mean over
+    "left" is the temperature of the fluid.
 
     All unknowns are positive: use `LogNormal`, and `LogitNormal` for the share.
 
@@ -187,10 +181,6 @@ def grouted_borehole(
         Volumetric heat capacity of the grout in J/(m^3 K).
     T0
         Undisturbed temperature.
-
-    Notes
-    -----
-    The power in W is the input channel "Q".
 
     Raises
     ------
@@ -231,9 +221,7 @@ def grouted_borehole(
         ],
         f=On("left", lambda x, _: x.inputs["Q"] / (2 * pi * H)),
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=GROUTED_BOREHOLE.written(),
+        **GROUTED_BOREHOLE.about(),
     )
 
 

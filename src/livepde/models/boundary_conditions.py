@@ -19,13 +19,7 @@ from livepde.model import Model
 
 @dataclass(frozen=True)
 class Multiple:
-    """A multiple of an unknown.
-
-    Attributes
-    ----------
-    unknown, factor
-        Its name, and the number that it is multiplied by.
-    """
+    """The unknown of a name, times a number."""
 
     unknown: str
     factor: float
@@ -37,27 +31,16 @@ Amount: TypeAlias = "float | Channel | str | Multiple"
 
 @dataclass(frozen=True)
 class Flux:
-    """Neumann condition, a flux into the domain through a boundary: D u_n = value.
-
-    Attributes
-    ----------
-    value
-        Flux in the unit of D u_n, W/m^2 for heat conduction.
-    """
+    """Neumann condition D u_n = value, a flux into the domain: W/m^2 for heat conduction."""
 
     value: Amount
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """Robin (Newton) condition, exchange through a boundary: D u_n = h (ambient - u).
+    """Robin (Newton) condition, exchange through a boundary: D u_n = coefficient (ambient - u).
 
-    Attributes
-    ----------
-    coefficient
-        Transfer coefficient h: W/(m^2 K) for heat conduction.
-    ambient
-        Value of u outside.
+    The transfer coefficient is in W/(m^2 K) for heat conduction; `ambient` is u outside.
     """
 
     coefficient: Amount
@@ -69,14 +52,9 @@ Condition: TypeAlias = Flux | Exchange
 
 @dataclass(frozen=True)
 class Source:
-    """Source in a part of the domain, per volume and time.
+    """Source in a part of the domain, per volume and time: W/m^3 for heat conduction.
 
-    Attributes
-    ----------
-    value
-        Source density in the unit of the equation, W/m^3 for heat conduction.
-    over
-        Predicate on x or name of a subdomain of the mesh; None for all of the domain.
+    `over` is a predicate on x or the name of a subdomain of the mesh; None: all of the domain.
     """
 
     value: Amount
@@ -139,7 +117,8 @@ def with_conditions(
             terms.through(name, condition)
     for name, source in (sources or {}).items():
         terms.gained(source.value, *_region(model, name, source.over))
-    terms.check_all_named()
+    if unused := [name for name in more if name not in terms.named]:
+        raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
     whole = model.with_unknowns(more) if more else model
     return whole.with_terms(terms.A, terms.B, terms.inputs)
 
@@ -157,10 +136,6 @@ class _Terms:
         self.inputs: list[str] = []
         self.A: list[Any] = []
         self.B: list[Any] = []
-
-    def check_all_named(self) -> None:
-        if unused := [name for name in self.unknowns if name not in self.named]:
-            raise ModelError(f"with_conditions: no condition names the unknown '{unused[0]}'.")
 
     def through(self, boundary: str, condition: Condition) -> None:
         """Add a flux, or an exchange as two terms, so that the term in u reads no input."""

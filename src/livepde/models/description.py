@@ -1,27 +1,24 @@
-"""Descriptions of predefined equations, for programs, case files and `livepde init`."""
+"""Descriptions of predefined equations, and common parts of nonlinear wave equations."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from livepde.errors import ModelError
-from livepde.fem import Place, Unknown
+from livepde.fem import Field, Integrand, Place, Unknown
 from livepde.model import Model
 
 
 @dataclass(frozen=True)
 class Variable:
-    """Unknown, state, or input of an equation.
+    """Unknown, state, or input of an equation, with unit and meaning.
 
     Attributes
     ----------
-    unit, text
-        Unit and meaning.
-    optional
-        Whether it may be left out.
     transform
         Transform of an unknown in a case that `livepde init` writes: "log" for a positive quantity,
         "logit" for a share between 0 and 1; empty for a quantity that may be negative.
@@ -59,8 +56,6 @@ class Quantity:
 
     Attributes
     ----------
-    text
-        Meaning of the quantity.
     at
         Function (left end, right end) of the mesh -> position at which the state is read.
     direct
@@ -74,14 +69,7 @@ class Quantity:
 
 
 class Fluxes(NamedTuple):
-    """Units of boundary fluxes and sources in a case.
-
-    Attributes
-    ----------
-    flux, transfer, source
-        Units of D u_n, of the coefficient h of an exchange h (ambient - u), and of a source per
-        volume and time.
-    """
+    """Units in a case: of D u_n, of h in an exchange h (ambient - u), and of a source density."""
 
     flux: str
     transfer: str
@@ -143,8 +131,8 @@ class Equation:
     components: tuple[str, ...] = ()
     dimension: Literal[1, 2] = 1
 
-    def written(self, unknowns: Collection[str] = ()) -> str:
-        """Return the formula without the terms of optional unknowns that a model does not have."""
+    def about(self, unknowns: Collection[str] = ()) -> dict[str, Any]:
+        """Return units and formula of a model, without terms of unknowns that it does not have."""
         left = [
             name for name, one in self.unknowns.items() if one.optional and name not in unknowns
         ]
@@ -155,19 +143,18 @@ class Equation:
         kept = [
             (sign, term) for sign, term in parts if not set(left) & set(re.findall(r"\w+", term))
         ]
-        return "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
+        formula = "".join([first, *(f" {sign} {term}" for sign, term in kept), comma, rest])
+        units = {"time_unit": self.time_unit, "length_unit": self.length_unit}
+        return {**units, "formula": formula}
 
     @property
     def takes_values(self) -> bool:
         """Whether a case may give values of the state on boundaries."""
-        return not isinstance(self.build, _Closed)
+        return not isinstance(self.build, closed)
 
 
 def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
-    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords.
-
-    Without boundary values `dirichlet` is None, the default of the function.
-    """
+    """Return the `build` of a function with unknowns, `dirichlet` and options as keywords."""
 
     def build(
         mesh: Any, unknowns: Mapping[str, Unknown], dirichlet: Mapping[str, Any], **options: Any
@@ -178,7 +165,7 @@ def by_name(function: Callable[..., Model]) -> Callable[..., Model]:
 
 
 @dataclass(frozen=True)
-class _Closed:
+class closed:
     """The `build` of a function without boundary values; raises `ModelError` with the reason."""
 
     function: Callable[..., Model]
@@ -198,6 +185,47 @@ class _Closed:
         return self.function(mesh, **unknowns, **options)
 
 
-def closed(function: Callable[..., Model], why: str) -> Callable[..., Model]:
-    """Return the `build` of a function without boundary values; it raises the reason."""
-    return _Closed(function, why)
+Number: TypeAlias = Unknown | float
+"""A coefficient of an equation: unknown, or a known number."""
+
+INITIAL = Variable("", "initial state, a field; else the case's `initial`", optional=True)
+SIDES = (("left", "right"), ("bottom", "top"), ("front", "back"))
+
+
+def state(mesh: Any, element: Any, dirichlet: Mapping[str, Any] | None, unit: str = "") -> Field:
+    """Return the field of the state: periodic, or with Dirichlet values."""
+    if dirichlet is not None:
+        return Field(mesh, element, dirichlet=dict(dirichlet), unit=unit)
+    pairs = [pair for pair in SIDES if set(pair) <= set(mesh.boundaries or {})]
+    return Field(mesh, element, periodic=pairs, unit=unit)
+
+
+def autonomous(
+    u: Field,
+    coefficients: Mapping[str, Number],
+    u0: Unknown | None,
+    form: Callable[[Any, Any, Any], Any],
+    about: Mapping[str, Any],
+) -> Model:
+    """Return u_t + A(u) = 0 with A by a form (c, u, v) of its coefficients c, known or unknown."""
+    known = {k: float(v) for k, v in coefficients.items() if isinstance(v, int | float)}
+    unknown: dict[str, Any] = {k: v for k, v in coefficients.items() if k not in known}
+    begun, initial = _beginning(u0, u)
+
+    def A(q: Any, u: Any, v: Any, x: Any) -> Any:
+        return form(SimpleNamespace(**known, **{k: getattr(q, k) for k in unknown}), u, v)
+
+    return Model(u, {**unknown, **begun}, A=A, initial=initial, **about)
+
+
+def _beginning(u0: Unknown | None, u: Field) -> tuple[dict[str, Unknown], Integrand | None]:
+    """Return an unknown initial state by name, and the form `initial` of a model.
+
+    A field inherits the boundaries of the state: periodic, or zero where that is fixed at zero.
+    """
+    if u0 is None:
+        return {}, None
+    if isinstance(u0, Field):
+        held = {name: 0.0 for name, value in u.dirichlet.items() if value == 0.0}
+        u0 = replace(u0, dirichlet=held, periodic=u.periodic)
+    return {"u0": u0}, lambda q, v, x: q.u0 * v

@@ -39,7 +39,8 @@ def heat(
     """Return u_t - div(alpha grad u) + loss (u - ambient) = source in any dimension.
 
     Boundaries without a value have a Robin condition, -alpha u_n = transfer (u - ambient) (Newton's
-    law of cooling). Omitted terms are zero: without `transfer` these boundaries are insulated.
+    law of cooling). Omitted terms are zero: without `transfer` these boundaries are insulated. With
+    `loss` or `transfer` the temperature of the surroundings is the input channel "ambient".
 
     Parameters
     ----------
@@ -63,10 +64,6 @@ def heat(
         Element of the state; default of first order.
     unit
         Unit of u.
-
-    Notes
-    -----
-    With `loss` or `transfer` the temperature of the surroundings is the input channel "ambient".
 
     Raises
     ------
@@ -177,9 +174,7 @@ def _model(
         A=terms,
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
-        time_unit="s",
-        length_unit="m",
-        formula=(HEAT if name == "heat" else CONDUCTION).written(given),
+        **(HEAT if name == "heat" else CONDUCTION).about(given),
     )
 
 

@@ -1,4 +1,4 @@
-"""Groundwater flow: confined aquifers in plan view, and radial flow of pumping tests."""
+"""Flow and transport in the ground: aquifers, pumping tests, tracers in a soil column."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Field, On, Place, Unknown, dot, grad, linear
+from livepde.fem import Channel, Field, On, Place, Unknown, dot, grad, linear
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models.description import Equation, Option, Variable, closed
@@ -20,7 +20,8 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
 
     At the wall of the well -2 pi r b k s_r = Q, and s = 0 at the far end. For a small well radius
     and a constant rate this is the problem of Theis (1935), s = Q/(4 pi k b) E1(r^2 Ss/(4 k t)); Q
-    may also change (step tests, recovery). Both unknowns are positive: use `LogNormal`.
+    may also change (step tests, recovery): in m^3/s, positive for extraction, it is the input
+    channel "Q". Both unknowns are positive: use `LogNormal`.
 
     Parameters
     ----------
@@ -33,10 +34,6 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         Specific storage in 1/m.
     b
         Thickness of the aquifer in m; for 1 m the unknowns are transmissivity and storativity.
-
-    Notes
-    -----
-    The rate in m^3/s, positive for extraction, is the input channel "Q".
 
     Raises
     ------
@@ -57,9 +54,7 @@ def pumping_test(mesh: Any, k: Unknown, Ss: Unknown, *, b: float, element: Any =
         coefficients=lambda q: {"diffusivity": q.k / q.Ss, "per_storage": 1 / q.Ss},
         M=lambda u, v, x: x[0] * u * v,
         inputs=["Q"],
-        time_unit="s",
-        length_unit="m",
-        formula=PUMPING_TEST.written(),
+        **PUMPING_TEST.about(),
     )
 
 
@@ -82,16 +77,15 @@ def groundwater(
 
     Parameters
     ----------
-    mesh
-        Any mesh of a plane; coordinates in m.
+    mesh, element
+        As for `heat`, in a plane.
     T
         Transmissivity in m^2/s: a number, by region, or a `Field`.
     S
         Storativity, dimensionless: a number or a `Field`. A `Piecewise` would violate the water
         balance where S jumps.
     dirichlet
-        Mapping from boundary to head in m: a number, a function g(x, t), or `Channel`. Other
-        boundaries have no flow.
+        As for `heat`, heads in m. Other boundaries have no flow.
     wells
         Mapping from name to (x, y). The name is the input channel of the rate in m^3/s, positive
         for extraction.
@@ -99,8 +93,6 @@ def groundwater(
         Radius of the wells' sources in m: at least the diameter of the cells around them.
     recharge
         Recharge from above, in m/s.
-    element
-        Element of the state; default of first order.
 
     Raises
     ------
@@ -135,32 +127,21 @@ def groundwater(
             rate = rate + x.inputs[name] * well(x, at, radius)
         return rate / q.S * v
 
-    # The well sources are polynomials of degree four.
-    state = Field(
-        mesh, element or linear(mesh), dirichlet=dict(dirichlet or {}), unit="m", quadrature=4
-    )
+    held = dict(dirichlet or {})
     return Model(
-        state,
+        # The well sources are polynomials of degree four.
+        Field(mesh, element or linear(mesh), dirichlet=held, unit="m", quadrature=4),
         {"T": T, "S": S},
         A=[flow, taken],
         inputs=tuple(sources),
-        time_unit="s",
-        length_unit="m",
-        formula=GROUNDWATER.written(),
+        **GROUNDWATER.about(),
     )
 
 
 def well(x: Place, at: Sequence[float], radius: float) -> Array:
     """Return the density of a round source of mass one, 3/(pi R^2) (1 - r^2/R^2)^2, in 1/m^2.
 
-    Parameters
-    ----------
-    x
-        Argument x of the form.
-    at
-        Position (x, y) of the well in m.
-    radius
-        R in m; beyond it the density is zero.
+    It is zero beyond the radius R in m around the position (x, y) of the well.
     """
     distance = ((x[0] - at[0]) ** 2 + (x[1] - at[1]) ** 2) / radius**2
     return 3 / (pi * radius**2) * np.maximum(1 - distance, 0.0) ** 2
@@ -187,23 +168,14 @@ def _place(mesh: Any, name: str, at: Sequence[float], radius: float) -> tuple[fl
 
 def _build_plane(
     mesh: Any,
-    unknowns: Mapping[str, Unknown],
+    unknowns: Mapping[str, Any],
     dirichlet: Mapping[str, Any],
     *,
     x: float,
     y: float,
-    radius: float,
-    recharge: float,
+    **options: Any,
 ) -> Model:
-    return groundwater(
-        mesh,
-        unknowns["T"],
-        unknowns["S"],
-        dirichlet,
-        wells={"Q": (x, y)},
-        radius=radius,
-        recharge=recharge,
-    )
+    return groundwater(mesh, dirichlet=dirichlet, wells={"Q": (x, y)}, **unknowns, **options)
 
 
 PUMPING_TEST = Equation(
@@ -241,4 +213,194 @@ GROUNDWATER = Equation(
     build=_build_plane,
     element=linear,
     dimension=2,
+)
+
+
+INLETS = ("flux", "fixed")
+
+
+def advection_dispersion(
+    mesh: Any,
+    D: Unknown,
+    v: Unknown,
+    *,
+    R: float = 1.0,
+    decay: float = 0.0,
+    inlet: str = "flux",
+    element: Any = None,
+    unit: str = "",
+) -> Model:
+    """Return R c_t = D c_xx - v c_x - decay c in a column with inflow on the left.
+
+    The inflow concentration is the channel "c_in". With inlet = "flux" the tracer enters with the
+    water, v c - D c_x = v c_in (third type; c is the concentration in the column); with "fixed" c =
+    c_in (first type). On the right the tracer leaves with the water, c_x = 0: if the front does not
+    reach this end, the column is semi-infinite as in the analytic solutions (Toride, Leij, van
+    Genuchten 1999, CXTFIT 2.1, USDA Research Report 137).
+
+    Parameters
+    ----------
+    mesh
+        Depth in cm, from "left" to "right".
+    D, v
+        Coefficient of dispersion in cm^2/h and pore velocity in cm/h: numbers, or by layer.
+    R
+        Retardation factor.
+    decay
+        Rate of decay in 1/h.
+    inlet
+        "flux" or "fixed".
+    element, unit
+        As for `heat`.
+
+    Raises
+    ------
+    ModelError
+        R is below 1, or the inlet is unknown.
+    """
+    _check("advection_dispersion", inlet, R)
+    state = _column(mesh, inlet, element, unit)
+
+    # Advection and dispersion are integrated by parts together, so that the natural condition is
+    # the third type: a given total flux v c - D c_x.
+    def flux(q: Any, c: Any, w: Any, x: Any) -> Any:
+        return (q.D * grad(c)[0] - q.v * c) * grad(w)[0]
+
+    return Model(
+        state,
+        {"D": D, "v": v},
+        A=[flux, *_ends(lambda q: q.v, lambda u: u, inlet)],
+        B=lambda c, w, x: decay * c * w,
+        M=lambda c, w, x: R * c * w,
+        inputs=["c_in"],
+        **ADVECTION_DISPERSION.about(),
+    )
+
+
+def mobile_immobile(
+    mesh: Any,
+    D: Unknown,
+    v: Unknown,
+    phi: Unknown,
+    omega: Unknown,
+    *,
+    inlet: str = "flux",
+    element: Any = None,
+    unit: str = "",
+) -> Model:
+    """Return dispersion in mobile water c with first-order exchange with immobile water s.
+
+        phi c_t = phi D c_xx - v c_x - omega (c - s)
+        (1 - phi) s_t = omega (c - s)
+
+    (Coats and Smith 1964; van Genuchten and Wierenga 1976). Sensors name their component, as in
+    `Points([11.0], of="c")`. For omega -> infinity this is `advection_dispersion` with phi D.
+
+    Parameters
+    ----------
+    mesh, inlet, element, unit
+        As for `advection_dispersion`, with the same channel "c_in".
+    D
+        Coefficient of dispersion in the mobile water, cm^2/h.
+    v
+        Mean pore velocity in cm/h: flux over total water content. The mobile water moves at v/phi.
+    phi
+        Mobile share of the water, in (0, 1): a `LogitNormal`.
+    omega
+        Rate of exchange in 1/h.
+
+    Raises
+    ------
+    ModelError
+        The inlet is unknown.
+    """
+    _check("mobile_immobile", inlet)
+
+    # The equations are divided by phi and 1 - phi: the mass form is free of unknowns.
+    def transport(q: Any, u: Any, w: Any, x: Any) -> Any:
+        return (q.D * grad(u.c)[0] - q.velocity * u.c) * grad(w.c)[0]
+
+    def exchange(q: Any, u: Any, w: Any, x: Any) -> Any:
+        return (u.c - u.s) * (q.into_mobile * w.c - q.into_immobile * w.s)
+
+    return Model(
+        {
+            "c": _column(mesh, inlet, element, unit),
+            "s": Field(mesh, element or linear(mesh), unit=unit),
+        },
+        {"D": D, "v": v, "phi": phi, "omega": omega},
+        A=[transport, exchange, *_ends(lambda q: q.velocity, lambda u: u.c, inlet)],
+        coefficients=lambda q: {
+            "velocity": q.v / q.phi,
+            "into_mobile": q.omega / q.phi,
+            "into_immobile": q.omega / (1 - q.phi),
+        },
+        inputs=["c_in"],
+        **MOBILE_IMMOBILE.about(),
+    )
+
+
+def _check(name: str, inlet: str, R: float = 1.0) -> None:
+    if inlet not in INLETS:
+        raise ModelError(f"{name}: inlet='{inlet}'; expected one of {', '.join(INLETS)}.")
+    if not (np.isfinite(R) and R >= 1):
+        raise ModelError(f"{name}: the retardation factor R must be at least 1; got {R}.")
+
+
+def _column(mesh: Any, inlet: str, element: Any, unit: str) -> Field:
+    dirichlet = {"left": Channel("c_in")} if inlet == "fixed" else {}
+    return Field(mesh, element or linear(mesh), dirichlet=dirichlet, unit=unit)
+
+
+def _ends(velocity: Any, solute: Any, inlet: str) -> list[On]:
+    """Return the boundary terms of inflow on the left and outflow on the right."""
+    # With c_x = 0 the total flux on the right is v c; that on the left is v c_in.
+    out = On("right", lambda q, u, w, x: velocity(q) * solute(u) * solute(w))
+    into = On("left", lambda q, _, w, x: -velocity(q) * x.inputs["c_in"] * solute(w))
+    return [out, into] if inlet == "flux" else [out]
+
+
+COLUMN = {
+    "D": Variable("cm^2/h", "coefficient of dispersion: a number, or by layer"),
+    "v": Variable("cm/h", "mean pore velocity"),
+}
+INFLOW = {"c_in": Variable("", "concentration that flows in")}
+FED = "is fed by the input c_in"
+INLET = Option("", "what the inflow prescribes", "flux", INLETS)
+
+ADVECTION_DISPERSION = Equation(
+    name="advection_dispersion",
+    summary="a tracer in a column of soil that is fed on the left",
+    formula="R c_t = D c_xx - v c_x - decay c,  v c - D c_x = v c_in on the left",
+    state=Variable("", "concentration, relative to that of the feed"),
+    unknowns=COLUMN,
+    inputs=INFLOW,
+    options={
+        "R": Option("", "retardation factor", 1.0),
+        "decay": Option("1/h", "rate of decay", 0.0),
+        "inlet": INLET,
+    },
+    build=closed(advection_dispersion, FED),
+    element=linear,
+    length_unit="cm",
+    time_unit="h",
+)
+
+MOBILE_IMMOBILE = Equation(
+    name="mobile_immobile",
+    summary="a tracer in a column of soil with partly immobile water",
+    formula="phi c_t = phi D c_xx - v c_x - omega (c - s),  (1 - phi) s_t = omega (c - s)",
+    state=Variable("", "concentration in the mobile (c) and the immobile water (s)"),
+    unknowns={
+        **COLUMN,
+        "phi": Variable("", "share of the water that moves", transform="logit"),
+        "omega": Variable("1/h", "rate of exchange"),
+    },
+    inputs=INFLOW,
+    options={"inlet": INLET},
+    build=closed(mobile_immobile, FED),
+    element=linear,
+    components=("c", "s"),
+    length_unit="cm",
+    time_unit="h",
 )

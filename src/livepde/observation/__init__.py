@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from livepde.observation.combined import Calibrated, Combined
-from livepde.observation.flux_plates import FluxPlates
-from livepde.observation.functionals import Functionals
-from livepde.observation.moving import Moving
-from livepde.observation.nonlinear import Transformed, TransformedObserved
+from livepde.observation.combined import Calibrated, Combined, Transformed, TransformedObserved
+from livepde.observation.functionals import FluxPlates, Functionals
 from livepde.observation.operator import Observation, Observed
+from livepde.observation.placed import Moving
 from livepde.observation.reconstruction import (
     Alpha,
     Apriori,
@@ -16,10 +14,10 @@ from livepde.observation.reconstruction import (
     Reconstructed,
     Reconstruction,
     Reconstructor,
+    Split,
     Tikhonov,
 )
 from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Points
-from livepde.observation.split import Split
 from livepde.observation.subdomain import Full, Subdomain
 
 __all__ = [

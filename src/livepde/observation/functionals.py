@@ -1,4 +1,4 @@
-"""Integral observations: fluxes through boundaries, weighted masses, energies."""
+"""Integral observations: fluxes, weighted masses, energies; and heat-flux plates."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.errors import ModelError, ObservationError
-from livepde.fem import Field, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
+from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, Moment, Named, Normal, On
+from livepde.fem.field_blocks import base_name
+from livepde.fem.measure import Measure
+from livepde.fem.space import LocalSpace
 from livepde.linalg import Array
 from livepde.observation.operator import Observation, Observed
 from livepde.spaces import HilbertSpace
@@ -67,20 +70,13 @@ class FunctionalsObserved(Observed):
 
     observation: Functionals
 
-    def __init__(
-        self,
-        observation: Functionals,
-        state: FunctionSpace,
-        X: HilbertSpace,
-        parameter: FunctionSpace,
-    ) -> None:
-        super().__init__(observation, state, X, parameter)
+    def _prepare(self) -> None:
         # State and parameter form one nonlinear argument, so that one complex step differentiates
         # with respect to both.
-        unknowns = {STATE + name: unknown for name, unknown in state.unknowns.items()}
-        unknowns |= {PARAMETER + name: unknown for name, unknown in parameter.unknowns.items()}
+        unknowns = {STATE + name: unknown for name, unknown in self.state.unknowns.items()}
+        unknowns |= {PARAMETER + name: one for name, one in self.parameter.unknowns.items()}
         spaces = {"w": FunctionSpace.of(Normal(), "w"), "uq": FunctionSpace(unknowns, False)}
-        self.forms = [self._form(name, spaces) for name in self.names]
+        self.forms = [self._form(name, spaces) for name in self.observation.integrands]
 
     def _names(self) -> tuple[str, ...]:
         return self.observation.names(len(self.observation.integrands))
@@ -94,9 +90,8 @@ class FunctionalsObserved(Observed):
             return g(q, _jets(uq, STATE, self.state), x) * w
 
         form = integrand if where is None else On(where, integrand)
-        mesh = next(iter(self.state.fields.values())).field.mesh
         try:
-            return Form(name, form, spaces, mesh, self._order, "uq", inputs=inputs)
+            return Form(name, form, spaces, self.state.mesh, self._order, "uq", inputs=inputs)
         except ModelError as error:
             raise ObservationError(f"Functionals, sensor '{name}': {error}") from error
 
@@ -105,7 +100,10 @@ class FunctionalsObserved(Observed):
         if self.observation.order is not None:
             return self.observation.order
         fields = [block.field for block in self.state.fields.values()]
-        orders = [_quadrature(field) for field in fields]
+        orders = [
+            2 * int(field.element.maxdeg) if field.quadrature is None else field.quadrature
+            for field in fields
+        ]
         degrees = [int(block.field.element.maxdeg) for block in self.parameter.fields.values()]
         return max(orders) + max(degrees, default=0)
 
@@ -125,11 +123,151 @@ class FunctionalsObserved(Observed):
         return sp.csr_array(rows[:, : len(u)]), rows[:, len(u) :].toarray()
 
 
-def _quadrature(field: Field) -> int:
-    return 2 * int(field.element.maxdeg) if field.quadrature is None else field.quadrature
-
-
 def _jets(uq: Any, prefix: str, space: FunctionSpace) -> Any:
     """Return state or parameter in the form of weak-form arguments."""
     jets = {name: getattr(uq, prefix + name) for name in space.names}
     return next(iter(jets.values())) if space.single else Named(**jets)
+
+
+def in_cells(parameter: FunctionSpace, mesh: Any, name: str) -> sp.csr_array:
+    """Return the matrix from q to the mean of an unknown over each cell, shape (cells, m)."""
+    if name not in parameter.names:
+        raise ObservationError(
+            f"FluxPlates: the model has no unknown '{name}'; it has {list(parameter.names)}."
+        )
+    measure = Measure(mesh, 2)
+    local = LocalSpace(parameter, measure)
+    cells, count = measure.shape
+    shares = measure.weights / measure.weights.sum(axis=1, keepdims=True)
+    rows = np.repeat(np.arange(cells), count)
+    means = sp.csr_array((shares.ravel(), (rows, np.arange(cells * count))))
+    size, start = cells * count, 0
+    found = sp.csr_array((cells, parameter.dim))
+    for key, part in zip(parameter.blocks, local.locals, strict=True):
+        if base_name(key) == name:
+            found = found + means @ local.evaluation[start * size : (start + 1) * size]
+        start += part.components
+    return sp.csr_array(found)
+
+
+@dataclass(frozen=True, eq=False)
+class FluxPlates(Observation):
+    """Flux sensors in one dimension, z_k = -D u_x at x_k, such as heat-flux plates.
+
+    At an end the flux **into** the domain counts as positive, inside the flux towards larger x.
+
+    Parameters
+    ----------
+    points
+        Sensor name -> the name of an end of the mesh ("left"), or a position.
+    conductivity
+        Name of the unknown D: one number, by layer, or a field.
+
+    Notes
+    -----
+    The flux is linear between the middles of cells, where the slope of the state is most accurate.
+    So it is of second order, also at an end and where D jumps between two cells.
+
+    Raises
+    ------
+    ObservationError
+        No sensor; when it is bound, a mesh that is no interval, a place outside of the mesh, or a
+        model without the unknown D.
+
+    Examples
+    --------
+    >>> plates = FluxPlates({"q_inside": "left", "q_middle": 0.12}, noise=0.3, unit="W/m^2")
+    """
+
+    points: Mapping[str, float | str]
+    conductivity: str = "k"
+
+    def __post_init__(self) -> None:
+        if not self.points:
+            raise ObservationError("FluxPlates: give at least one place.")
+
+    def names(self, count: int) -> tuple[str, ...]:
+        return tuple(self.points)
+
+    @property
+    def portable(self) -> bool:
+        return True
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> FluxPlatesObserved:
+        return FluxPlatesObserved(self, state, X, parameter)
+
+
+class FluxPlatesObserved(Observed):
+    """Bound `FluxPlates`: z = W (D q * S u), with means D q and slopes S u of the cells."""
+
+    observation: FluxPlates
+
+    def _prepare(self) -> None:
+        observation, state, parameter = self.observation, self.state, self.parameter
+        block = observation.scalar_block(state)
+        if len(block.field.mesh.p) != 1:
+            raise ObservationError(
+                "FluxPlates requires a mesh of one dimension; use Functionals with an integral "
+                "over a boundary."
+            )
+        ends = np.sort(block.field.mesh.p[0][block.field.mesh.t], axis=0)
+        order = np.argsort(ends[0])
+        ends = ends[:, order]
+        middles = ends.mean(axis=0)
+        if len(middles) < 2:
+            raise ObservationError("FluxPlates requires a mesh of two cells or more.")
+        values = block.probe(ends.reshape(1, -1))
+        slopes = sp.diags_array(1.0 / np.diff(ends, axis=0)[0]) @ (
+            values[len(middles) :] - values[: len(middles)]
+        )
+        self._slopes = state.widen(sp.csr_array(slopes), observation.of)
+        self._D = in_cells(parameter, block.field.mesh, observation.conductivity)[order]
+        self._weights = np.array(
+            [self._row(block, middles, name, at) for name, at in observation.points.items()]
+        )
+
+    def _names(self) -> tuple[str, ...]:
+        return self.observation.names(len(self.observation.points))
+
+    @staticmethod
+    def _row(block: FieldBlock, middles: Array, name: str, at: float | str) -> Array:
+        """Return the weights of the fluxes in the middles of all cells."""
+        mesh, sign = block.field.mesh, -1.0
+        low, high = float(mesh.p.min()), float(mesh.p.max())
+        if isinstance(at, str):
+            facets = (mesh.boundaries or {}).get(at)
+            if facets is None:
+                known = sorted(mesh.boundaries or {})
+                raise ObservationError(
+                    f"FluxPlates: '{name}' is at '{at}'; the mesh names {known}."
+                )
+            place = float(mesh.p[0][mesh.facets[0][np.asarray(facets)]].mean())
+            if place not in (low, high):
+                raise ObservationError(f"FluxPlates: '{name}' is at '{at}', which is not an end.")
+            # Into the domain: at the right end against x.
+            sign = -1.0 if place == low else 1.0
+        else:
+            place = float(at)
+        if not low <= place <= high:
+            raise ObservationError(
+                f"FluxPlates: '{name}' is at {place:g}, outside the mesh from {low:g} to {high:g}."
+            )
+        k = int(np.clip(np.searchsorted(middles, place) - 1, 0, len(middles) - 2))
+        share = (place - middles[k]) / (middles[k + 1] - middles[k])
+        row = np.zeros(len(middles))
+        row[k], row[k + 1] = sign * (1.0 - share), sign * share
+        return row
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        return np.asarray(self._weights @ ((self._D @ q) * (self._slopes @ u)))
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        H_u = sp.csr_array(self._weights * (self._D @ q)) @ self._slopes
+        H_q = (self._weights * (self._slopes @ u)) @ self._D
+        return sp.csr_array(H_u), np.asarray(H_q)

@@ -19,8 +19,9 @@ from livepde.observation.reconstruction import (
     Reconstructed,
     Reconstruction,
     Reconstructor,
+    Split,
+    is_selection,
 )
-from livepde.observation.split import Split, is_selection
 from livepde.spaces import HilbertSpace
 
 Direct = Callable[[Any, Place], Any]
@@ -146,8 +147,8 @@ class Observation:
 class Observed:
     """An observation bound to a state space: predicted readings and their derivatives.
 
-    Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`, and `available` if
-    readings may be missing.
+    Sensors other than z = G u + D q override `predict`, `jacobian` and `linear`, `available` if
+    readings may be missing, and `_prepare` to compute what they need.
     """
 
     def __init__(
@@ -161,6 +162,7 @@ class Observed:
         self.state = state
         self.X = X
         self.parameter = parameter
+        self._prepare()
         self.names = self._names()
         self.size = len(self.names)
         if len(set(self.names)) != self.size:
@@ -173,6 +175,9 @@ class Observed:
                 raise ObservationError(f"direct: no sensor is called '{name}'; {self.names} are.")
         self._splits: Memo[bytes, Split] = Memo(LARGEST_MEMO)
         self._reconstructors: Memo[bytes, Reconstructor] = Memo(LARGEST_MEMO)
+
+    def _prepare(self) -> None:
+        """Compute what predictions need; the base class needs nothing."""
 
     @property
     def places(self) -> Mapping[str, Array]:
@@ -193,7 +198,6 @@ class Observed:
 
     @property
     def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, False if in the inner product of X."""
         return self.observation.nodal
 
     @cached_property
@@ -221,10 +225,7 @@ class Observed:
 
     @cached_property
     def G(self) -> sp.csr_array:
-        """Constant matrix of the linear part, shape (sensors, n).
-
-        It raises `ObservationError` if the sensors have none.
-        """
+        """Constant matrix of the linear part, (sensors, n); raises an error if there is none."""
         G = sp.csr_array(self.observation.matrix(self.state), copy=True).astype(float)
         if G.shape[1] != self.X.dim:
             raise ObservationError(
@@ -246,21 +247,13 @@ class Observed:
 
     @property
     def linear(self) -> bool:
-        """True if z = G u, possibly after `linearised`, as projections and the gradient law need.
-
-        It is False for sensors that depend on the parameter.
-        """
+        """True if z = G u, possibly after `linearised`, as projections need."""
         return not self.observation.directs
 
     def predict(self, u: Array, q: Array, moment: Moment) -> Array:
         """Return the predicted readings, G u + D q, shape (sensors,); NaN: no reading.
 
-        Parameters
-        ----------
-        u, q
-            Coefficients of the state and of the parameter, shapes (n,) and (m,).
-        moment
-            Time and input channels.
+        u and q are coefficients of the state, (n,), and of the parameter, (m,).
         """
         z: Array = self.G @ u if self._shown is None else u[self._shown]
         direct = self._direct(moment)

@@ -1,8 +1,8 @@
-"""Point sensors whose positions are uncertain, z_k = u(x_k + d_k) with unknown d_k."""
+"""Point sensors at uncertain positions, z_k = u(x_k + d_k) with unknown d_k, and moving sensors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,11 +24,7 @@ NEAR = 1e-6
 
 
 def shift_names(sensor: str, dimension: int) -> list[str]:
-    """Return the names of a sensor's shifts: its own in 1D, else one for each coordinate.
-
-    >>> shift_names("T", 2)
-    ['T.x', 'T.y']
-    """
+    """Return the names of a sensor's shifts: "T" in 1D, else "T.x", "T.y" and so on."""
     return [sensor] if dimension == 1 else [f"{sensor}.{axis}" for axis in AXES[:dimension]]
 
 
@@ -36,18 +32,11 @@ def shift_names(sensor: str, dimension: int) -> list[str]:
 class _Shift:
     """Effect of shifting one sensor along one coordinate by d: a quadratic interpolant.
 
-    The quadratic interpolates the values at -a, 0 and b, about a standard deviation to each side. A
-    derivative is not used because u has none at a node of linear elements. At the end of the mesh a
-    or b is 0, and the interpolant is the straight line to the other side.
-
-    Attributes
-    ----------
-    sensor, column
-        Number of the sensor, and position of the shift in q.
-    below, above
-        Distances a and b.
-    low, high
-        Rows that evaluate the differences of u there to u at 0, shape (1, n).
+    The quadratic interpolates the values at -a, 0 and b (`below`, `above`), about a standard
+    deviation to each side. A derivative is not used because u has none at a node of linear
+    elements. At the end of the mesh a or b is 0, and the interpolant is the straight line to the
+    other side. The rows `low` and `high` evaluate the differences of u there to u at 0, shape (1,
+    n); `column` is the position of the shift in q.
     """
 
     sensor: int
@@ -75,16 +64,9 @@ class _Shift:
 class PlacedObserved(Observed):
     """Bound point sensors at uncertain positions: linear in u, quadratic in the shifts.
 
-    Parameters
-    ----------
-    observation, state, X, parameter
-        As for `Observed`.
-    rows
-        Matrix of the values that some sensors would measure at other places (`Points.rows`).
-    at
-        Stated coordinates of all sensors, shape (sensors, d).
-    uncertain, std
-        Names of the sensors whose positions are uncertain, and the standard deviation of a shift.
+    `rows` is the matrix of the values that some sensors would measure at other places
+    (`Points.rows`), `at` the stated coordinates of all sensors, shape (sensors, d). The positions
+    of the sensors in `uncertain` have shifts of standard deviation `std`.
     """
 
     def __init__(
@@ -165,10 +147,7 @@ class PlacedObserved(Observed):
 
     @cached_property
     def _parts(self) -> tuple[sp.csr_array, Array]:
-        """Pattern of G at shifted positions, and the values on it of G and of each difference.
-
-        Shapes (sensors, n) and (1 + 2 shifts, entries).
-        """
+        """Pattern of G at shifted positions, and values on it of G and of each difference."""
         rows = self._sensors
         sums = sp.csr_array(
             (np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(self.size, len(rows))
@@ -184,11 +163,8 @@ class PlacedObserved(Observed):
 
 
 def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
-    """Return start + step along an axis, or the last point on the way that is in the mesh.
-
-    A distance below `NEAR` of the step counts as zero: the sensor lies on the end of the mesh.
-    """
-    least, most = 0.0, 1.0
+    """Return start + step along an axis, or the last point on the way that is in the mesh."""
+    least, most = 0.0, 1.0  # a share below `NEAR` counts as zero: on the end of the mesh
 
     def at(share: float) -> Array:
         point: Array = start.copy()
@@ -201,3 +177,113 @@ def _reached(block: FieldBlock, start: Array, axis: int, step: float) -> Array:
         middle = 0.5 * (least + most)
         least, most = (middle, most) if block.contains(at(middle)) else (least, middle)
     return at(least) if least > 0.0 else start
+
+
+@dataclass(frozen=True, eq=False)
+class Moving(Observation):
+    """Point sensors with positions from the stream, z_k(t) = u(x_k(t), t).
+
+    While its position is missing or outside of the mesh, a sensor has no reading: its prediction is
+    NaN and its sample is not used. Positions are not held from one sample to the next.
+
+    Parameters
+    ----------
+    positions
+        Mapping from sensor name to the channel of its position; in more than one dimension to one
+        channel for each coordinate.
+
+    Examples
+    --------
+    >>> Moving({"probe": ("probe_x", "probe_y")}, noise=0.1).inputs
+    ('probe_x', 'probe_y')
+    """
+
+    positions: Mapping[str, str | Sequence[str]]
+
+    def __post_init__(self) -> None:
+        if not self.positions:
+            raise ObservationError("Moving: give at least one sensor.")
+        self._reads(name for names in self.channels for name in names)
+
+    @property
+    def channels(self) -> list[tuple[str, ...]]:
+        """Channels of the coordinates of each sensor."""
+        given = self.positions.values()
+        return [(names,) if isinstance(names, str) else tuple(names) for names in given]
+
+    def names(self, count: int) -> tuple[str, ...]:
+        return tuple(self.positions)
+
+    @property
+    def optional(self) -> frozenset[str]:
+        return frozenset(name for names in self.channels for name in names)
+
+    @property
+    def portable(self) -> bool:
+        return True
+
+    def bind(
+        self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
+    ) -> MovingObserved:
+        return MovingObserved(self, state, X, parameter)
+
+
+class MovingObserved(Observed):
+    """Bound `Moving` sensors: G depends on the moment."""
+
+    observation: Moving
+
+    def _prepare(self) -> None:
+        self.block = self.observation.scalar_block(self.state)
+        dimension = self.block.field.mesh.dim()
+        for name, channels in zip(self._names(), self.observation.channels, strict=True):
+            if len(channels) != dimension:
+                raise ObservationError(
+                    f"Moving: sensor '{name}' has position channels {list(channels)}; the mesh "
+                    f"has {dimension} coordinates."
+                )
+        # G at the last positions. Copies of an identifier share it, possibly in several threads:
+        # the three values are read and replaced as one tuple, so that they are always consistent.
+        self._last: tuple[bytes, sp.csr_array, Array] | None = None
+
+    def _names(self) -> tuple[str, ...]:
+        return self.observation.names(len(self.observation.positions))
+
+    @property
+    def linear(self) -> bool:
+        return False
+
+    def predict(self, u: Array, q: Array, moment: Moment) -> Array:
+        G, seen = self._at(moment)
+        z: Array = G @ u
+        z[np.logical_not(seen)] = np.nan
+        return z
+
+    def jacobian(self, u: Array, q: Array, moment: Moment) -> tuple[sp.csr_array, Array | None]:
+        return self._at(moment)[0], None
+
+    def available(self, moment: Moment) -> Array:
+        return self._at(moment)[1]
+
+    def _at(self, moment: Moment) -> tuple[sp.csr_array, Array]:
+        """Return G at a moment, and the mask of sensors inside the mesh."""
+        given = dict(moment.inputs)
+        points = np.array(
+            [[given.get(name, np.nan) for name in names] for names in self.observation.channels]
+        )
+        key = points.tobytes()
+        last = self._last
+        if last is None or last[0] != key:
+            seen = np.array([self.block.contains(point) for point in points])
+            rows = np.flatnonzero(seen)
+            G = sp.csr_array((len(points), self.state.dim))
+            if len(rows):
+                values = self.state.widen(self.block.probe(points[rows].T), self.observation.of)
+                place = sp.csr_array(
+                    (np.ones(len(rows)), (rows, np.arange(len(rows)))), (len(points), len(rows))
+                )
+                G = sp.csr_array(place @ values)
+            # Callers share the cached mask, so it must not be changed in place.
+            seen.setflags(write=False)
+            self._last = last = (key, G, seen)
+        return last[1], last[2]

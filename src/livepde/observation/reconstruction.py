@@ -1,4 +1,4 @@
-"""Reconstruction of the observed part of the state: G^+, and G_alpha (section 3.2).
+"""Observed and unobserved part of the state; reconstruction by G^+ and G_alpha (section 3.2).
 
 With noisy data G^+ z is undefined or unstable if the range of G is not closed. Even if it is
 closed, the noise enters the law through B(w), which takes two derivatives. The paper replaces it by
@@ -24,9 +24,89 @@ import scipy.sparse as sp
 
 from livepde.errors import ObservationError
 from livepde.fem import FieldBlock, Form, FunctionSpace, Integrand, ddot, dot, grad, hess
-from livepde.linalg import Array, Mask
-from livepde.observation.split import Split
+from livepde.linalg import Array, IntArray, Mask
 from livepde.spaces import HilbertSpace
+
+
+@dataclass(frozen=True, eq=False)
+class Split:
+    """Projections R = G^+ G on N(G)^perp and P = I - R on N(G), and G^+ itself.
+
+    Attributes
+    ----------
+    R, P
+        Sparse, shape (n, n); idempotent to rounding. Fixed (Dirichlet) coefficients are known, and
+        belong to P.
+    inverse, G
+        G^+ on the present sensors, shape (n, present), and their rows of G, shape (present, n).
+    present
+        Mask of the sensors used, shape (sensors,).
+    vectors
+        Basis of N(G)^perp, shape (n, k); None if the columns of `inverse` are one.
+    omega
+        Elements on which the data determine the state, for sensors on a subdomain: there the
+        paper's chi_omega is one, and integrals over Omega are split into those over `omega`, with
+        the data, and those over the other elements, with the estimate. None: all elements, with the
+        state split by R and P alone.
+    """
+
+    R: sp.csr_array
+    P: sp.csr_array
+    inverse: sp.csr_array
+    present: Array
+    G: sp.csr_array
+    vectors: Array | None = None
+    omega: IntArray | None = None
+
+    @property
+    def basis(self) -> Array:
+        """Basis of N(G)^perp, shape (n, k)."""
+        return self.inverse.toarray() if self.vectors is None else self.vectors
+
+    @cached_property
+    def _diagonal(self) -> Array | None:
+        """Diagonal of R if R is diagonal, else None."""
+        alone = bool(np.array_equal(self.R.indices, np.flatnonzero(np.diff(self.R.indptr))))
+        return self.R.diagonal() if alone else None
+
+    @cached_property
+    def _complete(self) -> bool:
+        """True if all sensors are present."""
+        return bool(self.present.all())
+
+    @cached_property
+    def _selected(self) -> IntArray | None:
+        """Coefficient read by each present sensor, if each reads a single one; else None."""
+        selects = self.vectors is None and is_selection(sp.csr_array(self.inverse.T))
+        return sp.csr_array(self.inverse.T).indices if selects else None
+
+    def project(self, u: Array) -> Array:
+        """Return R u."""
+        projected: Array = self.R @ u if self._diagonal is None else self._diagonal * u
+        return projected
+
+    def reconstruct(self, z: Array, boundary: Array | None) -> Array:
+        """Return the observed part R u* = G^+ z of the state in X, shape (n,).
+
+        Missing measurements (NaN) are ignored. `boundary` is a coefficient vector with the
+        Dirichlet values, zero elsewhere; None: zero.
+        """
+        known = z if self._complete else z[self.present]
+        if boundary is not None and boundary.any():
+            known = known - self.G @ boundary
+        if self._selected is None:
+            part: Array = self.inverse @ known
+            return part
+        part = np.zeros(self.R.shape[0])
+        part[self._selected] = known
+        return part
+
+
+def is_selection(G: sp.csr_array) -> bool:
+    """Return True if every row selects one coefficient, and no two rows the same."""
+    one_each = bool(np.all(np.diff(G.indptr) == 1) and np.all(G.data == 1.0))
+    return one_each and len(np.unique(G.indices)) == len(G.indices)
+
 
 SMALLEST, LARGEST = 1e-12, 1e12  # alpha of the discrepancy principle, in units of its scale
 # Relative accuracy of alpha in the discrepancy principle.
@@ -37,12 +117,10 @@ MOST_SENSORS = 10_000
 
 @dataclass(frozen=True, eq=False)
 class Reconstructed:
-    """Reconstruction of the observed part of the state, with its regularisation data.
+    """Reconstruction u = u_alpha = G_alpha z of the observed part of the state, shape (n,).
 
     Attributes
     ----------
-    u
-        u_alpha = G_alpha z in X, shape (n,).
     alpha
         Regularisation parameter; 0 for G^+.
     misfit
@@ -62,16 +140,10 @@ class Alpha(ABC):
 
     @abstractmethod
     def choose(self, misfit: Callable[[float], float], delta: float, scale: float) -> float:
-        """Return alpha >= 0 for one sample.
+        """Return alpha >= 0 for one sample with noise level delta in Z.
 
-        Parameters
-        ----------
-        misfit
-            Function alpha -> ||G u_alpha - z||_Z, nondecreasing.
-        delta
-            Noise level of the sample in Z.
-        scale
-            Value of alpha at which both terms have equal weight.
+        `misfit` is the function alpha -> ||G u_alpha - z||_Z, nondecreasing; `scale` the alpha at
+        which both terms have equal weight.
         """
 
     @property
@@ -90,15 +162,9 @@ def _check(owner: str, **values: float | None) -> None:
 class Apriori(Alpha):
     """A priori parameter choice, alpha = factor · delta^power.
 
-    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2.
-
-    Parameters
-    ----------
-    power, factor
-        Exponent and factor of the rule.
-    delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
-        of the observation.
+    Regularisation theory requires alpha -> 0 and delta^2/alpha -> 0: 0 < power < 2. The noise level
+    ||z^delta - z||_Z is `delta`, or `level` relative to ||z^delta||_Z; default given by `noise` of
+    the observation.
     """
 
     power: float = 1.0
@@ -128,15 +194,9 @@ class Discrepancy(Alpha):
 
     One scalar equation is solved for each sample; G is factorised once for each set of present
     sensors. If no alpha attains tau · delta because redundant sensors disagree by more, alpha is
-    the lower end of the search interval; if every misfit is below it, the upper end.
-
-    Parameters
-    ----------
-    tau
-        > 1 in theory, so that alpha is never chosen too small for the noise.
-    delta, level
-        Noise level ||z^delta - z||_Z, or relative to ||z^delta||_Z; default given by `noise`
-        of the observation.
+    the lower end of the search interval; if every misfit is below it, the upper end. In theory tau
+    > 1, so that alpha is never chosen too small for the noise. `delta` and `level` are as for
+    `Apriori`.
     """
 
     tau: float = 1.1
@@ -164,35 +224,21 @@ class Discrepancy(Alpha):
 
 
 class BoundSensors(Protocol):
-    """Protocol of sensors bound to a state space, for reconstructions; see `Observed`.
-
-    Attributes
-    ----------
-    state, X
-        The state space, with and without its components.
-    """
+    """Sensors bound to a state space, for reconstructions: see `Observed`."""
 
     state: FunctionSpace
     X: HilbertSpace
 
     @property
-    def G(self) -> sp.csr_array:
-        """Matrix of the sensors, shape (sensors, n)."""
-        ...
+    def G(self) -> sp.csr_array: ...
 
     @property
-    def noise(self) -> Array | None:
-        """Noise standard deviation of each sensor, shape (sensors,); None if unknown."""
-        ...
+    def noise(self) -> Array | None: ...
 
     @property
-    def nodal(self) -> bool:
-        """True if G^+ is taken in coefficients, False if in the inner product of X."""
-        ...
+    def nodal(self) -> bool: ...
 
-    def split(self, present: Array | None = None) -> Split:
-        """Return R, P and G^+ for the sensors present."""
-        ...
+    def split(self, present: Array | None = None) -> Split: ...
 
 
 class Reconstructor(ABC):
@@ -200,16 +246,10 @@ class Reconstructor(ABC):
 
     @abstractmethod
     def __call__(self, z: Array, boundary: Array, delta: float | None = None) -> Reconstructed:
-        """Return the reconstruction u_alpha.
+        """Return the reconstruction u_alpha from measurements of shape (sensors,).
 
-        Parameters
-        ----------
-        z
-            Measurements, shape (sensors,); those of absent sensors are ignored.
-        boundary
-            Coefficient vector with the Dirichlet values, zero elsewhere.
-        delta
-            Noise level ||z^delta - z||_Z; default that of the rule or the observation.
+        `boundary` is a coefficient vector with the Dirichlet values, zero elsewhere; `delta` the
+        noise level ||z^delta - z||_Z, default that of the rule or the observation.
         """
 
 

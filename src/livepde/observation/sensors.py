@@ -31,7 +31,6 @@ class Points(Observation):
         Mapping from sensor name to a function (q, x) for a direct dependence on the parameter,
         linear in q: z_k = u(x_k) + direct(q, x), as in {"T_fluid": lambda q, x: q.R_b *
         x.inputs["Q"] / H}.
-
     position_std
         Standard deviation of the true positions, along each coordinate: one number for all sensors,
         or a mapping from sensor name to number for some, with one common value. The shifts are then
@@ -44,8 +43,8 @@ class Points(Observation):
     Raises
     ------
     ObservationError
-        No position, or options that do not fit the sensors; when it is bound, a position outside
-        of the mesh, or a vector state of which no component is named.
+        No position, or options that do not fit the sensors; when it is bound, a position outside of
+        the mesh, or a vector state of which no component is named.
 
     Examples
     --------
@@ -148,14 +147,8 @@ class Points(Observation):
     ) -> sp.csr_array:
         """Return the matrix of the values that some sensors would measure at other places, (k, n).
 
-        Parameters
-        ----------
-        at
-            Coordinates, shape (k, d).
-        which
-            Number of the sensor at each place.
-        what
-            Name of a place in messages.
+        `at` are the coordinates, shape (k, d), `which` the number of the sensor at each place, and
+        `what` the name of a place in messages.
         """
         block, _ = state.component(self.of)
         values = block.probe(at.T, what)
@@ -343,15 +336,7 @@ def _cuts(mesh: Any, a: Array, b: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Matrix(Observation):
-    """Linear observation given by its matrix G on the coefficients of the state.
-
-    Parameters
-    ----------
-    G
-        Shape (sensors, n), dense or sparse.
-    labels
-        A name for each row.
-    """
+    """Linear observation by its matrix G, (sensors, n), dense or sparse; a label for each row."""
 
     G: Any
     labels: Sequence[str] | None = None

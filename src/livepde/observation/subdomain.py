@@ -34,11 +34,6 @@ class Subdomain(Observation):
 
     Elements cut by the boundary of omega are excluded. If that strip matters, place mesh nodes at
     the ends of omega: `interval(0, 1, 30, through=(0.3, 0.87))`.
-
-    Parameters
-    ----------
-    omega
-        Predicate on x of shape (d, points).
     """
 
     omega: Predicate
@@ -81,15 +76,10 @@ class Subdomain(Observation):
         given
             Function of x, shape (d, points), with a value for each point, of a vector field a row
             for each component; or a `DataArray` over the coordinates `x`, `y`, `z` of the mesh,
-            between which it is linear, and over one dimension more for several samples, as time.
+            between which it is linear, and over one dimension more for several samples, as time:
+            then z has the shape (samples, sensors). A value that is missing is NaN.
         state
             The state of the model, `model.state_space`.
-
-        Returns
-        -------
-        z
-            Shape (sensors,), of a `DataArray` with one dimension more (samples, sensors). A value
-            that is missing is NaN.
 
         Raises
         ------

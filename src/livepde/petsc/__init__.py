@@ -9,10 +9,8 @@ from __future__ import annotations
 from livepde.petsc.dolfinx import DolfinxModel
 from livepde.petsc.mpi_io import load_state, save_state
 from livepde.petsc.observer import PetscObserver
-from livepde.petsc.petsc_check import check_petsc_model
 from livepde.petsc.petsc_filter import PetscFilter, leading_modes, number_modes
-from livepde.petsc.petsc_model import PetscModel
-from livepde.petsc.step import ImplicitStep
+from livepde.petsc.petsc_model import ImplicitStep, PetscModel, check_petsc_model
 
 __all__ = [
     "DolfinxModel",

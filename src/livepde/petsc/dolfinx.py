@@ -13,8 +13,7 @@ import numpy as np
 
 from livepde.errors import ModelError
 from livepde.linalg import Array, IntArray
-from livepde.petsc.petsc_model import petsc_module
-from livepde.petsc.vectors import gathered, standard_vector
+from livepde.petsc.petsc_model import gathered, petsc_module, standard_vector
 
 OBSERVED, HIDDEN = 1, 2  # tags of cells
 

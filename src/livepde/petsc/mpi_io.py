@@ -21,8 +21,7 @@ from livepde.laws.equation_tests import ExcitationLevel
 from livepde.linalg import IntArray
 from livepde.petsc.observer import ObserverState
 from livepde.petsc.petsc_filter import PetscFilterState
-from livepde.petsc.petsc_model import PetscModel, petsc_module
-from livepde.petsc.vectors import zeros
+from livepde.petsc.petsc_model import PetscModel, petsc_module, zeros
 
 OF_Q = ("q", "rate_q", "modes")  # fields of a state with vectors of Q,
 OF_U = ("u", "U", "u_alpha", "rate_u")  # and of X

@@ -33,9 +33,20 @@ from livepde.laws.coupled.equation import STIFFEST
 from livepde.laws.damping import Damping, Residual, ResidualDamping
 from livepde.laws.equation_tests import PROBES, ExcitationGate, ExcitationLevel
 from livepde.laws.law import Status
-from livepde.petsc.petsc_model import PetscModel, petsc_module
-from livepde.petsc.step import RESTING, SAME, TINY, advance, require_order
-from livepde.petsc.vectors import free_mask, linear_solver, multigrid, random_vector, zeros
+from livepde.petsc.petsc_model import (
+    RESTING,
+    SAME,
+    TINY,
+    PetscModel,
+    advance,
+    free_mask,
+    linear_solver,
+    multigrid,
+    petsc_module,
+    random_vector,
+    require_order,
+    zeros,
+)
 from livepde.stepping import StepFailed
 
 PREFIX = "livepde_coupled_"

@@ -25,9 +25,18 @@ from livepde.errors import LawError
 from livepde.laws.filter import contraction
 from livepde.laws.law import Status
 from livepde.linalg import Array, IntArray, Mask
-from livepde.petsc.petsc_model import PetscModel
-from livepde.petsc.step import ImplicitStep, advance, require_order
-from livepde.petsc.vectors import combined, gathered, inner, linear_solver, random_vector, zeros
+from livepde.petsc.petsc_model import (
+    ImplicitStep,
+    PetscModel,
+    advance,
+    combined,
+    gathered,
+    inner,
+    linear_solver,
+    random_vector,
+    require_order,
+    zeros,
+)
 
 ACCURATE = 1e-14  # relative change of the variances of modes
 
@@ -36,16 +45,9 @@ ACCURATE = 1e-14  # relative change of the variances of modes
 class PetscFilterState:
     """Estimate and square root of the joint covariance after a sample; k unknowns a.
 
-    Attributes
-    ----------
-    u, U
-        State, and k rows of the square root, vectors of shape (n,).
-    a, C
-        Unknowns in prior standard deviations, shape (k,), and their square root, shape (k, k).
-    refused
-        Readings of each sensor that the gate has refused in a row, shape (sensors,).
-    modes
-        The columns of Phi, k vectors of shape (m,): a checkpoint has them.
+    State u, and k rows U of the square root, vectors of shape (n,); unknowns a in prior standard
+    deviations, (k,), and their square root C, (k, k). `refused` counts the readings of each sensor
+    that the gate has refused in a row; `modes` are the columns of Phi, k vectors of shape (m,).
     """
 
     t: float

@@ -78,15 +78,7 @@ PAPER = {
 
 @dataclass(frozen=True, eq=False)
 class NoisyTwin:
-    """Twin with exact data computed once, for many noise realisations.
-
-    Parameters
-    ----------
-    twin
-        The experiment without noise.
-    start
-        Initial state u*(x, 0) of the paper's runs.
-    """
+    """Twin with exact data computed once, for many noise realisations; `start` is u*(x, 0)."""
 
     twin: Twin
     start: Callable[[Any], Any]
@@ -124,13 +116,9 @@ class Ensemble:
     ----------
     times
         Shape (samples,).
-    energy
-        Energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain: shape (seeds,
-        samples).
-    error
-        Relative L2 error of q, shape (seeds, samples).
-    size
-        ||q^||_L2, shape (seeds, samples).
+    energy, error, size
+        Energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain, relative L2 error
+        of q, and ||q^||_L2, each of shape (seeds, samples).
     result
         The run of the first seed.
     failed
@@ -284,15 +272,7 @@ def row(kind: str, level: float, runs: Ensemble) -> list[Any]:
 def paper_noise(
     seeds: Sequence[int] = SEEDS, progress: bool = False
 ) -> tuple[Runs, Table, dict[float, Ensemble]]:
-    """Run the second figure on the paper's example.
-
-    Returns
-    -------
-    runs, table
-        Runs and table of every variant.
-    alone
-        For each level the runs for q* = 0 with the same band noise.
-    """
+    """Run the second figure on the paper's example; `alone` are the same runs where q* = 0."""
     case, nothing = paper_case(), paper_case(0.0)
     runs: Runs = {
         (name, level * v.share): ensemble(case, v.law, v.noise, level * v.share, seeds, progress)
@@ -408,7 +388,8 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
 def first_checks(runs: dict[float, Track]) -> list[Check]:
     """Return the checks of the first figure."""
     plain = runs[0.0]
-    x, q = _profile(plain)
+    data = plain.result.to_xarray()
+    x, q = data["x"].values, data["q"].values[-1]
     checks = [
         Check(
             f"first figure: {what} at t = 60, nu = {nu:g}",
@@ -482,11 +463,6 @@ def _failures(
         failures([found for found in noisy if found is not wild], ", second figure"),
         failures([wild], f", paper's example, {name}, {level:.0%} noise", NO_SOLUTION),
     ]
-
-
-def _profile(found: Track) -> tuple[Array, Array]:
-    data = found.result.to_xarray()
-    return data["x"].values, data["q"].values[-1]
 
 
 def _words(runs: dict[float, Track], alone: dict[float, Ensemble]) -> list[str]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
+from livepde import plots
 from livepde.diagnostics.check_report import Check
 from livepde.errors import ConfigurationError
 from livepde.identifier import Identifier
@@ -20,18 +21,10 @@ from livepde.streams import Twin
 
 @dataclass(frozen=True)
 class Experiment:
-    """A published or stated experiment.
+    """A published or stated experiment: its name on the command line, and one sentence.
 
-    Attributes
-    ----------
-    name
-        Name on the command line.
-    summary
-        One sentence.
-    truths
-        Supported kinds of truth (see `Twin`), the default first.
-    conduct
-        Function (truth, progress) -> outcome.
+    `truths` are the supported kinds of truth (see `Twin`), the default first; `conduct` is a
+    function (truth, progress) -> outcome.
     """
 
     name: str
@@ -42,12 +35,8 @@ class Experiment:
     def run(self, truth: str | None = None, progress: bool = False) -> Outcome:
         """Run it and return tables, checks and figures.
 
-        Parameters
-        ----------
-        truth
-            Origin of the data; default the first of `truths`.
-        progress
-            True: show a progress bar for every run.
+        The data have the origin `truth`, default the first of `truths`. With `progress` every run
+        shows a progress bar.
 
         Raises
         ------
@@ -67,9 +56,7 @@ class Failing(Protocol):
     """A run that counts its failed steps."""
 
     @property
-    def failed(self) -> int:
-        """Number of samples with a failed step."""
-        ...
+    def failed(self) -> int: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +65,6 @@ class Track:
 
     Attributes
     ----------
-    result, last
-        The run, and its last estimate.
     times, errors
         Relative L2 error of q after each sample, both of shape (samples,).
     u_error
@@ -126,3 +111,11 @@ def track(identifier: Identifier, twin: Twin, what: str, progress: bool = False)
     return Track(
         result, estimate, np.array(times), np.array(errors), twin.u_error(estimate), divided
     )
+
+
+def draw_errors(runs: Mapping[str, Track]) -> Any:
+    """Draw the error of q over time of all runs."""
+    series = {name: (found.times, found.errors) for name, found in runs.items()}
+    drawn, axes = plots.figure()
+    plots.history(series, ylabel="relative L2 error of q", levels={"q = 0": 1.0}, ax=axes[0])
+    return drawn

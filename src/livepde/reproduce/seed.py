@@ -28,7 +28,7 @@ from livepde.laws import GradientLaw, ResidualDamping
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.observation import Subdomain
-from livepde.reproduce.experiment import Experiment, Track, failures, track
+from livepde.reproduce.experiment import Experiment, Track, draw_errors, failures, track
 from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
@@ -58,14 +58,7 @@ def f(x: Any, t: float) -> Any:
 def build(std: float = 1.0, nodes: int = N, *, clamped: bool = False) -> tuple[Model, Subdomain]:
     """Return the paper's model, with a prior standard deviation of q, and observation.
 
-    Parameters
-    ----------
-    std
-        Prior standard deviation of q.
-    nodes
-        Number of nodes of the uniform mesh.
-    clamped
-        True: the paper's space, which has no slope functions at the ends; False: they are kept.
+    If `clamped`, the space is the paper's, which has no slope functions at the ends.
     """
     mesh = interval(0, 1, nodes - 1)
     element = hermite(mesh)
@@ -103,12 +96,6 @@ def start(x: Any) -> Any:
     return u_true(x, 0.0)
 
 
-def _auto(twin: Twin, progress: bool) -> Track:
-    law = GradientLaw(gain="auto")
-    identifier = Identifier(twin.model, twin.observation, law, q0=0.0, u0=start)
-    return track(identifier, twin, "gradient, auto", progress)
-
-
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     """Run the whole table and return it with checks and figures."""
     discrete = truth == "discrete"
@@ -120,7 +107,10 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
     if discrete:
         other = twin_of(clamped=False)
         kept = {case: identify(other, *case, progress) for case in WITH_SLOPES}
-        auto = _auto(other, progress)
+        identifier = Identifier(
+            other.model, other.observation, GradientLaw(gain="auto"), q0=0.0, u0=start
+        )
+        auto = track(identifier, other, "gradient, auto", progress)
         tables.append(
             _table("the same, slopes at the ends kept", other, kept, WITH_SLOPES, auto=auto)
         )
@@ -138,7 +128,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         figures={
             "parameter": partial(_figure, tracks, twin, "q"),
             "state": partial(_figure, tracks, twin, "u"),
-            "error": partial(_errors, tracks),
+            "error": partial(draw_errors, {_label(*case): run for case, run in tracks.items()}),
         },
     )
 
@@ -265,14 +255,6 @@ def _figure(tracks: dict[tuple[float, float], Track], twin: Twin, name: str) -> 
             data, name, times=SHOWN, exact=exact, observed=OMEGA, ax=ax, legend=ax is axes[-1]
         )
         ax.set_title(_label(*case))
-    return drawn
-
-
-def _errors(tracks: dict[tuple[float, float], Track]) -> Any:
-    """Draw the error of q over time of all runs."""
-    series = {_label(*case): (found.times, found.errors) for case, found in tracks.items()}
-    drawn, axes = plots.figure()
-    plots.history(series, ylabel="relative L2 error of q", levels={"q = 0": 1.0}, ax=axes[0])
     return drawn
 
 

@@ -23,7 +23,7 @@ from livepde.identifier import Identifier
 from livepde.laws import ResidualDamping, SensitivityLaw, Shadows
 from livepde.model import Model
 from livepde.observation import Full
-from livepde.reproduce.experiment import Experiment, Track, failures, track
+from livepde.reproduce.experiment import Experiment, Track, draw_errors, failures, track
 from livepde.runs import Outcome
 from livepde.stepping import ImplicitEuler
 from livepde.streams import Twin
@@ -138,7 +138,7 @@ def run(truth: str = "discrete", progress: bool = False) -> Outcome:
         dataset=tracks["gradient"].result.to_xarray(),
         figures={
             "parameter": partial(_figure, tracks),
-            "error": partial(_errors, tracks),
+            "error": partial(draw_errors, {f"{name} law": run for name, run in tracks.items()}),
         },
     )
 
@@ -165,14 +165,6 @@ def _figure(tracks: dict[str, Track]) -> Any:
         exact = q_true([data["x"].values])
         plots.profiles(data, "q", times=SHOWN, exact=exact, ax=ax, legend=ax is axes[-1])
         ax.set_title(f"{name} law")
-    return drawn
-
-
-def _errors(tracks: dict[str, Track]) -> Any:
-    """Draw the error of q over time of both laws."""
-    series = {f"{name} law": (found.times, found.errors) for name, found in tracks.items()}
-    drawn, axes = plots.figure()
-    plots.history(series, ylabel="relative L2 error of q", levels={"q = 0": 1.0}, ax=axes[0])
     return drawn
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from livepde.dates import when
 from livepde.diagnostics.check_report import Bound, Check, Sense, Table
-from livepde.diagnostics.identifiability import TRADED, InformationGain
+from livepde.diagnostics.information_gain import TRADED, InformationGain
 from livepde.frames import estimates, model_errors, relative_error
 from livepde.plots.style import modes_told, note, prior_left
 from livepde.records import NORMAL_95, field_names, refused_readings, scalars, used_errors

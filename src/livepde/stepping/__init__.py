@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from livepde.stepping.banded_stage import BandedStage, member_stage
-from livepde.stepping.between import Between, Held
-from livepde.stepping.corrections import Kept
-from livepde.stepping.interruption import interruptible
-from livepde.stepping.interval import End, Interval, Moments, Span, own_noise
-from livepde.stepping.member_stage import KeptFactors, MemberStage, StageOfMembers
-from livepde.stepping.newton import TINY, Near, Newton, Solution, StepFailed
+from livepde.stepping.forward import ForwardStage, simulate
+from livepde.stepping.interval import Between, End, Held, Interval, Moments, Span, own_noise
+from livepde.stepping.member_stage import (
+    BandedStage,
+    KeptFactors,
+    MemberStage,
+    StageOfMembers,
+    member_stage,
+)
+from livepde.stepping.newton import TINY, Kept, Near, Newton, Solution, StepFailed
 from livepde.stepping.schemes import (
     LONG_SUBSTEPS,
     MOST_SUBSTEPS,
@@ -18,9 +21,8 @@ from livepde.stepping.schemes import (
     Scheme,
     Stage,
     advance,
+    interruptible,
 )
-from livepde.stepping.simulation import simulate
-from livepde.stepping.state import ForwardStage
 
 __all__ = [
     "LONG_SUBSTEPS",

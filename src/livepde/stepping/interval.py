@@ -1,33 +1,79 @@
-"""Sample intervals of one process and of many: times, inputs and measurements at both ends."""
+"""Sample intervals, and how inputs behave between two readings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.linalg import Array, IntArray, Mask
-from livepde.stepping.between import Held
+
+Between: TypeAlias = Literal["line", "hold", "next"]
+"""A straight line; the last reading until the next one; or the next reading since the last one."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """The channels that are constant between two readings; all others are straight lines.
+
+    The value of a channel in `last` holds until the next reading (`between = "hold"`); the reading
+    of a channel in `next` is the mean since the last one (`between = "next"`).
+    """
+
+    last: tuple[str, ...] = ()
+    next: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, between: Mapping[str, Any], inputs: Collection[str]) -> Held:
+        """Return the channels of a mapping from channel to behaviour, checked.
+
+        Raises
+        ------
+        ConfigurationError
+            Another channel than those in `inputs`, or another behaviour.
+        """
+        if not isinstance(between, Mapping):
+            raise ConfigurationError(
+                f"between: got {between!r}; expected a mapping from input channel to behaviour, "
+                'such as {"heater": "hold"}.'
+            )
+        for name, given in between.items():
+            if name not in inputs:
+                raise ConfigurationError(
+                    f"between: '{name}' is not an input of this model; the inputs are "
+                    f"{list(inputs)}."
+                )
+            if given not in get_args(Between):
+                raise ConfigurationError(
+                    f"between of '{name}': got {given!r}; expected 'line', 'hold' or 'next'."
+                )
+        kinds = {
+            kind: [n for n, one in between.items() if one == kind] for kind in ("hold", "next")
+        }
+        return cls(tuple(sorted(kinds["hold"])), tuple(sorted(kinds["next"])))
+
+    def __bool__(self) -> bool:
+        return bool(self.last or self.next)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.last or name in self.next
+
+
+LINES = Held()
+
 
 NO_INPUTS = np.zeros((1, 0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class End:
-    """What is known at one end of a sample interval.
-
-    Attributes
-    ----------
-    t, inputs, z
-        Time, input channels, and measurements, shape (sensors,), NaN where missing.
-    noise, gaps, parts
-        As of an `Interval` that ends here.
-    """
+    """What is known at one end of a sample interval, as in `Interval`."""
 
     t: float
     inputs: Mapping[str, float]
@@ -165,16 +211,8 @@ def own_noise(noise: ArrayLike) -> Array | None:
 class Moments(NamedTuple):
     """One time, with the input channels of each member.
 
-    Attributes
-    ----------
-    t
-        The time.
-    channels
-        Names of the channels.
-    inputs
-        Their values, shape (members, channels), or (1, channels) if they are the same for all.
-    interval
-        Interval of a single process that holds the time; None for members of a fleet.
+    `inputs` has the shape (members, channels), or (1, channels) if they are the same for all;
+    `interval`, of a single process, contains the time, and is None for members of a fleet.
     """
 
     t: float
@@ -192,30 +230,21 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Span:
-    """Sample intervals of all members, with a common end.
+    """Sample intervals of all members, with a common end, as arrays.
 
     Attributes
     ----------
     t0, t1
         Time of the last accepted sample of each member, shape (members,), and of this one.
-    channels
-        Names of the input channels.
-    inputs0, inputs1
-        Their values at both ends, shape (members, channels), or (1, channels) if the same for all,
-        as they act on the process inside the interval.
-    z0, z1
-        Measurements at both ends, shape (members, sensors), NaN where missing; or (1, sensors).
+    inputs0, inputs1, row
+        As in `Interval`, shape (members, channels), or (1, channels) if the same for all.
+    z0, z1, noise
+        As in `Interval`, shape (members, sensors) or (1, sensors).
     interval
         Interval of a single process; None for members of a fleet.
-    noise
-        Standard deviation of each value of z1, of its shape, NaN for the default of the sensor;
-        None if all are defaults.
     gaps
         Duration of the gap of each channel before this interval, and 1 if it lasts at its end,
         shape (members, 2, channels) or (1, 2, channels); None without a gap.
-    row
-        Inputs of the sample at the end, of the shape of `inputs1`, as of an `Interval`; None if
-        they are `inputs1`.
     parts
         Number of parts of every substep, shape (members,); None if it is not chosen yet.
     """

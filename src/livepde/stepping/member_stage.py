@@ -1,4 +1,4 @@
-"""Batched implicit stage: states and tangents of several members of one model.
+"""Batched implicit stages: states and tangents of several members of one model.
 
 Column arrays have the shape (1 + r, members, n): the state and r tangents of each member.
 """
@@ -6,16 +6,31 @@ Column arrays have the shape (1 + r, members, n): the state and r tangents of ea
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 
-from livepde.linalg import Array, IntArray, Mask
+from livepde.fem import Channel, Form, Inputs, Moment
+from livepde.linalg import (
+    Array,
+    Assembler,
+    BandedBlocks,
+    BandedSolver,
+    BlockFactor,
+    IntArray,
+    Mask,
+    Pattern,
+    analyse,
+    row_product,
+)
 from livepde.model import Model
-from livepde.stepping.corrections import Kept
+from livepde.stepping.forward import ForwardStage
 from livepde.stepping.interval import Moments
-from livepde.stepping.state import ForwardStage
+from livepde.stepping.newton import Kept, StepFailed
 
 # Relative error of a covariance square root. It affects the gain only, not the innovation, and may
 # be coarser than the state.
@@ -26,13 +41,10 @@ ESTIMATE = 1e-8
 
 @dataclass(frozen=True, eq=False)
 class KeptFactors:
-    """Warm-start data of each member, as `Kept` of a single process.
+    """Warm-start data of each member, as `Kept`, with the members as first axis.
 
-    Attributes
-    ----------
-    q, h, spent, trend
-        Shapes (members, m), (members,), (members,) and (members, n); h = 0 for a member without a
-        cached factor. For stages that cache no factors, q and trend have no columns.
+    h = 0 for a member without a cached factor. For stages that cache none, q and trend have no
+    columns.
     """
 
     q: Array
@@ -71,9 +83,8 @@ class StageOfMembers(NamedTuple):
     kept
         Warm-start data of the previous stage.
     off_centre
-        Mask of members whose last tangent is the offset of the estimated mean from the
-        linearisation point, which has to be more accurate than a covariance square root; shape
-        (members,).
+        Mask of members, (members,), whose last tangent is the offset of the estimated mean from the
+        linearisation point, which has to be more accurate than a covariance square root.
     factors
         Cache of factorised matrices for this q, keyed by step length, shared by the stages of one
         step of a time scheme; a stage may read it and add to it.
@@ -106,12 +117,7 @@ class MemberStage(ABC):
 
     @abstractmethod
     def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
-        """Return states and tangents at the end of a stage, and its warm-start data.
-
-        Parameters
-        ----------
-        columns
-            States and tangents at the beginning of the stage, shape (1 + r, members, n).
+        """Return states and tangents, (1 + r, members, n), at the end of a stage; warm-start data.
 
         Raises
         ------
@@ -165,3 +171,307 @@ class SeparateStages(MemberStage):
             return new, kept
         rows = (np.array([getattr(one, name) for one in left]) for name in vars(left[0]))
         return new, KeptFactors(*rows)
+
+
+# Largest number of unknowns with an assembled matrix A_j each: the cost of summing them grows
+# linearly.
+MOST_UNKNOWNS = 64
+
+# Magnitudes of the random inputs with which affinity is tested: a kink or saturation may lie far
+# from one.
+SCALES = (1e-3, 1.0, 1e3, 1e6)
+# Relative deviation from affinity that is attributed to rounding in the assembly.
+ROUNDING = 1e-11
+# Inputs at which responses are measured: so large that subtracting the vector without inputs
+# cancels no digits, and a power of two so that the division is exact.
+LARGE = 2.0**20
+
+NO_RESPONSE = np.zeros((0, 0))  # of a stage that does not depend on inputs
+
+
+class BandedStep(NamedTuple):
+    """What stages of one length with the same unknowns share.
+
+    `amounts` are h q of the unknowns in which A is linear, (members, unknowns), `slopes` their
+    derivatives in the physical unknowns, (members, unknowns, m), None if these are the same.
+    """
+
+    factor: BlockFactor
+    amounts: Array
+    slopes: Array | None
+    forced: tuple[Array, Array] | None
+
+
+class BandedStage(MemberStage):
+    """Batched stage of models whose matrices are constant, banded and affine in q.
+
+    The matrices M/h + B and A_j are assembled once. The matrices of all members are the diagonal
+    blocks of one banded matrix, which is factorised by one LAPACK call.
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        form, zero, free = model.linear_A, np.zeros(model.X.dim), model.X.free
+        known = (int, float, Channel)
+        fixed_in_time = all(isinstance(value, known) for value in model.boundary_values)
+        units = np.eye(form.spaces["q"].dim)
+        self.pattern, maps = _analysed(model)
+        rows, cols = self.pattern.rows, self.pattern.indices
+        # Masks of the entries between free coefficients, and of free rows with Dirichlet columns.
+        inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
+        # The matrices depend on neither time nor inputs; the forms still need some moment as
+        # argument.
+        some = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
+        mass = maps["M"] @ model.mass.data
+        rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
+        slopes = [maps["A"] @ form.data("v", "u", some, u=zero, q=q) for q in units]
+        self._mass = row_product(self._stacked(mass * free[rows]))
+        self._slopes = row_product(self._stacked(*(slope * inner for slope in slopes)))
+        # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
+        ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
+        parts = np.array([*(slope * inner for slope in slopes), rest * inner + ones, mass * inner])
+        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *parts)
+        # The matrix of a stage is the sum of these with weights h q, h and 1.
+        self._bands = self._blocks.band(parts)
+        # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
+        # They have few entries, and stay sparse: their products are formed once.
+        mass_edge, rest_edge = self._stacked(mass * outer), self._stacked(rest * outer)
+        slope_edge = self._stacked(*(slope * outer for slope in slopes))
+
+        def boundary(moment: Moment) -> Array:
+            return model.impose(zero, moment)
+
+        def load(moment: Moment) -> Array:
+            known = (model.form_F.vector("v", moment) - model.B(zero, moment)) * free
+            return np.asarray(known - rest_edge @ boundary(moment))
+
+        def offset(moment: Moment) -> Array:
+            at_zero = [form.vector("v", moment, q=q, u=zero) * free for q in units]
+            return np.asarray(np.concatenate(at_zero) + slope_edge @ boundary(moment))
+
+        def driven(vector: Callable[[Moment], Array], *forms: Form) -> DrivenVector:
+            def timed() -> bool:
+                return not fixed_in_time or any("t" in each.uses for each in forms)
+
+            return DrivenVector(vector, model.channels, timed)
+
+        self._boundary = driven(boundary)
+        self._mass_boundary = driven(lambda moment: mass_edge @ boundary(moment))
+        self._load = driven(load, model.form_F, model.form_B)
+        self._offset = driven(offset, form)
+
+    @staticmethod
+    def refuses(model: Model) -> str:
+        """Return the reason why a model does not fit this stage; empty if it fits."""
+        if not (model.linear_A.linear_in_parameter and model.affine):
+            return "the model is not affine in its state and its unknowns"
+        if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
+            return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
+        if not model.steady:
+            return "the matrices of the model depend on time or inputs"
+        if not isinstance(analyse(_analysed(model)[0]), BandedSolver):
+            return "the matrices of the model are not banded: the mesh has more than one dimension"
+        return ""
+
+    @property
+    def refusal(self) -> str:
+        """Reason why members with different inputs cannot be batched; empty if they can."""
+        if not all(item.affine for item in (self._boundary, self._load, self._offset)):
+            return "the model is not affine in its input channels"
+        return ""
+
+    def _stacked(self, *parts: Array) -> sp.csr_array:
+        """Return vertically stacked matrices of the pattern."""
+        blocks = [self.pattern.matrix(part) for part in parts]
+        whole = sp.csr_array(sp.vstack(blocks, format="csr"))
+        whole.eliminate_zeros()  # an unknown of a layer has an effect there only
+        return whole
+
+    def twin(self) -> BandedStage:
+        return self  # it keeps no factor
+
+    def kept(self, members: int) -> KeptFactors:
+        return KeptFactors.none(members)
+
+    def advance(self, columns: Array, stage: StageOfMembers) -> tuple[Array, KeptFactors]:
+        # The equations are multiplied by h, which avoids dividing an array of the size of all
+        # columns.
+        (size, n), at = columns.shape[1:], stage.at
+        step = stage.factors.get(stage.h) or self._begin(stage)
+        if size == 1 and len(step.factor.bad):
+            raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
+        # BLAS may round products of other shapes differently, so the separate columns share no
+        # product with the others. Each column is solved by itself, however many there are.
+        new, rows = np.empty(columns.shape), columns.reshape(-1, n)
+        known, together = new.reshape(-1, n), (len(columns) - stage.apart) * size
+        if self._mass.separate or not stage.apart:
+            self._mass(rows, known)
+        else:
+            self._mass(rows[:together], known[:together])
+            self._mass(rows[together:], known[together:])
+        u = known[:size]
+        if step.forced is not None:
+            base, changes = step.forced
+            u += base
+            if len(changes):
+                u += at.inputs[:, : len(changes)].dot(changes)
+        else:
+            u += stage.h * self._load(at) - self._mass_boundary(at)
+        offset = None if self._offset.zero else self._offset(at).reshape(-1, len(step.amounts.T), n)
+        if offset is not None:
+            u -= (step.amounts[:, None] @ offset)[:, 0]
+        # The state first: the tangents need it.
+        u[:] = step.factor.solve(new[:1])[0]
+        if len(columns) > 1:
+            # A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n), drives the
+            # tangents.
+            driven = self._slopes(u).reshape(size, -1, n)
+            if offset is not None:
+                driven = driven + offset
+            along, chosen = stage.h * stage.directions, together // size - 1
+            if step.slopes is not None:
+                along = along @ step.slopes.transpose(0, 2, 1)
+            if chosen:
+                known[size:together] -= _along(along[:, :chosen], driven)
+            if stage.apart:
+                known[together:] -= _along(along[:, chosen:], driven)
+            new[1:] = step.factor.solve(new[1:])
+        if not self._boundary.zero:
+            u += self._boundary(at)
+        return new, stage.kept
+
+    def _begin(self, stage: StageOfMembers) -> BandedStep:
+        """Return what all stages of a length share, and keep it for the next one."""
+        latent, h = self.model.latent, stage.h
+        unknowns = stage.q if latent.plain else latent.value(stage.q.T).T
+        slopes, coefficients = None, self.model.coefficients
+        if coefficients is not None:
+            slopes = np.array([coefficients.slopes(q) for q in unknowns])
+            unknowns = np.array([coefficients.value(q) for q in unknowns])
+        weights = np.empty((len(unknowns), unknowns.shape[1] + 2))
+        amounts = np.multiply(unknowns, h, out=weights[:, :-2])
+        weights[:, -2], weights[:, -1] = h, 1.0
+        factor = self._blocks.factorise(weights.dot(self._bands))
+        step = BandedStep(factor, amounts, slopes, self._forced(h))
+        stage.factors[h] = step
+        return step
+
+    def _forced(self, h: float) -> tuple[Array, Array] | None:
+        """Return what drives the state in a stage, (1, n), and its derivative in the inputs.
+
+        None where that reads the time, or is not affine in the inputs.
+        """
+        load, boundary = self._load.responses, self._mass_boundary.responses
+        if load is None or boundary is None:
+            return None
+        if self._mass_boundary.zero:
+            return h * load[0], NO_RESPONSE if self._load.constant else h * load[1]
+        return h * load[0] - boundary[0], h * load[1] - boundary[1]
+
+
+def _along(directions: Array, driven: Array) -> Array:
+    """Return sums of what drives the tangents along their directions, (r * members, n)."""
+    if len(driven) == 1:  # a product of stacks costs more
+        return np.asarray(directions[0].dot(driven[0]))
+    found: Array = (directions @ driven).transpose(1, 0, 2)
+    return found.reshape(-1, driven.shape[2])
+
+
+def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
+    """Return the sparsity pattern of the stage matrix, and the maps of its parts."""
+    whole = Assembler(model.X.dim)
+    whole.add("M", model.form_M.pattern("v", "u"))
+    whole.add("B", model.form_B.pattern("v", "u"))
+    whole.add("A", model.linear_A.pattern("v", "u"))
+    return whole.build()
+
+
+def member_stage(model: Model) -> MemberStage:
+    """Return the fastest applicable batched stage; the only place of this decision."""
+    if BandedStage.refuses(model):
+        return SeparateStages(model)
+    return BandedStage(model)
+
+
+class DrivenVector:
+    """A vector v(t, inputs), (n,), usually affine in the inputs and independent of time.
+
+    In that case it is assembled once, and its evaluation is one small matrix product. `timed`
+    returns True if the vector has read the time so far.
+    """
+
+    def __init__(
+        self,
+        vector: Callable[[Moment], Array],
+        channels: tuple[str, ...],
+        timed: Callable[[], bool],
+    ) -> None:
+        self.vector = vector
+        self.channels = channels
+        self._timed = timed
+
+    def _at(self, t: float, inputs: Array) -> Array:
+        named = dict(zip(self.channels, inputs.tolist(), strict=True))
+        return self.vector(Moment(t, Inputs(named)))
+
+    @cached_property
+    def affine(self) -> bool:
+        """True if the vector is affine in the inputs, probed at several magnitudes."""
+        if not self.channels:
+            return True
+        # A fixed seed: whether a model counts as affine must not differ between two runs. Several
+        # magnitudes, since a kink or a saturation may lie far from one.
+        rng = np.random.default_rng(2)
+        for scale in SCALES:
+            a, b = scale * rng.standard_normal((2, len(self.channels)))
+            with np.errstate(all="ignore"):
+                parts = [self._at(0.3, x) for x in (a, b, a + b, 0.0 * a)]
+            change = parts[0] + parts[1] - parts[2] - parts[3]
+            size = max(np.abs(part).max(initial=0.0) for part in parts)
+            if not np.abs(change).max(initial=0.0) <= ROUNDING * size:
+                return False
+        return True
+
+    @cached_property
+    def responses(self) -> tuple[Array, Array] | None:
+        """Vector without inputs, (1, n), and its derivative by each input, (channels, n).
+
+        None if the vector reads the time or is not affine.
+        """
+        if not self.affine:
+            return None
+        zero = np.zeros(len(self.channels))
+        base = self._at(0.0, zero)
+        units = LARGE * np.eye(len(zero))
+        changes = [(self._at(0.0, unit) - base) / LARGE for unit in units]
+        if self._timed():
+            return None
+        return base[None], np.reshape(changes, (len(zero), len(base)))
+
+    @cached_property
+    def zero(self) -> bool:
+        """True if the vector is always zero."""
+        return self.responses is not None and not any(part.any() for part in self.responses)
+
+    @cached_property
+    def constant(self) -> bool:
+        """True if neither time nor inputs change the vector."""
+        return self.responses is not None and not self.responses[1].any()
+
+    def __call__(self, at: Moments) -> Array:
+        """Return the vector of each member, shape (members, n); (1, n) if the same for all."""
+        if self.responses is not None:
+            base, changes = self.responses
+            return base if self.constant else base + at.inputs[:, : len(changes)].dot(changes)
+        if len(at.inputs) == 1:
+            return self.vector(at.member(0))[None]
+        base = self._at(at.t, np.zeros(len(self.channels)))
+        total = base[None]
+        # Affine in the inputs, but time-dependent: one evaluation per channel serves all members.
+        largest_inputs = np.abs(at.inputs[:, : len(self.channels)]).max(axis=0)
+        for c, largest in enumerate(largest_inputs):
+            if largest > 0.0:  # a difference at the size of the values: no digits are lost
+                unit = np.zeros(len(self.channels))
+                unit[c] = largest
+                total = total + (at.inputs[:, c] / largest)[:, None] * (self._at(at.t, unit) - base)
+        return total

@@ -1,4 +1,4 @@
-"""Newton's method for an implicit stage, with acceptance by the residual norm."""
+"""Newton's method for an implicit stage, and refinement with the factor of a nearby matrix."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+import scipy.sparse as sp
 
 from livepde.errors import LinearAlgebraError
 from livepde.linalg import Array, Factor, nonfinite_allowed
@@ -74,12 +77,10 @@ class StageEquation(Protocol[Point]):
 
 @dataclass(frozen=True, eq=False)
 class Near:
-    """Predictor of a stage: starting value and cached Jacobian factor.
+    """Predictor of a stage: starting value y and cached Jacobian factor.
 
     Attributes
     ----------
-    y
-        The prediction.
     factor
         Factor of a nearby Jacobian, for the first updates; None: the Jacobian at y is factorised.
     refresh
@@ -93,16 +94,9 @@ class Near:
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[Point]):
-    """Solution of a stage with iteration statistics.
+    """Solution `at` of a stage, with the number of Newton updates.
 
-    Attributes
-    ----------
-    at
-        The solution, with its residual, which is below the tolerance.
-    updates
-        Number of Newton updates.
-    made
-        Iterate of the last factorised Jacobian, and its factor; None without a factorisation.
+    `made` is the iterate of the last factorised Jacobian, and its factor; None without one.
     """
 
     at: Point
@@ -155,12 +149,8 @@ class Newton:
     ) -> Solution[Point]:
         """Return the solution of a stage.
 
-        Parameters
-        ----------
-        start
-            Initial iterate, or a function that returns it: with `near` it may not be needed.
-        near
-            Predicted solution.
+        `start` is the initial iterate, or a function that returns it: with `near`, the predicted
+        solution, it may not be needed.
 
         Raises
         ------
@@ -191,14 +181,7 @@ class _Iteration(Generic[Point]):
     def run(self, at: Point, near: Near, allowed: float, factors: int) -> Solution[Point]:
         """Return the solution; raise `StepFailed` without convergence.
 
-        Parameters
-        ----------
-        at, near
-            Initial iterate and its predictor data.
-        allowed
-            Accepted relative residual.
-        factors
-            Maximum number of factorisations.
+        `allowed` is the accepted relative residual, `factors` the maximum number of factorisations.
         """
         newton, factor = self.newton, near.factor
         while not self._solved(at, allowed):
@@ -264,3 +247,123 @@ class _Iteration(Generic[Point]):
         raise StepFailed(
             "not_converged", f"no update reduces the relative residual of {at.size:.1e}"
         )
+
+
+# Bound on the error of a stage relative to the change of the state in it, so that the accuracy does
+# not depend on how slow the process is.
+SHARE = 1e-2
+# Relative size of a correction at the level of accumulated rounding errors: further corrections
+# would not improve the solution.
+ROUNDING = 1e-11
+# A factor with a contraction rate above this is replaced: five corrections would gain fewer than
+# three digits.
+SLOW = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Warm-start data of a stage: q, (m,), and step h of its cached factor, trend of u, (n,).
+
+    The factor itself is not stored: it is recomputed from these data if it is missing, as after a
+    restart, and the subsequent numbers are the same. q is empty if there is no factor. `spent` are
+    the excess solves since the factor was computed, beyond those expected with a nearby q; the
+    trend is the rate of change for the predictor of the next stage.
+    """
+
+    q: Array
+    h: float
+    spent: float
+    trend: Array
+
+    @classmethod
+    def none(cls) -> Kept:
+        """Return empty warm-start data, as before the first stage."""
+        return cls(np.zeros(0), 0.0, 0.0, np.zeros(0))
+
+
+class At(NamedTuple):
+    """Parameter and step at which the matrix of a stage is evaluated."""
+
+    q: Array
+    h: float
+
+    def same(self, q: Array, h: float) -> bool:
+        """Return True if parameter and step equal (q, h)."""
+        return self.h == h and (self.q is q or np.array_equal(self.q, q))
+
+
+@dataclass(eq=False)
+class Corrections:
+    """Iterative refinement with the matrix of one stage and the factor of another.
+
+    `matrix`, `at` and the mask `free` are of the stage; `factor` returns the factorised matrix of
+    (q, h), at a `price` in triangular solves, and is used at `factor_at`. `spent` is as in `Kept`.
+    """
+
+    matrix: sp.csr_array | Array
+    at: At
+    free: Array
+    factor: Callable[[Array, float], Factor]
+    price: float
+    factor_at: At
+    spent: float
+
+    def once(self, start: Array, b: Array) -> Array:
+        """Return the solution of matrix x = b after a single correction.
+
+        The error left is at most `SLOW` of the initial one, since the factor would be replaced
+        otherwise.
+        """
+        r = (b - self.matrix @ start) * self.free[:, None]
+        return start + solved(self.factor(*self.factor_at), r)
+
+    def solve(self, before: Array, start: Array, b: Array, tolerance: float, passes: int) -> Array:
+        """Return the solution of matrix x = b on the free coefficients, shape (n,) or (n, r).
+
+        `before` is x at the beginning of the stage, `start` an initial guess, exact on the fixed
+        coefficients. `tolerance` bounds the error relative to x, both in the Frobenius norm over
+        all columns, which is invariant under rotations of the columns of a covariance square root.
+        Only corrections beyond `passes` count as excess solves.
+        """
+        free = self.free.reshape(-1, *[1] * (b.ndim - 1))
+        width = b[0].size
+        exact = self.at.same(*self.factor_at)
+        first = (b - self.matrix @ start) * free
+        x, r, count = start, first, 0
+        while True:
+            update = solved(self.factor(*self.factor_at), r)
+            x, count = x + update, count + 1
+            moved, size = float(np.linalg.norm(update)), float(np.linalg.norm(x))
+            # The factor of the stage's own matrix needs no iteration, and at rounding level
+            # corrections only exchange rounding errors.
+            if exact or moved <= ROUNDING * size:
+                return x
+            last, r = float(np.linalg.norm(r)), (b - self.matrix @ x) * free
+            # The contraction rate is estimated from residuals, not from updates: the residual of
+            # the new iterate is needed anyway for the next correction.
+            rate = float(np.linalg.norm(r)) / last if last else math.inf  # squares may underflow
+            if rate <= SLOW:
+                # The remaining error is the geometric series of all further corrections.
+                left = moved * rate / (1.0 - rate)
+                change = float(np.linalg.norm(x - before))
+                allowed = max(min(tolerance * size, SHARE * change), ROUNDING * size)
+                done = left <= allowed
+                more = 0.0 if done else math.log(allowed / left) / math.log(rate)
+                spent = self.spent + width * max(count + more - passes, 0)
+                if done:
+                    self.spent = spent
+                    return x
+                if spent <= self.price:
+                    continue
+            # The refinement with the old factor has cost, or would cost, as much as a
+            # factorisation.
+            self.factor_at, self.spent, exact = self.at, 0.0, True
+            x, r = start, first
+
+
+def solved(factor: Factor, b: Array) -> Array:
+    """Return the solution by a factor; raise `StepFailed` for a singular matrix."""
+    try:
+        return factor.solve(b)
+    except LinearAlgebraError as error:
+        raise StepFailed("singular", str(error)) from error

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypeAlias
 
@@ -16,9 +18,29 @@ import numpy as np
 
 from livepde.errors import ConfigurationError
 from livepde.linalg import Array
-from livepde.stepping.between import LINES, Held
-from livepde.stepping.interruption import safe_point
+from livepde.stepping.interval import LINES, Held
 from livepde.stepping.newton import StepFailed
+
+# A variable of the context, not of a control: a refit in its own thread is not interrupted.
+CHECK: ContextVar[Callable[[], None] | None] = ContextVar("livepde_interruption", default=None)
+
+
+def safe_point() -> None:
+    """Call the function of `interruptible`, if there is one; called before each substep."""
+    check = CHECK.get()
+    if check is not None:
+        check()
+
+
+@contextmanager
+def interruptible(check: Callable[[], None]) -> Iterator[None]:
+    """Let a function be called before each substep; what it raises ends the computation."""
+    token = CHECK.set(check)
+    try:
+        yield
+    finally:
+        CHECK.reset(token)
+
 
 # An interval of more than so many substeps of `dt_max`, such as a pause of the source, is divided
 # into fewer and longer ones: hourly readings with steps of a second are below, and any pause costs
@@ -152,28 +174,18 @@ class Advance:
         return sum(longest < h / 2**k for k in range(MOST_GRADES))
 
 
-def _unwatched(t: float, h: float) -> None:
-    pass
-
-
 def advance(
     control: Advance,
     stage: Stage,
     y: Array,
     t0: float,
     t1: float,
-    begin: Callable[[float, float], None] = _unwatched,
+    begin: Callable[[float, float], object] = lambda t, h: None,
 ) -> tuple[Array, int, StepFailed | None]:
-    """Advance y from t0 to t1.
+    """Advance y from t0 to t1 by the substeps of a control.
 
-    Times are computed from integer counts, never accumulated.
-
-    Parameters
-    ----------
-    control, stage, y, t0, t1
-        Step control and implicit stage; the solution at t0; the interval.
-    begin
-        Is told start and length of each substep before it is tried.
+    Times are computed from integer counts, never accumulated. `begin` receives start and length of
+    each substep before it is tried.
 
     Returns
     -------

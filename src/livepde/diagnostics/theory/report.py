@@ -10,17 +10,18 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import CheckReport, Table
-from livepde.diagnostics.constants import Spaces, constants
-from livepde.diagnostics.error_bounds import TwinTracker, bounds, conditions
-from livepde.diagnostics.excitation import Excitation, Spectrum
-from livepde.diagnostics.links import interpolation, link
-from livepde.diagnostics.stopping import (
+from livepde.diagnostics.theory.constants import Spaces, constants
+from livepde.diagnostics.theory.error_bounds import (
     OnlineStopping,
     StoppingState,
+    TwinTracker,
+    bounds,
+    conditions,
     noise_size,
     reconstruction_matrix,
     stopping_time,
 )
+from livepde.diagnostics.theory.excitation import Excitation, Spectrum, interpolation, link
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
@@ -74,12 +75,10 @@ class TheoryReport:
 
     Attributes
     ----------
-    tables
-        Quantities that could be evaluated.
+    tables, notes
+        Quantities that could be evaluated, and those that could not, with reasons.
     reports
         Conditions and error bounds; only with a truth.
-    notes
-        Quantities that could not be evaluated, with reasons.
     constants, spectrum, stopping
         The numbers behind the tables; None if they could not be computed. `stopping` is the
         surrogate of T*, infinity if it was not reached.
@@ -271,6 +270,8 @@ def theory_report(
 ) -> TheoryReport:
     """Run an identifier and evaluate the quantities of the paper's theory along the run.
 
+    Quantities that cannot be evaluated are listed in a note, never guessed.
+
     Parameters
     ----------
     identifier
@@ -283,12 +284,6 @@ def theory_report(
         Standard deviation of the sensors, for the surrogate of T*; default that of the observation.
     twin
         Twin with the truth, if available; its samples are then used.
-
-    Returns
-    -------
-    TheoryReport
-        Tables and a Markdown page. Quantities that cannot be evaluated are listed in a note, never
-        guessed.
 
     Raises
     ------

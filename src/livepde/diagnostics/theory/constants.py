@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import eigh
 
-from livepde.diagnostics.state_parts import DENSE, Border, Images, Part, lanczos
+from livepde.diagnostics.theory.state_parts import DENSE, Border, Images, Part, lanczos
 from livepde.errors import ConfigurationError
 from livepde.fem import START, Moment
 from livepde.laws.damping import Constants
@@ -93,10 +93,7 @@ class Spaces:
     def images(self, jacobian: Callable[[IntArray | None], sp.csr_array]) -> tuple[Images, Images]:
         """Return the images of the two parts under C', for `Part.lipschitz`.
 
-        Parameters
-        ----------
-        jacobian
-            Function that returns the matrix of C' on some elements; None: on all.
+        `jacobian` returns the matrix of C' on some elements; None: on all.
         """
         if self._regions is None:
             whole = [(self.model.X, jacobian(None))]
@@ -109,13 +106,7 @@ class Spaces:
         return seen, [(inside, sp.csr_array(J @ self._unseen)), outside]
 
     def observed_A(self, w: Array, moment: Moment = START, q: Array | None = None) -> sp.csr_array:
-        """Return A(w) over omega, if it is a subdomain: dual vectors in columns, shape (n, m).
-
-        Parameters
-        ----------
-        q
-            As in `Model.A`.
-        """
+        """Return A(w) over omega, if it is a subdomain: dual vectors in columns, shape (n, m)."""
         model, form = self.model, self.model.form_A
         if self._regions is not None:
             form = form.on(self._regions[0])
@@ -267,16 +258,8 @@ def constants(
     embeddings, ratios
         See `Constants`; the ratios are Kantorovich's bounds.
 
-    Parameters
-    ----------
-    spaces
-        Norms.
-    q
-        Coefficients of the (physical) parameter at which C is taken, q* in a twin, shape (m,).
-    states
-        Coefficients of states along the run, at least one.
-    gain
-        Gain of the law: it divides the inner product of Q, so C_A grows with its square root.
+    C is taken at the (physical) parameter q, q* in a twin, shape (m,), and at states along the run,
+    at least one. The gain of the law divides the inner product of Q: C_A grows with its root.
 
     Raises
     ------

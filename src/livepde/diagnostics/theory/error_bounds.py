@@ -1,16 +1,17 @@
-"""Errors e, r, p of a twin experiment along a run, with the paper's conditions and bounds."""
+"""Errors e, r, p of a twin experiment with the paper's conditions and bounds; stopping time T*."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
+import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import Check, CheckReport
-from livepde.diagnostics.constants import Spaces
+from livepde.diagnostics.theory.constants import Spaces
 from livepde.errors import ConfigurationError
 from livepde.fem import Moment
 from livepde.laws.damping import (
@@ -24,6 +25,7 @@ from livepde.laws.damping import (
     theta_smoothed,
 )
 from livepde.linalg import Array
+from livepde.observation import Observed, Tikhonov
 from livepde.result import Estimate
 from livepde.streams import Twin
 
@@ -48,8 +50,6 @@ class Errors:
 
     Attributes
     ----------
-    t
-        Time.
     e
         ||q - q*||_Q, gain-scaled.
     r, p, d, r_alpha
@@ -102,15 +102,11 @@ class TwinTracker:
 
     Parameters
     ----------
-    twin
-        The truth.
     spaces
         Spaces that define the norms; `Spaces.of(model, observed, law)` for those of the law's
         operators.
-    gain
-        Gain of the law; ||e||_Q^2 is divided by it.
-    damping
-        The law's rule, for theta.
+    gain, damping
+        Those of the law: ||e||_Q^2 is divided by the gain, and the rule gives theta.
     reconstruct
         Function z -> u_alpha as used by the law; default that of the observation.
 
@@ -157,13 +153,7 @@ class TwinTracker:
         self._last: tuple[float, Array] | None = None
 
     def add(self, estimate: Estimate, z: Any) -> Errors:
-        """Compare one estimate with the truth and record the errors.
-
-        Parameters
-        ----------
-        z
-            The sample's measurements, shape (sensors,).
-        """
+        """Compare one estimate with the truth and record the errors; z has the shape (sensors,)."""
         twin, spaces = self.twin, self.spaces
         exact, split = twin.u(estimate.t), spaces.split
         boundary = twin.model.impose(np.zeros(len(exact)), Moment(estimate.t))
@@ -213,12 +203,6 @@ def _values(errors: Sequence[Errors], get: Callable[[Errors], float]) -> Array:
     return np.array([get(item) for item in errors])
 
 
-def _integral(errors: Sequence[Errors], get: Callable[[Errors], float]) -> float:
-    times = _values(errors, lambda item: item.t)
-    values = _values(errors, get)  # by hand: NumPy 1.26 has no `trapezoid`
-    return float((np.diff(times) * (values[1:] + values[:-1]) / 2.0).sum())
-
-
 def _asked(
     data: Data, c: Constants, sigma: float
 ) -> tuple[Callable[[Errors, float], float], Callable[[Errors], float]]:
@@ -263,15 +247,9 @@ def conditions(
 
     Parameters
     ----------
-    errors
-        Of a `TwinTracker`.
-    c
-        Constants.
     data
         Which section: "exact" (cond:mu_1, cond:mu02, cond:nu), "noisy" (ass:mu_nu, ass:mu_noisy,
         (cond_d)) or "smoothed" (ass:mu_nu_smooth, cond:mu_smooth_2).
-    nu, sigma
-        Coefficients of the law.
     c1
         Constant of the stronger bound on mu for the convergence of the state.
     floor
@@ -349,23 +327,9 @@ def bounds(
     3. The integral of ||p||_V^ ||r||_X <= (||e(0)||_Q^2 + ||r(0)||_X^2)/(2 L_C), as in the proofs
        (sigma = 0; prop:welldefine prints twice that).
 
-    Time integrals are trapezoidal sums over the samples.
-
-    Parameters
-    ----------
-    errors
-        Of a `TwinTracker`.
-    nu, sigma
-        Those of the law.
-    q_true
-        ||q*||_Q, gain-scaled, for sigma > 0.
-    until
-        T*, for noisy data.
-
-    Returns
-    -------
-    CheckReport
-        One line for each bound; their hypotheses are checked by `conditions`.
+    Time integrals are trapezoidal sums over the samples. `q_true` is ||q*||_Q, gain-scaled, for
+    sigma > 0; `until` is T*, for noisy data. The report has one line for each bound; their
+    hypotheses are checked by `conditions`.
     """
     # For noisy data the bounds hold before T*; they are made of the errors at the first sample.
     kept = [item for item in errors if item.t < until or item is errors[0]]
@@ -398,7 +362,9 @@ def bounds(
     elif largest_p == 0.0:
         lines.append(Check.at_most("2. ||p||^2 (all observed)", largest_p, 0.0, ""))
     if sigma == 0 and c.L_C > 0:
-        part = _integral(kept, lambda item: item.p.V * residual(item))
+        values = _values(kept, lambda item: item.p.V * residual(item))
+        widths = np.diff(_values(kept, attrgetter("t")))  # by hand: NumPy 1.26 has no `trapezoid`
+        part = float((widths * (values[1:] + values[:-1]) / 2.0).sum())
         lines.append(
             Check.at_most(
                 f"3. integral of ||p||_V ||{label}||_X",
@@ -408,3 +374,141 @@ def bounds(
             )
         )
     return CheckReport(f"error bounds, {data} data", tuple(lines))
+
+
+# Number of sensors up to which the error norms are computed exactly, sensor by sensor.
+MOST_SENSORS = 2000
+# Number of random vectors beyond that: the relative standard error is at most sqrt(2/(4 PROBES)) =
+# 1/8.
+PROBES = 32
+# Number of sensors up to which the matrix of G_alpha is formed.
+MOST_COLUMNS = 10_000
+
+
+def stopping_time(errors: Sequence[Errors], c: Constants) -> float:
+    """Return T*: the first sample time that violates (cond_d); infinity if none does.
+
+    ||d||_V~ > c_M/(2 C_M) ||r||_VX~^2/||r||_X, with the true d and r of a `TwinTracker`.
+    """
+    for item in errors:
+        if item.margin < 2.0 * c.C_M / c.c_M:
+            return item.t
+    return np.inf
+
+
+def noise_size(
+    spaces: Spaces,
+    std: Array,
+    reconstruction: Array | sp.csr_array | None = None,
+    u_alpha: Array | None = None,
+) -> Norms:
+    """Return the root mean square of the data error d in X, VX~ and V~ from a noise level.
+
+    d = G_alpha eta + (G_alpha G - R) u*: the propagated noise, and the regularisation error of the
+    exact state. The second part is estimated by applying G_alpha G - R to u_alpha. Beyond 2000
+    sensors the first is the mean over 32 fixed random vectors, with a relative standard error of at
+    most 1/8, which decreases with the number of independent coefficients that contribute.
+
+    Parameters
+    ----------
+    std
+        Standard deviation of each sensor, shape (sensors,); errors are independent.
+    reconstruction
+        Matrix of G_alpha, shape (n, sensors); default G^+. Raw nodal noise is about 1/h^2 times
+        larger in V~ than in X, so without smoothing T* is reached immediately.
+    u_alpha
+        Reconstruction of the sample, shape (n,); None: omit the second part.
+    """
+    matrix = spaces.split.inverse if reconstruction is None else reconstruction
+    if matrix.shape[1] != len(std):
+        raise ConfigurationError(
+            f"noise_size: {len(std)} standard deviations for {matrix.shape[1]} sensors."
+        )
+    std = np.asarray(std, dtype=float)
+    if len(std) > MOST_SENSORS:
+        signs = 2.0 * np.random.default_rng(0).integers(0, 2, (len(std), PROBES)) - 1.0
+        factor = matrix @ (std[:, None] * signs) / np.sqrt(PROBES)
+    else:
+        factor = (matrix.toarray() if sp.issparse(matrix) else np.asarray(matrix)) * std
+    if u_alpha is not None:
+        lost = matrix @ (spaces.observed.G @ u_alpha) - u_alpha
+        factor = np.column_stack([factor, lost])
+    return spaces.observed_part.root_mean_square(factor)
+
+
+def reconstruction_matrix(observed: Observed, alpha: float | None = None) -> Array:
+    """Return the matrix of z -> u_alpha with all sensors present, shape (n, sensors).
+
+    `alpha` is the regularisation parameter if the rule has one; for the discrepancy principle that
+    of the sample (`observed.reconstruct(z).alpha`), at which the map is linearised.
+    """
+    rule = observed.observation.reconstruction
+    if not rule.regularises:
+        inverse = observed.split().inverse
+        if inverse.shape[1] > MOST_COLUMNS:
+            raise ConfigurationError(
+                f"reconstruction_matrix: {inverse.shape[1]} sensors, up to {MOST_COLUMNS} are "
+                "possible; G^+ as a sparse matrix is observed.split().inverse."
+            )
+        matrix: Array = inverse.toarray()
+        return matrix
+    if alpha is not None and isinstance(rule, Tikhonov):
+        rule = replace(rule, alpha=float(alpha))
+    apply = rule.prepare(observed, np.ones(observed.size, dtype=bool))
+    nothing = np.zeros(observed.X.dim)
+    return np.column_stack([apply(unit, nothing).u for unit in np.eye(observed.size)])
+
+
+@dataclass(frozen=True)
+class StoppingState:
+    """State of `OnlineStopping` after the sample at t.
+
+    T is the time of the first sample that violated the surrogate condition, infinity if none yet;
+    `margin` the ratio of right to left side of (cond_d) at the last sample: below 1 it is violated.
+    """
+
+    t: float = -np.inf
+    T: float = np.inf
+    margin: float = np.inf
+
+
+@dataclass(frozen=True)
+class OnlineStopping:
+    """Online surrogate of T* without truth.
+
+    (cond_d) contains the unknown d and r. Here ||d||_V~ is replaced by its root mean square for the
+    noise level (`noise_size`), and the true residual by the observed one minus the noise: r_alpha =
+    r - d, so for noise that the estimate does not follow yet ||r||^2 = ||r_alpha||^2 - ||d||^2 in
+    the mean, in X as in VX~. Of the constants only C_M/c_M is used.
+
+    Examples
+    --------
+    >>> stop = OnlineStopping(Constants(1.0, 1.0))
+    >>> state = stop.add(stop.init(), 0.0, Norms(1.0, 3.0, 9.0), Norms(0.01, 0.1, 1.0))
+    >>> stop.add(state, 1.0, Norms(0.1, 0.3, 0.9), Norms(0.01, 0.1, 1.0)).T
+    1.0
+    """
+
+    constants: Constants
+
+    def init(self) -> StoppingState:
+        """Return the state before the first sample."""
+        return StoppingState()
+
+    def margin(self, r_alpha: Norms, d: Norms) -> float:
+        """Return c_M/(2 C_M) ||r||_VX~^2/(||r||_X ||d||_V~), with estimated r."""
+        VX = max(r_alpha.VX**2 - d.VX**2, 0.0)
+        X = np.sqrt(max(r_alpha.X**2 - d.X**2, 0.0))
+        if d.V == 0.0:
+            return np.inf
+        # ||r||_X = 0 means that r does not exceed the noise.
+        if X == 0.0:
+            return 0.0
+        c = self.constants
+        return float(c.c_M / (2.0 * c.C_M) * VX / (X * d.V))
+
+    def add(self, state: StoppingState, t: float, r_alpha: Norms, d: Norms) -> StoppingState:
+        """Take one sample's residual and noise size; return the new state."""
+        margin = self.margin(r_alpha, d)
+        T = t if margin < 1.0 and not np.isfinite(state.T) else state.T
+        return replace(state, t=t, T=T, margin=margin)

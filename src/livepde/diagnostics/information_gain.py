@@ -38,8 +38,7 @@ class InformationGain:
         Remaining share of the prior standard deviation; for a field the root mean square over its
         modes.
     modes
-        For a field the numbers of pinned and of flat combinations of its modes, and the number of
-        modes; empty for a number.
+        For a field the numbers of pinned and of flat combinations of its modes, and of modes.
     bound
         The bound at which a number lies, NaN for none.
     moves
@@ -116,12 +115,7 @@ class Identifiability:
 
 
 def identifiability(model: Model, belief: Belief) -> Identifiability:
-    """Compare a belief with its prior.
-
-    Parameters
-    ----------
-    belief
-        Belief in latent coefficients: `Identifier.latent_belief()`.
+    """Compare a belief in latent coefficients, `Identifier.latent_belief()`, with its prior.
 
     Raises
     ------

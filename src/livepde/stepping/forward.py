@@ -1,11 +1,14 @@
-"""Implicit stage of the forward model with a known parameter, and its tangents."""
+"""The forward model with a known parameter: implicit stage, tangents, and time integration."""
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -25,8 +28,9 @@ from livepde.linalg import (
     compact,
 )
 from livepde.model import Model
-from livepde.stepping.corrections import At, Corrections, Kept, solved
-from livepde.stepping.newton import TINY, Newton, StepFailed
+from livepde.stepping.interval import Interval
+from livepde.stepping.newton import TINY, At, Corrections, Kept, Newton, StepFailed, solved
+from livepde.stepping.schemes import Advance, advance
 
 # Relative error of a state that is solved with a reused factor.
 STATE = 1e-8
@@ -85,14 +89,10 @@ class ForwardStage:
 
     @cached_property
     def symmetric(self) -> bool:
-        """True if the matrix of a stage is expected to be symmetric for all q and h.
-
-        M is symmetric, and the rest is tested at one random q. `_factorise` tests each matrix
-        again.
-        """
+        """True if the matrix of a stage is expected to be symmetric for all q and h."""
         if not self.keeps:
             return False
-        # One random parameter suffices, with probability one, if the matrix is linear in q;
+        # M is symmetric. One random q suffices, with probability one, if the matrix is linear in q;
         # `_factorise` tests every matrix again.
         model, rows = self.model, self._free[1]
         some = np.random.default_rng(0).standard_normal(model.Q.dim) * model.latent.deviations
@@ -110,11 +110,9 @@ class ForwardStage:
         return pattern.positions(pattern.indices, pattern.rows)
 
     def _mirrored(self, data: Array) -> bool:
-        """Return True if data of the free block are symmetric, relative to the diagonal.
-
-        The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj), which gives a
-        tolerance that does not depend on the units of the state's components.
-        """
+        """Return True if data of the free block are symmetric, relative to the diagonal."""
+        # The entries of a positive definite matrix satisfy |a_ij| <= sqrt(a_ii a_jj): a tolerance
+        # that does not depend on the units of the state's components.
         pattern = self._free[0]
         scale = np.sqrt(np.abs(pattern.matrix(data).diagonal()))
         allowed = LINEAR * scale[pattern.rows] * scale[pattern.indices]
@@ -307,8 +305,6 @@ class ForwardStage:
             State and tangents at the beginning of the stage, shape (n, 1 + r).
         directions
             Derivative of the latent coefficients of q along each tangent, shape (m, r).
-        kept
-            Warm-start data of the previous stage.
         tolerance
             Bound on the error of the tangents, relative to the norm of all of them; a hundredth of
             their change is a second bound.
@@ -424,3 +420,45 @@ class _StageEquation:
         own = stage.dual(at.residual)
         rounding = ROUNDING * max(stage.dual(sizes), stage.dual(self.source))
         return own <= max(allowed * own / max(at.size, TINY), rounding)
+
+
+def simulate(
+    model: Model,
+    q: Array,
+    u0: Any,
+    times: Sequence[float],
+    control: Advance,
+    inputs: Callable[[float], Any] | None = None,
+) -> Iterator[tuple[float, Array]]:
+    """Yield (t, u) of the forward model at the given times, the first being the initial time.
+
+    Parameters
+    ----------
+    q
+        Coefficients of the parameter, shape (m,).
+    u0
+        Initial state: a number, a function of x, or coefficients.
+    inputs
+        Function t -> mapping of input channels.
+
+    Raises
+    ------
+    StepFailed
+        A step failed even when halved as often as `control` allows.
+    """
+    values = inputs or (lambda t: {})
+    forward = ForwardStage(model)
+    none = np.zeros(0)
+    u = model.impose(model.initial_values(u0), Moment(times[0], values(times[0])))
+    yield times[0], u
+    for t0, t1 in pairwise(times):
+        interval = Interval(t0=t0, t1=t1, inputs0=values(t0), inputs1=values(t1), z0=none, z1=none)
+
+        # The interval is a default, since a closure would see that of a later round.
+        def stage(c: Array, t: float, h: float, interval: Interval = interval) -> Array:
+            return forward.solve(c, q, h, interval.at(t))
+
+        u, _, failure = advance(control, stage, u, t0, t1)
+        if failure is not None:
+            raise failure
+        yield t1, u

@@ -39,8 +39,8 @@ def lanczos(
 ) -> tuple[Array, Array]:
     """Return the largest eigenvalues of top x = lambda bottom x, ascending, and their vectors.
 
-    Both are symmetric, bottom > 0. Lanczos starts from a fixed vector, so that every run gives the
-    same numbers.
+    Both are symmetric, bottom > 0. From a fixed start vector, so that every run has the same
+    numbers.
     """
     operators = [
         LinearOperator((size, size), matvec=f, dtype=float) for f in (top, bottom, bottom_inverse)
@@ -55,11 +55,8 @@ def lanczos(
 def largest_eigenvalue(top: Map, bottom: Map, bottom_inverse: Map | None, size: int) -> float:
     """Return the largest eigenvalue of top x = lambda bottom x, both symmetric, bottom > 0.
 
-    Parameters
-    ----------
-    top, bottom, bottom_inverse
-        Functions of vectors and of matrices; the inverse is needed for Lanczos only, which large
-        problems are solved by.
+    By functions of vectors and of matrices; the inverse is needed for Lanczos only, in large
+    problems.
     """
     if size == 0:
         return 0.0
@@ -81,14 +78,9 @@ def _root(x: Array, y: Array) -> float:
 class Border:
     """Interface of omega in the norms of one part of the state.
 
-    Attributes
-    ----------
-    space
-        X on the part.
-    tests
-        X on the functions with support in the part: the test functions of the law's own ||r||_V~.
-    smoothness
-        Gram matrix of H^1 on the part, shape (n, n).
+    `space` is X on the part, `tests` X on the functions with support in the part, the test
+    functions of the law's own ||r||_V~, and `smoothness` the Gram matrix of H^1 on the part, (n,
+    n).
     """
 
     space: HilbertSpace
@@ -133,10 +125,9 @@ class Part:
     ----------
     space
         X on this part, with the Gram matrix integrated over the part.
-    basis
-        Basis of the part, on the free coefficients, shape (n, k).
-    rest
-        Basis of the other part, shape (n, l); without columns if the two are orthogonal in X.
+    basis, rest
+        Bases of this part, on the free coefficients, (n, k), and of the other one, (n, l); `rest`
+        has no columns if the two are orthogonal in X.
     operator
         Matrix of M, or N, from coefficients to dual vectors, shape (n, n).
     VX, V
@@ -293,10 +284,7 @@ class Part:
     def lipschitz(self, images: Images) -> float:
         """Largest ||J v||_X / ||v||_V for the Jacobian J of C(q, .).
 
-        Parameters
-        ----------
-        images
-            Pairs of X and J on the regions of J v; the squared norms are summed.
+        `images` are pairs of X and J on the regions of J v; the squared norms are summed.
         """
 
         def image(x: Array) -> Array:
@@ -331,11 +319,8 @@ class Part:
         if self._V is not None:
             image_inverse = _columns(lambda x: own.riesz(self.schur(own.riesz(x))))
             bound *= np.sqrt(self._largest(self.gram_V, self.image, image_inverse))
-        return float(bound / self.coercivity_reversed())
-
-    def coercivity_reversed(self) -> float:
-        """Least quotient ||v||_VX^2 / (M v, v)_X."""
-        return 1.0 / self._sparse(self.operator, self.gram_VX)
+        # The last factor is the reciprocal of the least quotient ||v||_VX^2 / (M v, v)_X.
+        return float(bound / (1.0 / self._sparse(self.operator, self.gram_VX)))
 
     def _largest(self, top: Map, bottom: Map, bottom_inverse: Map | None) -> float:
         return largest_eigenvalue(top, bottom, bottom_inverse, self.size)

@@ -1,0 +1,1 @@
+"""The paper's theory as computable quantities: only the command line and tests use it."""
