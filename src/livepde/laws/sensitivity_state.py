@@ -333,7 +333,7 @@ def _windows_from(
         "initial": state.initial & ~begun,
         "assimilated": np.where(begun, zero, state.assimilated),
         "due": np.where(begun, zero + 1, state.due),
-        "fit": where(begun, FitState.none(state.start), state.fit),
+        "fit": where(begun, FitState.none(now), state.fit),
         "fork": Fork.none(now),
     }
 

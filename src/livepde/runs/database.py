@@ -53,7 +53,7 @@ SCHEMA = (
     "UNIQUE (t, kind, channel, message))",
     "CREATE TABLE counts (kind TEXT, channel TEXT, number INTEGER NOT NULL, crc INTEGER NOT NULL, "
     "PRIMARY KEY (kind, channel)) WITHOUT ROWID",
-    "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, said TEXT NOT NULL, crc INTEGER NOT NULL)",
+    "CREATE TABLE verdicts (id INTEGER PRIMARY KEY, content TEXT NOT NULL, crc INTEGER NOT NULL)",
     "CREATE TABLE tries (id INTEGER PRIMARY KEY, number INTEGER NOT NULL)",
 )
 

@@ -384,7 +384,7 @@ class Journal:
 
     def judge(self, verdict: Mapping[str, Any]) -> None:
         """Store the verdict on the run so far, as `Verdict.to_dict` returns it."""
-        conflict = "ON CONFLICT (id) DO UPDATE SET said = excluded.said, crc = excluded.crc"
+        conflict = "ON CONFLICT (id) DO UPDATE SET content = excluded.content, crc = excluded.crc"
         self._insert("verdicts", 1, json.dumps(verdict), conflict=conflict)
 
     @property
@@ -630,7 +630,7 @@ class Journal:
         if len(values) != sum(sizes) or lengths - {self._vertices}:
             raise ValueError(f"the estimate at t = {t} has not the size of the others")
         found, innovation, error, _ = np.split(values, np.cumsum(sizes))
-        said = {str(name): float(number) for name, number in json.loads(notes).items()}
+        content = {str(name): float(number) for name, number in json.loads(notes).items()}
         code = STATUS_CODES.index(STATUS_CODES[status])
         return Record(
             t=float(t),
@@ -639,7 +639,7 @@ class Journal:
             withheld_error=error,
             status=code,
             steps=int(steps),
-            notes=said,
+            notes=content,
             snapshot=snapshot,
         )
 
