@@ -579,8 +579,8 @@ def test_a_step_that_fails_is_told_of_that_member_alone(alike):
 
 
 @pytest.mark.long
-def test_a_sample_that_none_can_take_ends_all(alike):
-    """A gap in the times that is longer than a step may be divided."""
+def test_a_pause_of_decades_ends_none(alike):
+    """It is longer than a step may be divided; fleets and single runs end alike."""
     for name in ("rod", "other", "third"):
         path = Path(f"rod/{name}.csv")
         rows = path.read_text().splitlines()
@@ -589,5 +589,5 @@ def test_a_sample_that_none_can_take_ends_all(alike):
     call(*FIRST, "rods")
     call(*FIRST, "apart", "--separately")
     left, right = (pd.read_csv(f"{folder}/fleet.csv") for folder in ("rods", "apart"))
-    assert left["status"].tolist() == ["failed"] * 3
+    assert left["status"].tolist() == ["finished"] * 3
     pd.testing.assert_frame_equal(left, right, rtol=1e-7)

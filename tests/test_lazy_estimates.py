@@ -142,7 +142,8 @@ def test_a_result_keeps_little_more_than_its_numbers():
     result = identifier.run(samples(count, ["T_0"]))
     records, axes = result.records, {"time", "snapshot"}
     data = result.to_xarray()
-    kept = [data[name] for name in data if axes & set(data[name].dims)]
+    # `estimates` repeats numbers of other variables.
+    kept = [data[name] for name in data if axes & set(data[name].dims) and name != "estimates"]
     needed = 8 * count + sum(values.nbytes for values in kept)
     assert data.sizes["snapshot"] == data.sizes["time"] == count
     assert needed <= records.nbytes + 4 * 8 * count  # the matrix of correlations is told once

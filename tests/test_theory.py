@@ -636,7 +636,7 @@ def test_report_theory_of_a_run_directory(tmp_path):
     assert "Constants of the discretised model" in titles
     assert (copy / "theory.md").read_text().startswith("# Theory: ")
     without = runner.invoke(app, ["report", str(copy), "--theory"])
-    assert "add --data FILE" in str(without.exception)
+    assert "Add --data FILE" in str(without.exception)
 
 
 # --- experiments ----------------------------------------------------------------------------------
