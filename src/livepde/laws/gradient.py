@@ -33,10 +33,10 @@ from livepde.laws.information import (
 )
 from livepde.laws.law import Belief, Deferred, Law, Problem, Report, Status
 from livepde.laws.observed_part import (
-    Inverse,
     ObservedPart,
     ObservedPath,
     SelfChosenSmoothing,
+    StatedReconstruction,
     smooths,
 )
 from livepde.laws.step_diagnostics import Diagnostics
@@ -214,7 +214,7 @@ def constant_parts(
         M_op=M_op,
         N_op=N_op,
         nu=nu,
-        observed=Inverse(problem),
+        observed=StatedReconstruction(problem),
         metric=ConstantMetric(gain, sigma),
         gate=gate,
         probes=None if gate is None else Probes(problem.model, problem.observed.split()),
@@ -247,7 +247,7 @@ def tuned_parts(problem: Problem, nu: float, N_op: Any, newton: Newton) -> Gradi
         M_op=None,
         N_op=N_op,
         nu=nu,
-        observed=SelfChosenSmoothing(problem) if own else Inverse(problem),
+        observed=SelfChosenSmoothing(problem) if own else StatedReconstruction(problem),
         metric=metric,
         memory=metric.pattern,
     ).prepared()

@@ -268,7 +268,7 @@ def exact(split: Split, z: Array, boundary: Array | None, alpha: float = np.nan)
 
 
 @dataclass(frozen=True, eq=False)
-class Inverse:
+class StatedReconstruction:
     """u_alpha = G^+ z, or G_alpha z if the `reconstruction` of the observation regularises."""
 
     problem: Problem
@@ -337,4 +337,4 @@ def _smoothed(smoother: SmoothingOperator, alpha: float, split: Split, n: int) -
     return find
 
 
-ObservedPart: TypeAlias = Inverse | SelfChosenSmoothing
+ObservedPart: TypeAlias = StatedReconstruction | SelfChosenSmoothing
