@@ -630,7 +630,7 @@ class Journal:
         if len(values) != sum(sizes) or lengths - {self._vertices}:
             raise ValueError(f"the estimate at t = {t} has not the size of the others")
         found, innovation, error, _ = np.split(values, np.cumsum(sizes))
-        content = {str(name): float(number) for name, number in json.loads(notes).items()}
+        found_notes = {str(name): float(number) for name, number in json.loads(notes).items()}
         code = STATUS_CODES.index(STATUS_CODES[status])
         return Record(
             t=float(t),
@@ -639,7 +639,7 @@ class Journal:
             withheld_error=error,
             status=code,
             steps=int(steps),
-            notes=content,
+            notes=found_notes,
             snapshot=snapshot,
         )
 
