@@ -28,7 +28,10 @@ WORSE = 1.2  # error over that of the fit at most
 
 
 class Timed(NamedTuple):
-    """Processor seconds of a whole process, and without those of a run with few rows."""
+    """Processor seconds of a whole process, and of what it computes.
+
+    Of livepde without those of a run with few rows, of the fit as it counts them itself.
+    """
 
     whole: float
     part: float
@@ -69,8 +72,8 @@ def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
         ]
     head = ("job", "livepde, s", "fit, s", "ratio", "whole", "error", "of the fit", "apart")
     notes = [
-        f"Processor times with one thread, medians of {rounds} rounds. 'ratio' leaves out what a "
-        f"run of {FEW} rows costs. 'whole' is that of whole processes, with verdict, intervals, "
+        f"Processor times with one thread, medians of {rounds} rounds. 'ratio' leaves out imports, "
+        f"of livepde what a run of {FEW} rows costs. 'whole' is that of whole processes, with verdict, intervals, "
         "journal, report and figure, which the fit has not; the fit of the field has no standard "
         "deviations. 'apart' is the largest difference of the estimates, in standard deviations."
     ]
@@ -83,17 +86,22 @@ def _measured(job: Job, folder: Path, rounds: int) -> tuple[list[tuple[Timed, Ti
     job.write(folder / "few", FEW)
     times = []
     for number in range(rounds):
-        each = []
-        for part in ("all", "few"):
-            case, out = folder / part / "case.toml", folder / f"{part}{number}"
-            each.append(_run(["livepde", "run", str(case), "--out", str(out)])[0])
-            seconds, printed = _run(["benchmarks.user_jobs.fits", job.name, str(folder / part)])
-            each.append(seconds)
-            if part == "all":
-                estimates = json.loads(printed)
-        own, fit, own_few, fit_few = each
-        times.append((Timed(own, own - own_few), Timed(fit, fit - fit_few)))
-    return times, _compared(job, folder / "all0", estimates)
+        own, few = (
+            _run(
+                [
+                    "livepde",
+                    "run",
+                    f"{folder}/{part}/case.toml",
+                    "--out",
+                    f"{folder}/{part}{number}",
+                ]
+            )
+            for part in ("all", "few")
+        )
+        whole, printed = _run(["benchmarks.user_jobs.fits", job.name, f"{folder}/all"])
+        fit = json.loads(printed)
+        times.append((Timed(own[0], own[0] - few[0]), Timed(whole, fit["seconds"])))
+    return times, _compared(job, folder / "all0", fit["estimates"])
 
 
 def _run(command: Sequence[str]) -> tuple[float, str]:
