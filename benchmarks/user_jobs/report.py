@@ -73,7 +73,8 @@ def user_jobs(names: Sequence[str] = (), rounds: int = 3) -> Outcome:
     head = ("job", "livepde, s", "fit, s", "ratio", "whole", "error", "of the fit", "apart")
     notes = [
         f"Processor times with one thread, medians of {rounds} rounds. 'ratio' leaves out imports, "
-        f"of livepde what a run of {FEW} rows costs. 'whole' is that of whole processes, with verdict, intervals, "
+        f"of livepde what a run of {FEW} rows costs. 'whole' is that of whole processes, with "
+        "verdict, intervals, "
         "journal, report and figure, which the fit has not; the fit of the field has no standard "
         "deviations. 'apart' is the largest difference of the estimates, in standard deviations."
     ]
