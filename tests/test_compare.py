@@ -290,6 +290,9 @@ def test_exchanged_columns_are_exchanged_by_settings(tmp_path):
     assert found.setting == 'channels.first.column="T_30"; channels.T_30.column="T_10"'
     assert with_settings(prepared, once) == once
     right = cases.load(path, settings=parse(found.setting.split("; "))).prepare().raw
+    part = replace(cause, setting='channels.T_1.column="T_30"; channels.T_30.column="T_1"')
+    several = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(part,))])
+    assert not with_settings(prepared, several).findings[0].causes[0].setting  # no such channel
     first = right.names.index("first")
     column = prepared.raw.names.index("T_30")
     np.testing.assert_array_equal(right.values[:, first], prepared.raw.values[:, column])

@@ -172,6 +172,7 @@ def test_an_early_input_is_compared_with_the_readings_that_it_uses(tmp_path):
     assert early.readings["T_30"] == base.readings["T_30"] - 3
     assert early.gained(base) > GAINED
     assert early.same_readings == pytest.approx(base.log_evidence, rel=0.3)
+    assert early.same_readings > base.log_evidence  # without three readings that misfit
     assert recommended(base, [early]) is early
 
 

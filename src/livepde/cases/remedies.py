@@ -115,8 +115,9 @@ def _stated(case: Case, cause: Cause) -> tuple[str, ...]:
 def _exchanged(case: Case, cause: Cause) -> tuple[str, ...]:
     """Return the settings by which each of two channels reads the column of the other."""
     names = list(tomllib.loads("\n".join(settings_in(cause.setting))).get("channels", {}))
-    columns = [case.spec.channels[name].column for name in reversed(names)]
-    if None in columns:  # a mean of columns, or the parts of one channel
+    channels = [case.spec.channels.get(name) for name in reversed(names)]
+    columns = [None if channel is None else channel.column for channel in channels]
+    if None in columns:  # a sensor of a channel that has several, or a mean of columns
         return ()
     pairs = zip(names, columns, strict=True)
     return tuple(channel_setting(name, "column", toml_value(column)) for name, column in pairs)
