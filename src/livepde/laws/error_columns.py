@@ -26,7 +26,7 @@ from livepde.stepping import ForwardStage
 from livepde.verdict.directions import boundary_lifts, flux_loads, force, scaled_channel
 
 MOST_WORK = 1e8  # coefficients of answers that a pass may compute
-MOST_STEPS = 500  # in which answers go on: errors of unknown size are smooth enough
+MOST_STEPS = 500  # Euler steps of an answer: finer ones hardly move the intervals
 MOST_UNKNOWNS = 4  # that may jump or drift
 STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or changes
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
@@ -111,7 +111,10 @@ class ErrorColumns:
 
     @property
     def _resists(self) -> bool:
-        """Whether a contact may resist: it stops what is conducted, not what a flow carries."""
+        """Whether a contact may resist: it stops what is conducted, not what a flow carries.
+
+        A flow is looked for in linear equations only.
+        """
         stage = ForwardStage(self.model)
         return stage.symmetric or not stage.keeps
 
