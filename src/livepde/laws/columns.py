@@ -23,7 +23,7 @@ import numpy as np
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
-from livepde.laws.refit import WILD, near_most, near_neighbours, refitted
+from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
@@ -35,7 +35,10 @@ FEWEST_ROWS = 40
 MOST_WORK = 4e8  # coefficients of states that all passes may compute
 PASSES = 6  # over the samples that a fit may take
 ROUNDS = 4  # fits of an error whose size changes from one to the next
-TRIED = {"unit": 1, "exchange": 2, "offset": 1, "gain": 1, "lag": 1}  # errors that are fitted
+# Errors of each kind that are fitted, at most; and what the linear model must promise of a further
+# one, over the first: an early boundary looks like a late sensor next to it.
+TRIED = {"unit": 1, "exchange": 2, "offset": 1, "gain": 2, "lag": 2}
+RIVAL = 0.8
 STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
 LONGEST = 0.2  # of the samples, by which a column may be late
 PLAIN = 0.02  # range of a column over its size below which it is constant
@@ -238,7 +241,7 @@ class _Fit:
 def likely_columns(columns: Columns) -> Explained:
     """Return the errors of columns that explain most of the misfit, the likeliest first."""
     samples, search = columns.samples(), _Trials(columns)
-    found = refitted(samples, search.options, last=False)
+    found = search.refitted(samples)
     if found is None:
         return Explained([], 0.0)
     base, prior = _Fit.about(found.best), samples.about(0.0 * found.best.xi)
@@ -271,6 +274,11 @@ class _Trials:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
         self.base_readings = columns.samples().readings
+
+    def refitted(self, samples: StoredSamples) -> Found | None:
+        """Return the end of a search, which begins anew only if the run has not done so in vain."""
+        vain = len(samples.spans) if self.columns.state.fit.screened[0] else 0
+        return refitted(samples, self.options, last=False, screened=vain)
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
         """Iterate over errors, and by how much they lower a cost by the model about a fit."""
@@ -362,7 +370,7 @@ class _Trials:
     def fitted(self, error: Error) -> tuple[float, Error] | None:
         """Return the cost of a fit with a corrected column, and the error, its size improved."""
         for _ in range(ROUNDS):
-            found = refitted(self.columns.samples(error), self.options, last=False)
+            found = self.refitted(self.columns.samples(error))
             if found is None:
                 return None
             fit = _Fit.about(found.best)
@@ -391,10 +399,12 @@ class _Trials:
 def _varied(tried: Sequence[tuple[float, Error]]) -> list[Error]:
     """Return the most promising errors of each kind, those without free numbers first."""
     kept: list[Error] = []
+    first: dict[str, float] = {}
     for gained, error in tried:
         same = [other for other in kept if other.kind == error.kind]
         new = all((one.names, one.unit) != (error.names, error.unit) for one in same)
-        if gained > 0.0 and new and len(same) < TRIED[error.kind]:
+        promises = gained > 0.0 and gained >= RIVAL * first.setdefault(error.kind, gained)
+        if promises and new and len(same) < TRIED[error.kind]:
             kept.append(error)
     return sorted(kept, key=lambda error: error.numbers)
 
@@ -423,7 +433,7 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
         case "gain":
             values |= {"share": f"{100.0 * abs(size):.2g} %", "side": "large" if side else "small"}
         case "lag":
-            lag = f"{abs(size):.2g} {problem.model.time_unit}".rstrip()
+            lag = amount_of(abs(size), problem.model.time_unit)
             values |= {"amount": lag, "side": "late" if side else "early"}
         case "unit" if unit_of.name:
             values |= {"unit": unit_of.name, "expected": unit_of.expected}

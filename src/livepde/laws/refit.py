@@ -58,6 +58,9 @@ UNSURE = 0.5  # only where a direction keeps more than this share of its prior s
 ROUNDING = 1e-12  # share of a variance
 QUANTILE, BLOCKS = 0.8, 8  # of mean squares, over sensors and blocks of samples
 SCREENED, FITTED, SPREAD = 32, 3, 1.5  # points, best of them that are tried, and their deviation
+# Searches from elsewhere that must end at the best trajectory, and what they leave of their misfit
+# at most: where no reading sees an unknown all of them end at the prior, and prove nothing.
+AGREED, LEFT = 3, 0.5
 # Samples over those of a search that began again in vain, from which another one does: the model is
 # most likely in error. The second at the end of a run.
 ANEW, ANEW_LAST = 4, 2
@@ -124,11 +127,11 @@ class Found:
 
     best: Passed  # the samples about the trajectory where it ended
     used: Mask  # readings in use, shape (samples, sensors)
-    # True if no step lowers the cost any more, and samples that are not explained pin all unknowns:
-    # then the model is in error, not the search.
+    # True if no step lowers the cost any more, and samples that are not explained pin all unknowns,
+    # or searches from elsewhere end here as well: then the model is in error, not the search.
     converged: bool
     passes: float  # passes over the samples that it took
-    screened: bool  # True if it began again at screened points, and none explains the samples
+    screened: bool  # True if it began again at screened points, and will not find another end
 
 
 def refitted(
@@ -140,12 +143,13 @@ def refitted(
     deviation, as the same samples are fitted again later. `screened`: how many samples the last
     search had that began again at screened points in vain.
     """
-    search = _Search(samples, options, last)
+    search = _Search(samples, options, last, lacking=1 if screened else AGREED)
     search.descend(samples.reached)
-    again = len(samples.spans) >= (ANEW_LAST if last else ANEW) * screened
-    screens = search.lost or (search.suspicious and again)
+    screens = search.suspicious and len(samples.spans) >= (ANEW_LAST if last else ANEW) * screened
     if screens:
         search.screen()
+    elif screened:
+        search.lacking = 0  # fewer samples have shown that there is no other end
     if last and search.lost:
         search.draw()
     if search.best is None:
@@ -160,7 +164,7 @@ def refitted(
         used=search.used,
         converged=search.settled and not search.lost,
         passes=search.passes,
-        screened=screens and search.suspicious,
+        screened=screens and search.unexplained and not search.lost,
     )
 
 
@@ -178,6 +182,7 @@ class _Search:
     samples: StoredSamples
     options: Refit
     last: bool
+    lacking: int = AGREED  # searches from elsewhere that have yet to end at the best trajectory
     used: Mask = field(init=False)
     best: Passed | None = None
     settled: bool = False
@@ -234,7 +239,19 @@ class _Search:
         self.passes += 1.0
         return self.samples.about(xi)
 
-    def _descend(self, start: Passed) -> None:
+    def _elsewhere(self, xi: Array) -> None:
+        """Search from another point, and note whether that ends at the best trajectory."""
+        start, best = self._about(self.samples.within_bounds(xi)), self.best
+        if start is None:
+            return
+        end = self._descend(start)
+        if best is not None and self._near(best, end.xi):
+            if self._misfit(end) < LEFT * self._misfit(start):
+                self.lacking -= 1
+        elif self.best is end:
+            self.lacking = AGREED
+
+    def _descend(self, start: Passed) -> Passed:
         """Take Levenberg-Marquardt steps from a pass, and keep the end if it is the best."""
         end, settled = start, False
         budget, delta = self.passes + self.options.passes, DELTA
@@ -248,6 +265,7 @@ class _Search:
             end = better
         if self.best is None or end.cost(self.used) < self.best.cost(self.used):
             self.best, self.settled = end, settled
+        return end
 
     def _decrease(self, one: Passed) -> float:
         """Return by how much the quadratic model of the cost falls to its minimum."""
@@ -336,10 +354,13 @@ class _Search:
 
     @property
     def lost(self) -> bool:
-        """True if samples that are not explained leave an unknown as uncertain as its prior."""
+        """True if samples that are not explained leave an unknown as uncertain as its prior.
+
+        Unless searches from elsewhere end at the same trajectory.
+        """
         if self.best is None:
             return True
-        if self._square <= DOUBTFUL:
+        if not self.unexplained or self.lacking <= 0:
             return False
         H, _ = self.best.model(self.used)
         # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
@@ -348,6 +369,11 @@ class _Search:
         floor = ROUNDING * np.trace(before) * np.eye(len(before))
         shares = scipy.linalg.eigh(after, before + floor, eigvals_only=True)
         return math.sqrt(max(shares[-1], 0.0)) > UNSURE
+
+    @property
+    def unexplained(self) -> bool:
+        """True if the best trajectory leaves more than the noise."""
+        return self._square > DOUBTFUL
 
     @property
     def _square(self) -> float:
@@ -364,10 +390,9 @@ class _Search:
         # At the end of a run a misfit that pins all unknowns is most likely an error of the model.
         fitted = 1 if self.last and not self.lost else FITTED
         for place in order[:fitted].tolist():
-            if not np.isfinite(costs[place]) or self._known(points[place]):
-                continue
-            self.descend(points[place])
-            if not self.suspicious:
+            if np.isfinite(costs[place]) and not self._known(points[place]):
+                self._elsewhere(points[place])
+            if not self.suspicious or self.lacking <= 0:
                 return
 
     def _spread(self, points: Array) -> Array:
@@ -378,19 +403,24 @@ class _Search:
         return np.array([self.samples.within_bounds(one) for one in whole])
 
     def _known(self, xi: Array) -> bool:
-        """True if a point is at the best trajectory, within a posterior standard deviation."""
-        if self.best is None:
-            return False
-        H, _ = self.best.model(self.used)
-        away = xi - self.best.xi
+        """True if a point is at the best trajectory."""
+        return self.best is not None and self._near(self.best, xi)
+
+    def _near(self, one: Passed, xi: Array) -> bool:
+        """True if a point is within a posterior standard deviation of a trajectory."""
+        H, _ = one.model(self.used)
+        away = xi - one.xi
         return float(away @ H @ away) < 1.0
+
+    def _misfit(self, one: Passed) -> float:
+        return float((one.residuals[self.used] ** 2).sum())
 
     def draw(self) -> None:
         """Search from drawn points, before it is given up."""
         drawn = np.random.default_rng(0).standard_normal((LAST, int(self.samples.alive.sum())))
         for xi in self._spread(LAST_SPREAD * drawn):
-            self.descend(xi)
-            if not self.suspicious:
+            self._elsewhere(xi)
+            if not self.suspicious or self.lacking <= 0:
                 return
 
 

@@ -331,7 +331,7 @@ def _words(direction: ScoreDirection, size: float, at: Position) -> Sentence:
             share = f"{100.0 * abs(amount):.2g} %"
             values |= {"share": share, "side": "large" if more else "small"}
         case "lag":
-            time = f"{abs(amount):.2g} {at.time_unit}".rstrip()
+            time = amount_of(abs(amount), at.time_unit)
             values |= {"amount": time, "side": "late" if more else "early"}
         case "position":
             values |= {"amount": amount_of(abs(amount), direction.unit)}

@@ -368,14 +368,19 @@ def percent(share: float, digits: int = 0) -> str:
 def amount_of(size: float, unit: str) -> str:
     """Return a positive size with its unit, as a difference: of temperatures in K.
 
-    >>> amount_of(0.01, "m"), amount_of(0.0005, "m"), amount_of(0.5, "degC"), amount_of(2.0, "")
-    ('1 cm', '0.5 mm', '0.5 K', '2')
+    >>> (
+    ...     amount_of(0.01, "m"),
+    ...     amount_of(0.0005, "m"),
+    ...     amount_of(0.5, "degC"),
+    ...     amount_of(3618.96, "s"),
+    ... )
+    ('1 cm', '0.5 mm', '0.5 K', '3600 s')
     """
     unit = unit.replace("degC", "K")
     if unit in CENTI and 0.0 < size < 1.0:
         centi, milli = CENTI[unit]
         size, unit = (100.0 * size, centi) if size >= 0.00995 else (1000.0 * size, milli)
-    return f"{size:.2g} {unit}".rstrip()
+    return f"{float(f'{size:.2g}'):g} {unit}".rstrip()
 
 
 def significance(log_e: float) -> str:
