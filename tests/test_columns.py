@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 import livepde as lp
+from benchmarks.user_jobs.data import JOBS
+from livepde.cases.case import load
 from livepde.verdict import Cause, Finding, Verdict
 
 LENGTH, CELLS, FINE = 0.1, 120, 10
@@ -231,3 +235,22 @@ def test_causes_are_merged_by_what_they_explain():
     assert found.severity == "caution"
     (found,) = plain.with_causes([Cause("unit", "b", "b is in degF", 0.9)]).findings
     assert found.severity == "do not trust"
+
+
+@pytest.mark.slow
+def test_an_early_boundary_is_no_late_sensor_and_the_search_ends(tmp_path: Path):
+    """Six layers and four offsets; the upper boundary is an hour early, the data by volumes."""
+    (job,) = (job for job in JOBS if job.name == "soil")
+    job.write(tmp_path, rows=100)
+    table = pd.read_csv(tmp_path / "data.csv")
+    table["T05"] = table["T05"].shift(-1).ffill()
+    table.to_csv(tmp_path / "data.csv", index=False)
+    prepared = load(tmp_path / "case.toml").prepare()
+    last = prepared.identifier.run(prepared.stream).last
+    (misfit,) = (finding for finding in last.verdict.findings if finding.what == "misfit")
+    assert (misfit.causes[0].kind, misfit.causes[0].subject) == ("lag", "T05")
+    assert misfit.causes[0].size == pytest.approx(-3600.0, rel=0.05)
+    # Searches from elsewhere end at the same trajectory: that is the fit, and the model is wrong.
+    assert last.verdict.level == "do not trust"
+    assert last.fit is not None and last.fit.converged
+    assert last.fit.passes < 50  # 205 where each of eleven searches is followed to its end
