@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import xarray as xr
 from typer.testing import CliRunner
@@ -88,7 +89,7 @@ def found_in(path: Path) -> list[lp.verdict.Finding]:
     table = load(path).read().raw
     assert table is not None
     times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
-    return sampling_findings(times, table)
+    return sampling_findings(times, (table.t, table.values))
 
 
 # --- what the sampling shows ---------------------------------------------------------------------
@@ -115,6 +116,17 @@ def test_a_clock_that_leaps_is_named(tmp_path: Path, kind: str, length: str, see
     assert f"time jumps by {length}" in finding.text
     assert "(sample 301)" in finding.text
     assert finding.causes[0].kind == "clock"
+
+
+@pytest.mark.slow
+def test_a_live_run_names_a_clock_that_leaps(tmp_path: Path, monkeypatch: Any) -> None:
+    path = case(tmp_path, "small leap")
+    rows = pd.read_csv(tmp_path / "rod.csv").to_json(orient="records", lines=True)
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["run", str(path), "--data", "-"], input=rows)
+    assert done.exit_code == 0, done.output
+    (report,) = tmp_path.glob("runs/*/report.md")
+    assert "(sample 301): time jumps by 70 s" in report.read_text()
 
 
 def test_a_unit_of_time_that_changes_is_named(tmp_path: Path) -> None:

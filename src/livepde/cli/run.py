@@ -306,8 +306,10 @@ def concluded(
     driving = loaded.roles("boundary", "input")
 
     def judged() -> Verdict:
+        raw, journal = prepared.raw, driven.journal
+        kept = journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
         found = [
-            *sampling_findings(dataset, prepared.raw),
+            *sampling_findings(dataset, kept),
             *clock_findings(driven.journal),
             *input_findings(driven.journal, driving),
         ]

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from livepde.runs.journal import Journal
-    from livepde.streams import DataTable
 
 MODEL_ERROR = 4.0  # ratio of squared innovations to their expected square: twice as large
 MOST_JUMPS = 5  # that get a sentence of their own
@@ -126,16 +125,18 @@ def clock_findings(journal: Journal) -> list[Finding]:
     return [Finding("clock", severity, text, "", count, remedy=remedy)]
 
 
-def sampling_findings(data: xr.Dataset, table: DataTable | None = None) -> list[Finding]:
+def sampling_findings(
+    data: xr.Dataset, readings: tuple[Array, Array] | None = None
+) -> list[Finding]:
     """Return what the times of a run show: units that changed, clocks that leapt, and pauses.
 
-    `table`: the complete record of the run, whose readings tell a clock that leapt from a pause.
+    `readings`: times and values of the channels, shapes (samples,) and (samples, channels), which
+    tell a clock that leapt from a pause.
     """
     t, found = data["time"].values, list[Finding]()
     leaps = {}
-    if table is not None:
-        rows = pauses(table.t)
-        leaps = {leap.t: leap for leap in clock_leaps(table.t, table.values, rows)}
+    if readings is not None:
+        leaps = {leap.t: leap for leap in clock_leaps(*readings, pauses(readings[0]))}
     anchors = note(data, "residual") is None  # the gradient law has no covariance
     for k in pauses(t):
         usual = float(np.median(np.diff(t[:k])))
