@@ -17,7 +17,7 @@ from livepde import cases
 from livepde.cases.read import parse
 from livepde.cases.remedies import NO_SETTING, with_settings
 from livepde.cases.variants import (
-    Interval,
+    LastEstimate,
     Variant,
     VariantRun,
     conclusions,
@@ -168,7 +168,7 @@ def test_without_withheld_sensors_the_evidence_decides():
 
 
 def test_an_unknown_that_depends_on_the_variant_is_named():
-    near, far = Interval(1.0, 0.1, 0.8, 1.2), Interval(2.0, 0.1, 1.8, 2.2)
+    near, far = LastEstimate(1.0, 0.1, 0.8, 1.2), LastEstimate(2.0, 0.1, 1.8, 2.2)
     base = ended("as stated", 10.0, 1.0, estimates={"k": near, "c": near})
     other = ended("other", 5.0, 1.0, estimates={"k": far, "c": near})
     notes = " ".join(conclusions(base, [other]))
@@ -201,7 +201,7 @@ def test_a_case_without_evidence_recommends_nothing_and_names_failures():
 
 
 def test_an_interval_that_is_not_known_refutes_nothing():
-    unknown = Interval(1.0, math.nan, math.nan, math.nan)
+    unknown = LastEstimate(1.0, math.nan, math.nan, math.nan)
     assert unknown.overlaps(unknown)
     content = ended("gradient", math.nan, 1.0, estimates={"k": unknown}).to_dict()
     assert content["estimates"]["k"]["low"] is None
@@ -326,7 +326,7 @@ def test_every_proposed_variant_is_a_case(tmp_path, equation):
     own = [*ROD[equation], "channels.T_10.offset=0.2", "unknowns.source={ prior = 0, std = 1e-3 }"]
     prepared = cases.load(path, settings=parse(own)).prepare()
     sizes = {"T_10": 0.5, "T_30": 0.2}
-    near = Interval(1.0, 0.1, 0.8, 1.2)
+    near = LastEstimate(1.0, 0.1, 0.8, 1.2)
     base = ended("as stated", 0.0, 1.0, errors=sizes, misfits=sizes, estimates={"k": near})
     found = proposed(prepared, base)
     names = {variant.name for variant in found}

@@ -64,7 +64,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Interval:
+class LastEstimate:
     """Last estimate of an unknown: value, standard deviation, ends of the 95 % interval, unit.
 
     The interval allows for errors of the model where the verdict knows it.
@@ -76,7 +76,7 @@ class Interval:
     high: float
     unit: str = ""
 
-    def overlaps(self, other: Interval) -> bool:
+    def overlaps(self, other: LastEstimate) -> bool:
         """Return whether two intervals have a point in common; true if one is not known."""
         return not (self.low > other.high or other.low > self.high)
 
@@ -114,7 +114,7 @@ class VariantRun:
     misfits: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     withheld: Mapping[str, float] = field(default_factory=dict)
-    estimates: Mapping[str, Interval] = field(default_factory=dict)
+    estimates: Mapping[str, LastEstimate] = field(default_factory=dict)
     unknowns: int = 0
 
     @property
@@ -285,7 +285,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
             low, high = allowed[label].low, allowed[label].high
         value, std = float(data[label][-1]), float(data[f"{label}_std"][-1])
         unit = str(data[label].attrs.get("units", ""))
-        estimates[label] = Interval(value, std, low, high, unit)
+        estimates[label] = LastEstimate(value, std, low, high, unit)
     modes = [modes_told(data, name)[1] for name in fields if f"{name}_modes" in data]
     used = data["time"].values >= prepared.assimilate_from
     seen = np.isfinite(data["innovation"].transpose("time", "sensor").values[used]).sum(axis=0)

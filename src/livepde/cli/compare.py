@@ -20,7 +20,7 @@ from livepde.cli.printing import present
 from livepde.errors import CaseError, ConfigurationError, RunError
 
 if TYPE_CHECKING:
-    from livepde.cases.variants import Interval, Variant, VariantRun
+    from livepde.cases.variants import LastEstimate, Variant, VariantRun
     from livepde.runs import Table
 
 COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
@@ -215,7 +215,7 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
     return [*tables, Table("Settings of the variants", ("variant", "settings"), changed)]
 
 
-def _interval(known: Interval | None) -> str:
+def _interval(known: LastEstimate | None) -> str:
     """Return an estimate with its interval as text, a dash where there is none."""
     from livepde.runs.summary import digits
 

@@ -48,7 +48,7 @@ class Line(NamedTuple):
     told: str = ""
 
 
-class Place(NamedTuple):
+class FilePosition(NamedTuple):
     """A place in a file: where it is, and by what the file is known."""
 
     start: int = 0  # byte before which all was read
@@ -57,7 +57,7 @@ class Place(NamedTuple):
     header: int = 0  # byte at which the header in effect begins
 
     @classmethod
-    def read(cls, text: str) -> Place | None:
+    def read(cls, text: str) -> FilePosition | None:
         """Return the place in a text; None if there is none."""
         return cls(*map(int, text.split())) if text else None
 
@@ -131,7 +131,7 @@ class _Content:
         """Return whether what was read is still there."""
         return self.known(self.head, self.tail, self.offset)
 
-    def fits(self, place: Place) -> bool:
+    def fits(self, place: FilePosition) -> bool:
         """Return whether a place may be in this file."""
         head = self.at(0, min(place.start, HEAD))
         return self.stat.st_size >= place.start and zlib.crc32(head) == place.crc
@@ -254,7 +254,7 @@ class GrowingFile:
 
     path: Path  # it need not exist yet
     grows: bool  # whether lines may be added
-    place: Place | None = None  # where an earlier session has stopped
+    place: FilePosition | None = None  # where an earlier session has stopped
     _now: _Content | None = field(default=None, init=False)
     _next: deque[_Content] = field(default_factory=deque, init=False)  # rotated, to be read
     _older: list[tuple[_Content, float]] = field(default_factory=list, init=False)
@@ -285,12 +285,12 @@ class GrowingFile:
         """Number of the file that is read, and the offset in it; (0, 0) before any."""
         return self._left if self._now is None else (self._now.number, self._now.offset)
 
-    def place_of(self, number: int, start: int, header: int) -> Place:
+    def place_of(self, number: int, start: int, header: int) -> FilePosition:
         """Return a place in one of the files."""
         head, inode = self._known.get(number, (b"", 0))
         if self._now is not None and self._now.number == number:
             head = self._now.head
-        return Place(start, zlib.crc32(head[:start]), inode, header)
+        return FilePosition(start, zlib.crc32(head[:start]), inode, header)
 
     def before(self, start: int) -> list[bytes]:
         """Return the lines of the file that is read from a place to where it is read."""
@@ -348,7 +348,7 @@ class GrowingFile:
         )
         return [Line(content.number, 0, b"", "rewritten", text)]
 
-    def _resumed(self, place: Place) -> bool:
+    def _resumed(self, place: FilePosition) -> bool:
         """Open the file of a place, under its name or another one; return whether it is there."""
         others = (
             path for path in self._folder() if _inode(path) == place.inode or self._is_rotated(path)

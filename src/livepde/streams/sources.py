@@ -17,7 +17,7 @@ from typing import Any, Protocol, TypeVar
 
 from livepde.errors import DataError
 from livepde.streams.csvfile import UNDER, UTF_8, are_labels, is_title, too_wide
-from livepde.streams.growing_file import LONGEST, UTF_16, GrowingFile, Line, Place
+from livepde.streams.growing_file import LONGEST, UTF_16, FilePosition, GrowingFile, Line
 from livepde.streams.table import JSON_LINES, no_file
 
 T = TypeVar("T")
@@ -158,7 +158,7 @@ class Follow(RowSource):
         self._separator, self._encoding = separator, encoding
         self._skip, self._times = skip, tuple(times)
         self._json = self.path.suffix in JSON_LINES
-        self._resumed = Place.read(position)
+        self._resumed = FilePosition.read(position)
         self._file = GrowingFile(self.path, follow, self._resumed)
         self._ready: deque[Line] = deque()
         self._number = 0  # of the file whose lines are read
