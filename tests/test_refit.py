@@ -16,7 +16,7 @@ from scipy.special import erfc, erfcx
 
 import livepde as lp
 from livepde.laws import refit as refit_module
-from livepde.laws.refit import refitted
+from livepde.laws.refit import near_neighbours, refitted
 from livepde.laws.stored_samples import StoredSamples
 from livepde.models import heat
 
@@ -137,6 +137,20 @@ def test_outliers_are_left_out():
         value, std = clean.parameters[name]
         assert abs(spoiled.parameters[name][0] - value) < std
     assert len(wild) // 2 <= spoiled.fit.refused <= len(wild) + 4
+
+
+def test_wild_readings_in_a_row_are_told_from_those_beside_them():
+    """The median of the neighbours of one is wild itself, at both ends of the row."""
+    rng = np.random.default_rng(3)
+    values = rng.standard_normal((40, 1))
+    values[6:10, 0] += [-17.0, -98.0, -73.0, -22.0]
+    wild = np.zeros((40, 1), dtype=bool)
+    wild[6:10] = True
+    assert (near_neighbours(values, 4.0) == ~wild).all()
+    # A step that stays is no row of wild readings.
+    values = rng.standard_normal((40, 1))
+    values[20:] += 50.0
+    assert near_neighbours(values, 4.0)[[*range(17), *range(23, 40)]].all()
 
 
 def test_a_run_continues_to_the_bit():

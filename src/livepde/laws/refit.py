@@ -86,9 +86,24 @@ def usual_size(values: Array) -> float:
 def near_neighbours(values: Array, limit: float) -> Mask:
     """Return which values lie within `limit` usual distances from the median of their neighbours.
 
-    A model error, which changes slowly, stays.
+    A model error, which changes slowly, stays. Values that are near tell about the others: among
+    several wild ones in a row the neighbours of one are no measure.
     """
-    return _near(values, limit, _of_neighbours)
+    first = _near(values, limit, _of_neighbours)
+    near = first.copy()
+    for k, column in enumerate(values.T):
+        (kept,) = first[:, k].nonzero()
+        if len(kept) <= FEW:
+            continue
+        (others,) = (np.isfinite(column) & ~first[:, k]).nonzero()
+        away = np.full(len(column), np.nan)
+        away[kept] = column[kept] - _of_neighbours(column[kept])
+        begin = np.searchsorted(kept, others) - NEIGHBOURS
+        begin = np.clip(begin, 0, len(kept) - 2 * NEIGHBOURS)
+        around = kept[begin[:, None] + np.arange(2 * NEIGHBOURS)]
+        away[others] = column[others] - np.median(column[around], axis=1)
+        near[:, k] = np.abs(away) <= limit * usual_size(away[kept])
+    return near
 
 
 def near_most(values: Array, limit: float) -> Mask:
