@@ -113,7 +113,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
             identifier.refit()  # as at the end of a batch run
 
     def known() -> Known:
-        belief = identifier.latent_belief()
+        belief = identifier._latent_belief()
         factor = belief.q_factor
         return belief.q, factor
 

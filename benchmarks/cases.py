@@ -310,7 +310,7 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
             seconds = frozen.seconds = 0.0
     for run, result in zip(runs, results, strict=True):
         if result.last is not None:
-            result.settle(run.settled(result.last))
+            result._settle(run._settled(result.last))
     datasets = [result.to_xarray() for result in results]
     ratio = seconds / frozen.seconds if frozen.seconds else math.nan
     return datasets[0], datasets[1], ratio

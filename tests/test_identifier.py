@@ -376,7 +376,7 @@ def test_rows_of_a_pandas_table_count_by_name():
     by_step = identifier()
     for t, row in swapped.iterrows():
         last = by_step.step(t, row)
-    last = by_step.settled(last)
+    last = by_step._settled(last)
     assert np.array_equal(last.u, expected.u)
 
 

@@ -363,10 +363,10 @@ class Result(Shown):
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        self.records.append(self.record(estimate, self._keeps))
+        self.records.append(self._record(estimate, self._keeps))
         self._follow(estimate)
 
-    def announce(self, estimate: Estimate) -> bool:
+    def _announce(self, estimate: Estimate) -> bool:
         """Count an estimate whose record is stored later; return whether it keeps its fields."""
         keeps = self._keeps
         self._follow(estimate)
@@ -382,13 +382,13 @@ class Result(Shown):
         self._settled, self._ended = None, False
         self.last = estimate
 
-    def settle(self, estimate: Estimate) -> None:
-        """Take the last parameter and state from `Identifier.settled`, in tables and datasets."""
+    def _settle(self, estimate: Estimate) -> None:
+        """Take the last parameter and state from the end of a run, in tables and datasets."""
         self._ended = True
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
-    def record(self, estimate: Estimate, keeps: bool) -> Record:
+    def _record(self, estimate: Estimate, keeps: bool) -> Record:
         """Return the record of an estimate; `keeps`: with its fields."""
         return Record(
             t=estimate.t,
@@ -398,10 +398,10 @@ class Result(Shown):
             status=STATUS_CODES.index(estimate.status.code),
             steps=estimate.steps,
             notes=estimate.diagnostics.named(),
-            snapshot=self.snapshot(estimate) if keeps else None,
+            snapshot=self._snapshot(estimate) if keeps else None,
         )
 
-    def snapshot(self, estimate: Estimate) -> Snapshot:
+    def _snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
         return snapshot_of(self.model, estimate.belief)
 
@@ -621,12 +621,12 @@ class Result(Shown):
             return records, last
         if self.last is not None and self._settled is not None:
             snapshot = (
-                None if records.last_snapshot < len(records) - 1 else self.snapshot(self.last)
+                None if records.last_snapshot < len(records) - 1 else self._snapshot(self.last)
             )
             records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             # The last fields are part of the dataset, also where `fields_every` has left them out.
-            last = self.snapshot(self.last)
+            last = self._snapshot(self.last)
         return records, last
 
     def __getstate__(self) -> dict[str, Any]:

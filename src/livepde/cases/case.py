@@ -96,7 +96,7 @@ class Prepared:
         """The identifier, before the first sample."""
         law = self.case.law
         identifier = self.identifier_with(law.live() if self.live else law)
-        if self.case.spec.output.smoothed and (why := identifier.unsmoothed):
+        if self.case.spec.output.smoothed and (why := identifier._unsmoothed):
             raise self.case.error("output.smoothed", f"{why}; leave it out.")
         return identifier
 

@@ -236,7 +236,7 @@ def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Res
     for sample in samples:
         result.add(who.step(sample.t, sample.z, sample.inputs))
     if result.last is not None:
-        result.settle(who.settled(result.last, columns=columns))
+        result._settle(who._settled(result.last, columns=columns))
     return result
 
 
