@@ -81,7 +81,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
         for line in ax.lines
         if "jump" in str(line.get_label())
     ]
-    assert len(lines) == 3  # the unknown, innovations, and withheld channels
+    assert len(lines) == 3  # the unknown, innovations, and validation channels
 
 
 @pytest.mark.long

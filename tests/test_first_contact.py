@@ -611,7 +611,7 @@ def test_terms_of_a_model_are_shown_as_they_are_written():
 def test_an_identifier_shows_law_sensors_and_time():
     who = identifier(withheld=lp.Points({"W": 0.5}))
     shown = repr(who)
-    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "withheld: W\n", "time: 0 s"):
+    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "validation: W\n", "time: 0 s"):
         assert line in shown
     who = identifier()
     who.run(dated())
@@ -663,7 +663,7 @@ def test_the_figure_of_a_run_begins_with_what_was_measured():
     assert np.allclose(first.lines[0].get_ydata(), dated()["T_30"])
     assert [text.get_text() for text in first.get_legend().get_texts()][
         -1
-    ] == "T_60 again (withheld)"
+    ] == "T_60 again (validation)"
 
 
 def test_sensors_of_several_units_have_a_figure_for_each():
@@ -694,7 +694,7 @@ def test_residuals():
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_30"]) for x in ax.lines)
     ax = found().plot.residuals(withheld=True)
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_60 again"]) for x in ax.lines)
-    with pytest.raises(lp.errors.ConfigurationError, match="no withheld sensors"):
+    with pytest.raises(lp.errors.ConfigurationError, match="no validation sensors"):
         two().plot.residuals(withheld=True)
 
 

@@ -131,7 +131,7 @@ def test_before_assimilation_begins_data_are_only_scored():
 
 
 def test_configurations_that_do_not_fit():
-    with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and withheld"):
+    with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and for validation"):
         identifier(withheld=lp.Points({"a": 0.5}))
     with pytest.raises(lp.errors.ConfigurationError, match="dt_max"):
         identifier(dt_max=0.0)

@@ -303,7 +303,7 @@ def test_measures_and_checks(driven):
     both = np.concatenate([data.innovation.values.ravel(), data.withheld_error.values.ravel()])
     assert found["rmse"] == pytest.approx(np.sqrt(np.mean(both**2)))
     assert found["rmse.a"] == found["rmse.assimilated"]
-    assert found["rmse.b"] == found["rmse.withheld"]
+    assert found["rmse.b"] == found["rmse.validation"]
     assert found["failed_steps"] == 0
     checks = checks_of({"alpha": (">=", -9.0), "beta": ("<=", 1.0)}, data)
     assert [check.ok for check in checks] == [True, False]

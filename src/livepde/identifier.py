@@ -210,7 +210,7 @@ class Identifier(Shown):
         _, model = self.model._shown()
         rows = {name: text for name, text in model.items() if name.startswith("unknown ")}
         rows = {"equation": model["equation"], **rows, "law": options_of(self.law)}
-        for kind, sensors in (("sensors", self.observed), ("withheld", self.withheld)):
+        for kind, sensors in (("sensors", self.observed), ("validation", self.withheld)):
             if sensors is not None:
                 rows[kind] = listed(sensors.names)
         if self.inputs:
@@ -573,7 +573,7 @@ class Identifier(Shown):
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return the verdict of the law with the findings on steps, withheld sensors and gaps."""
+        """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names, ignored = self.withheld.names if self.withheld is not None else (), self.ignored
         inputs = self._channels.inputs

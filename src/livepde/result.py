@@ -70,7 +70,7 @@ class Estimate(Shown):
         For `GradientLaw`, which pulls the state to the sample within the step, the output error
         after the step.
     withheld_error
-        Measured minus estimated of each withheld channel.
+        Measured minus estimated of each validation channel.
     status
         Status of the step; unless ok, q and u are those of the last successful step.
     steps
@@ -302,7 +302,7 @@ class Result(Shown):
     count
         Number of earlier estimates, not all of which need be kept; default that of the records.
     ignored
-        Names of withheld sensors that never count, for the default layout.
+        Names of validation sensors that never count, for the default layout.
     """
 
     def __init__(
@@ -548,7 +548,7 @@ class Result(Shown):
 
     @property
     def measured(self) -> pd.DataFrame:
-        """Readings of the assimilated and then of the withheld sensors, one row for each sample.
+        """Readings of the assimilated and then of the validation sensors, one row for each sample.
 
         Raises
         ------

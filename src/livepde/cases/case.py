@@ -319,7 +319,7 @@ class Case(CaseContent):
     @cached_property
     def withheld(self) -> Observation | None:
         """The sensors that are predicted only, withheld or ignored; None if there are none."""
-        return observation_of(self, "withheld", "ignored")
+        return observation_of(self, "validation", "ignored")
 
     @property
     def ignored(self) -> tuple[str, ...]:
