@@ -129,6 +129,19 @@ class Identifier(Shown):
     ------
     ConfigurationError
         Parts that do not fit together.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> identifier = lp.Identifier(rod, sensors, u0=1.0)
+    >>> for t, reading in [(0.5, 0.93), (1.0, 0.81), (2.0, 0.64)]:
+    ...     estimate = identifier.step(t, {"T_50": reading})
+    >>> low, high = estimate["alpha"].interval()
+    >>> low < estimate["alpha"].median < high
+    True
     """
 
     def __init__(

@@ -88,6 +88,16 @@ class Estimate(Shown):
         Function that returns the verdict of the law on the run so far; see `verdict`.
     fit
         The last fit of all stored samples; None before it, and for laws without.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> estimate = lp.Identifier(rod, sensors, u0=1.0).step(1.0, {"T_50": 0.81})
+    >>> sorted(estimate.parameters), estimate.u.shape
+    (['alpha'], (9,))
     """
 
     t: float
@@ -303,6 +313,17 @@ class Result(Shown):
         Number of earlier estimates, not all of which need be kept; default that of the records.
     ignored
         Names of validation sensors that never count, for the default layout.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> data = [(0.5, [0.93]), (1.0, [0.81]), (2.0, [0.64])]
+    >>> result = lp.Identifier(rod, sensors, u0=1.0).run(data)
+    >>> len(result), list(result.summary().index)
+    (3, ['alpha'])
     """
 
     def __init__(

@@ -40,6 +40,12 @@ class Sample:
         and a mapping the noise by itself: "noise of T_1". NaN: the noise that the sensor states.
     inputs
         Input and boundary channels, if they are not in z.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Sample(60.0, {"T_10": 20.5, "T_left": 31.0}).t
+    60.0
     """
 
     t: float
