@@ -366,8 +366,8 @@ class Identifier(Shown):
         t
             Time in the unit of the model, or a date; the first date is at t0.
         z, inputs
-            As of a `Sample`: an array in the order of the sensors, a mapping or a row of a pandas
-            table by names.
+            As of a `Sample`: an array in the order of the sensors, or a mapping by names. In a row
+            of a pandas table that has all channels, other columns are ignored.
 
         Returns
         -------

@@ -306,13 +306,24 @@ class Channels:
         The noise is None if no value has one of its own, NaN where one has none. Among the inputs
         may be other channels.
         """
-        z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
+        if not isinstance(z, (np.ndarray, dict)):
+            row = labelled(z)
+            z = row if row is z else self._columns(row)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             measured, noise, withheld, named = self._by_name(z, inputs)
         else:
             measured, noise = readings(z, self.observed)
             withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
         return measured, noise, withheld, named | self._named(inputs) if inputs else named
+
+    def _columns(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return a row of a table without the columns that are no channel, as `run` reads a table.
+
+        A row that lacks a channel keeps them: one may be this channel with a misspelt name.
+        """
+        if not (set(self.names) - self.optional).issubset(row):
+            return row
+        return {name: value for name, value in row.items() if name in self._known}
 
     def readings(self, samples: Sequence[Sample]) -> Array:
         """Return the readings of assimilated and validation sensors, shape (samples, sensors)."""
