@@ -99,7 +99,7 @@ versions: $(READY)  ## Run the same on every other Python that is found, with co
 package: $(READY)  ## Build wheel and source distribution into dist/, and try the wheel in an empty environment
 	@$(BIN)/python .ci/package.py
 
-platforms: $(READY)  ## Resolve the core for Linux, macOS and Windows with binary wheels only: 80 s
+platforms: $(READY)  ## Resolve the core for Linux, macOS and Windows with binary wheels only
 	@$(BIN)/python .ci/platforms.py
 
 check: $(READY)  ## Check style, format, types, import layers and plain English

@@ -113,7 +113,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
             identifier.refit()  # as at the end of a batch run
 
     def known() -> Known:
-        belief = identifier.latent_belief()
+        belief = identifier._latent_belief()
         factor = belief.q_factor
         return belief.q, factor
 
@@ -124,7 +124,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
 
 
 def _hidden(data: Data, missed: Array) -> float:
-    """Return the root mean square of what withheld sensors missed, shape (times, withheld)."""
+    """Return the root mean square of what validation sensors missed, shape (times, withheld)."""
     late = data.process.times >= data.process.assimilate_from
     return float(np.sqrt(np.nanmean(missed[late][1:] ** 2)))
 
@@ -262,7 +262,7 @@ def _checks(found: Found) -> list[Check]:
 
 NOTES = (
     "error: relative, of the parameter, at the end; where it moves the root mean square over times "
-    "in the second half. Median over seeds, least and largest. soil: K, at the withheld sensor, "
+    "in the second half. Median over seeds, least and largest. soil: K, at the validation sensor, "
     "one step ahead (prior and offline fit: in a free run).",
     f"limit: error over that of '{EACH_SAMPLE}', which is given all data up to the time that is "
     f"scored. '{ALL_DATA}' is the same for what is constant, and a smoother for what moves: it "

@@ -265,7 +265,7 @@ def followed(process: Process, seed: int, change: float = 0.0, samples: int = 0)
             alarms.append(k)
     late = [k - at for k in alarms if k > at]
     truth = ((1.0 + change) * data.q)[process.where]
-    belief, latent = identifier.latent_belief(), process.model.latent
+    belief, latent = identifier._latent_belief(), process.model.latent
     error = latent.value(belief.q)[process.where] / truth - 1.0
     # The interval in latent coefficients, through which every transform maps its ends.
     std = np.asarray(belief.q_std, dtype=float)

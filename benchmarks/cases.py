@@ -310,7 +310,7 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
             seconds = frozen.seconds = 0.0
     for run, result in zip(runs, results, strict=True):
         if result.last is not None:
-            result.settle(run.settled(result.last))
+            result._settle(run._settled(result.last))
     datasets = [result.to_xarray() for result in results]
     ratio = seconds / frozen.seconds if frozen.seconds else math.nan
     return datasets[0], datasets[1], ratio
@@ -359,7 +359,7 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             quality.append((job.label, *["–"] * 5, "failed", "–"))
             continue
         numbers = run.numbers
-        rmse, withheld = numbers["rmse"], numbers.get("rmse.withheld", math.nan)
+        rmse, withheld = numbers["rmse"], numbers.get("rmse.validation", math.nan)
         errors = [shown(value) for value in (rmse, withheld, run.prior)]
         steps = int(numbers["failed_steps"])
         cost = shown(run.ratio, ".1f")
@@ -369,7 +369,7 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
             rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
     columns = ("case", "unknown", "estimate", "± std. dev.", "unit", "reference", "error")
-    more = ("case", "RMSE", "withheld", "prior", "samples", "time", "failed steps", "verdict")
+    more = ("case", "RMSE", "validation", "prior", "samples", "time", "failed steps", "verdict")
     return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
 
 

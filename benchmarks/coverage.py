@@ -257,7 +257,7 @@ def twin(problem: Problem, seed: int) -> Twin:
         estimate = identifier.step(times[k], z)
         samples.append(estimate)
         if (moving and k in compared) or k == problem.samples:
-            scores.append(_score(model, estimate, identifier.latent_belief(), path[k]))
+            scores.append(_score(model, estimate, identifier._latent_belief(), path[k]))
     inside, errors = zip(*scores, strict=True)
     result = identifier.run([])  # the estimates as a dataset, for what the run says of itself
     for estimate in samples:

@@ -42,7 +42,7 @@ class Fit:
         Latent coefficients at each time, shape (times, dim), and a function of the time's number
         that returns a square root of their covariance, shape (dim, coordinates).
     predicted, hidden
-        What assimilated and withheld sensors show, shapes (times, sensors), (times, withheld).
+        What assimilated and validation sensors show, shapes (times, sensors), (times, withheld).
     seconds, evaluations
         Processor time, and runs of the forward model with sensitivities.
     converged

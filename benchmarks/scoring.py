@@ -31,7 +31,7 @@ class Score:
     Attributes
     ----------
     error
-        Relative error of the parameter; of a real process, error of the withheld sensor.
+        Relative error of the parameter; of a real process, error of the validation sensor.
     covered
         Share of values whose 95 % interval holds the truth; NaN without intervals or truth.
     step

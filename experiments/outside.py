@@ -195,7 +195,7 @@ def judge(data: Data, identifier: Identifier) -> Score:
     (name,) = model.parameter_space.fields
     low, high = (_shown(model, end) for end in estimate[name].interval())
     hit = np.where(np.isfinite(low), (low <= data.true) & (data.true <= high), np.nan)
-    latent = identifier.latent_belief()
+    latent = identifier._latent_belief()
     std = np.full(latent.q.shape, np.nan) if latent.q_std is None else latent.q_std
     share = _shown(model, std) / _shown(model, np.sqrt(model.Q.variance))
     return Score(data.error(_shown(model, estimate.q)), hit, share)
@@ -215,7 +215,7 @@ def rows(data: Data) -> dict[str, Score]:
     for count in (6, 12):
         law = SensitivityLaw(modes=count)
         found[f"sensitivity, {count} modes"] = judge(data, run(data, law))
-        directions = informed(whole.latent_belief(), model, count)
+        directions = informed(whole._latent_belief(), model, count)
         law = Informed(directions=directions)
         found[f"sensitivity, {count} informed"] = judge(data, run(data, law))
     auto = SensitivityLaw(modes="auto")

@@ -81,7 +81,7 @@ def test_a_jump_is_in_tables_sentences_figure_and_record(tmp_path: Path):
         for line in ax.lines
         if "jump" in str(line.get_label())
     ]
-    assert len(lines) == 3  # the unknown, innovations, and withheld channels
+    assert len(lines) == 3  # the unknown, innovations, and validation channels
 
 
 @pytest.mark.long
@@ -185,7 +185,7 @@ def learned(unknowns: dict[str, Any], rate: Any) -> tuple[Any, Any]:
     sensors = lp.Points([0.5], noise=1e-3)
     identifier = lp.Identifier(model, sensors, lp.SensitivityLaw(modes=8), u0=1.0)
     result = identifier.run([(0.1 * k, [1.0]) for k in range(1, 31)])
-    return result.to_xarray(), identifiability(model, identifier.latent_belief())
+    return result.to_xarray(), identifiability(identifier)
 
 
 @pytest.mark.slow

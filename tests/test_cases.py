@@ -344,7 +344,7 @@ unknowns.q = { prior = 1.0, std = 1.0 }
 law = { kind = "sensitivity", noise = 0.1 }
 [channels]
 a = { role = "sensor", column = "a", at = [0.5, 0.5] }
-b = { role = "withheld", column = "b", at = [0.5, 0.75] }
+b = { role = "validation", column = "b", at = [0.5, 0.75] }
 """)
     _, data = result_of(tmp_path / "case.toml")
     assert np.isfinite(data.q).all()
@@ -508,7 +508,7 @@ REFUSED = [
     ('at = "left"', 'at = "left", of = "u"', "of requires a sensor"),
     ('at = "20 cm"', "each = [0, 0.4, 5]", "each needs column = a name with {}"),
     ('noise = "0.05 K" }', 'noise = "0.05 K", correlated = { tim = 3 } }', "did you mean 'time'?"),
-    ('role = "sensor"', 'role = "withheld"', "there is no sensor. Add"),
+    ('role = "sensor"', 'role = "validation"', "there is no sensor. Add"),
     ("[law]", "[boundary]\nlft = 3\n[law]", "boundary: no boundary 'lft'"),
     ('rmse = "<= 0.15"', 'rmse = "lots"', "expect.rmse: got 'lots'; expected [low, high]"),
     ("title =", "titel =", "no key 'titel'; did you mean 'title'?"),
@@ -745,8 +745,8 @@ def test_the_initial_state_is_said_once(rod):
 
 
 def test_families(rod):
-    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
-    path = rod((old, 'T = { role = "withheld", column = "T_{}0", each = ["0 cm", "40 cm", 5] }'),
+    old = 'T_20 = { role = "validation", column = "T_20", at = "20 cm" }'
+    path = rod((old, 'T = { role = "validation", column = "T_{}0", each = ["0 cm", "40 cm", 5] }'),
                ("T_10 =", "first ="), ("T_30 =", "third ="))  # fmt: skip
     case = cases.load(path)
     assert case.withheld.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
@@ -758,8 +758,8 @@ def test_families(rod):
 
 @pytest.mark.slow
 def test_very_many_sensors_are_one_row(rod):
-    old = 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }'
-    new = 'W = { role = "withheld", column = "T_20{}", each = [0, 0.4, 50] }'
+    old = 'T_20 = { role = "validation", column = "T_20", at = "20 cm" }'
+    new = 'W = { role = "validation", column = "T_20{}", each = [0, 0.4, 50] }'
     path = rod(
         (old, new),
         ("cells = 40", "cells = 4"),
@@ -775,7 +775,7 @@ def test_very_many_sensors_are_one_row(rod):
     rows = tables(data)[1].rows
     assert [row[:2] for row in rows] == [
         ("T_10 ... T_30", "assimilated"),
-        ("W_0 ... W_49", "withheld"),
+        ("W_0 ... W_49", "validation"),
     ]
 
 
@@ -789,7 +789,7 @@ law = { kind = "sensitivity", noise = 0.01 }
 steps.scheme = "alexander2"
 [channels]
 c = { role = "sensor", column = "c", at = 0.5, of = "c" }
-s = { role = "withheld", column = "s{}", each = [0, 1, 2], of = "s" }
+s = { role = "validation", column = "s{}", each = [0, 1, 2], of = "s" }
 """
 TWO_CODE = """
 import numpy as np
@@ -1096,7 +1096,7 @@ def test_soil_by_layer(tmp_path):
     _, data = result_of(shipped("soil_layers", tmp_path))
     found = measures(data)
     assert found["rmse"] <= 0.25
-    assert found["rmse.withheld"] <= 0.25
+    assert found["rmse.validation"] <= 0.25
     # Layers as batch fits of amplitude and phase have them, within the deviations reported.
     for layer, fit in (("05-10", 4.1e-7), ("10-20", 5.4e-7), ("20-30", 8.1e-7), ("30-40", 7.7e-7)):
         name = f"alpha[{layer}]"

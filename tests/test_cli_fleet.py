@@ -432,7 +432,7 @@ def test_what_it_leaves_serves_other_commands(alike):
     case.identifier.load("rods/b/checkpoint.bin")
     run = runs.open(Path("rods/b"))
     assert case.identifier.t == run.dataset["time"][-1]
-    estimate = case.identifier.settled(case.identifier.estimate())
+    estimate = case.identifier._settled(case.identifier.estimate())
     assert estimate.q[0] == run.dataset["alpha"][-1]
     assert case.identifier.step(estimate.t + 20.0, list(case.stream)[-1].z).status.ok
 

@@ -282,7 +282,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     for k, error in enumerate(errors):
         assert np.array_equal(points[k].y, readings[:, k])
         assert np.allclose(lines[k].y, readings[:, k] - error)
-    assert [line.name for line in lines] == ["a", "b (withheld)"]
+    assert [line.name for line in lines] == ["a", "b (validation)"]
     assert [line.line.dash for line in lines] == [None, "dash"]
     said = str(cards.verdict(seen))
     assert "The source is silent: nothing from the source for 9 s." in said

@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import sys
+import warnings
 from dataclasses import replace
 from html.parser import HTMLParser
 
@@ -468,6 +469,48 @@ def test_netcdf_c_reads_the_files(rod, tmp_path):
             assert np.array_equal(found["u"][:], rod.dataset["u"])
             assert "since" in found["time"].units
             assert "_FillValue" not in found["time"].ncattrs()
+
+
+def complaints(path) -> list[str]:
+    """Return the errors that a checker of the CF conventions finds, each with its section."""
+    runner = pytest.importorskip("compliance_checker.runner")
+    suite = runner.CheckSuite()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of its own packages
+        suite.load_all_available_checkers()
+        with suite.load_dataset(str(path)) as data:
+            ((found, crashed),) = suite.run_all(data, ["cf:1.11"]).values()
+    assert not crashed
+    highest = suite.checkers["cf:1.11"].HIGH
+    # The value is whether a check has passed, or how many parts of how many.
+    missed = [one for one in found if one.weight == highest and not passed(one.value)]
+    return [f"{one.name}: {text}" for one in missed for text in one.msgs]
+
+
+def passed(value: bool | tuple[int, int]) -> bool:
+    return value[0] == value[1] if isinstance(value, tuple) else value
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["line", "triangle", "hexahedron"])
+def test_a_checker_of_cf_accepts_the_files(tmp_path, kind):
+    export(made(tmp_path / "run", kind, origin=ORIGIN), tmp_path / "run.nc")
+    # The roles of UGRID are part of CF 1.11, appendix A; the checker only knows the older ones.
+    found = [text for text in complaints(tmp_path / "run.nc") if "cf_role" not in text]
+    assert not found
+
+
+@pytest.mark.slow
+def test_a_checker_of_cf_accepts_times_without_a_date(tmp_path):
+    export(made(tmp_path / "run"), tmp_path / "run.nc")
+    # Seconds since nothing are no time of CF. The checker expects one for the name alone.
+    name_alone = "'time' should have standard_name='time'"
+    assert all(name_alone in text for text in complaints(tmp_path / "run.nc"))
+    with xr.open_dataset(tmp_path / "run.nc", engine="scipy") as found:
+        wrong = found.load()
+    wrong["time"].attrs["standard_name"] = "time"
+    wrong.to_netcdf(tmp_path / "wrong.nc", engine="scipy")
+    assert any("since" in text for text in complaints(tmp_path / "wrong.nc"))
 
 
 @pytest.mark.slow

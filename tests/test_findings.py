@@ -288,7 +288,7 @@ RUNS = {
     "assess: refused": Pair(partial(rod, "spikes"), rod),
     "assess: prior": Pair(partial(rod, "far from the prior"), rod),
     "ledger: input": Pair(partial(fed, gaps=True), fed),
-    "ledger: withheld": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
+    "ledger: validation": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
     "findings: hold": Pair(partial(fed, between="next"), fed),
     "findings: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
     "findings: effect": Pair(partial(ended, 0.08), ended),

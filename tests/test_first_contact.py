@@ -76,9 +76,9 @@ result = lp.Identifier(model, sensors, u0=0.0).run("rod.csv")
 result = lp.Identifier(model, sensors, u0=0.0).run(df.to_xarray())
 result = lp.Identifier(model, sensors, u0=0.0).run(df.reset_index())
 result = lp.Identifier(model, sensors, u0=0.0).run(df.tz_localize("Europe/Berlin"))
-result = lp.Identifier(model, sensors, u0=0.0).run(df.drop(columns="battery_V").iterrows())
+result = lp.Identifier(model, sensors, u0=0.0).run(df.iterrows())
 online = lp.Identifier(model, sensors, u0=0.0)
-estimates = [online.step(t, row) for t, row in df.drop(columns="battery_V").iterrows()]
+estimates = [online.step(t, row) for t, row in df.iterrows()]
 print(model, online, estimates[-1], result)
 print(result.summary().loc["alpha", ["value", "low", "high"]])
 print(result.to_dataframe()["alpha"].resample("1s").last())
@@ -261,6 +261,16 @@ def test_rows_one_by_one():
     later = pd.date_range(channels.index[-1] + pd.Timedelta("125ms"), periods=2, freq="125ms")
     ahead = [who.forecast(times, {"T_left": 1.0})["T_30"] for times in (later, [3.0, 3.125])]
     assert np.array_equal(*ahead)
+
+
+def test_a_row_of_a_table_may_have_other_columns():
+    found = [identifier().step(0.0, row) for _, row in measured().iloc[:1].iterrows()]
+    assert found[0].parameters == identifier().step(0.0, measured().iloc[0, :3]).parameters
+    assert same(identifier().run(dated().iterrows()))
+    row = measured().iloc[0]
+    for wrong in (row.rename({"T_30": "T30"}), row.to_dict()):  # a mapping has chosen its names
+        with pytest.raises(lp.errors.SampleError, match=r"unknown channel '(T30|battery_V)'"):
+            identifier().step(0.0, wrong)
 
 
 def test_the_next_table_continues_the_dates():
@@ -611,7 +621,7 @@ def test_terms_of_a_model_are_shown_as_they_are_written():
 def test_an_identifier_shows_law_sensors_and_time():
     who = identifier(withheld=lp.Points({"W": 0.5}))
     shown = repr(who)
-    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "withheld: W\n", "time: 0 s"):
+    for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "validation: W\n", "time: 0 s"):
         assert line in shown
     who = identifier()
     who.run(dated())
@@ -663,7 +673,7 @@ def test_the_figure_of_a_run_begins_with_what_was_measured():
     assert np.allclose(first.lines[0].get_ydata(), dated()["T_30"])
     assert [text.get_text() for text in first.get_legend().get_texts()][
         -1
-    ] == "T_60 again (withheld)"
+    ] == "T_60 again (validation)"
 
 
 def test_sensors_of_several_units_have_a_figure_for_each():
@@ -694,7 +704,7 @@ def test_residuals():
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_30"]) for x in ax.lines)
     ax = found().plot.residuals(withheld=True)
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_60 again"]) for x in ax.lines)
-    with pytest.raises(lp.errors.ConfigurationError, match="no withheld sensors"):
+    with pytest.raises(lp.errors.ConfigurationError, match="no validation sensors"):
         two().plot.residuals(withheld=True)
 
 

@@ -40,7 +40,7 @@ OPEN = {  # what his table does not tell: the ends, the places, a unit, the prio
     'column = "T_left"': 'left = { role = "boundary", column = "T_left", at = "left" }',
     'column = "probe': 'probe = { role = "sensor", column = "probe near furnace", at = "10 cm", '
     'unit = "degF" }',
-    'column = "T_20"': 'T_20 = { role = "withheld", column = "T_20", at = "20 cm" }',
+    'column = "T_20"': 'T_20 = { role = "validation", column = "T_20", at = "20 cm" }',
     'column = "T_30"': 'T_30 = { role = "sensor", column = "T_30", at = "30 cm" }',
     'column = "T_right"': 'right = { role = "boundary", column = "T_right", at = "right" }',
     'noise = "?': f'law = {{ noise = "{NOISE} K" }}',
@@ -174,7 +174,7 @@ def test_from_nothing_to_a_result_of_ones_own(shell, ctrl_c):
     estimate, std = found["measures"]["alpha"], found["measures"]["alpha.std"]
     assert abs(estimate - DIFFUSIVITY) < 0.02 * DIFFUSIVITY
     assert abs(estimate - DIFFUSIVITY) < 4.0 * std
-    assert found["measures"]["rmse.withheld"] < 2.0 * NOISE
+    assert found["measures"]["rmse.validation"] < 2.0 * NOISE
 
     # A second run goes beside the first; into the same directory it is refused.
     assert "runs/mine-2" in shell.ok("livepde", "run", "mine/case.toml")

@@ -201,7 +201,7 @@ def test_a_plate_as_a_sensor_determines_k_and_C(
         ([('noise = "0.3 W/m^2"', 'noise = "0.3 K"')], "channels.q.noise"),
         (
             [
-                ('role = "sensor"', 'role = "withheld"'),
+                ('role = "sensor"', 'role = "validation"'),
                 (
                     'T_outside = { role = "boundary", column = "T_outside", at = "right" }',
                     'T_outside = { role = "sensor", column = "T_outside", at = "24 cm" }',

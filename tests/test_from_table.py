@@ -487,7 +487,7 @@ def test_the_case_of_a_rod_is_fifteen_lines_and_runs(here):
 WARM = "time_s;T_5cm;T_15cm\n0;20,0;20,0\n60;21,0;20,5\n120;22,0;\n180;23,0;21,5\n240;24,0;22,0\n"
 HEATER = "t [min],Q_kW,state\n-1,5,on\n1,7,on\n2.5,10,on\n4,10,off\n"
 FILES = {"mesh.from": "3 cm", "mesh.to": "1 m", "law.noise": "0.1 K", "options.H": "1 m"}
-FILES |= {"options.T0": "20 degC", "channels.T_15cm.role": "withheld"}
+FILES |= {"options.T0": "20 degC", "channels.T_15cm.role": "validation"}
 FILES |= {"unknowns.k.prior": "2 W/(m K)", "unknowns.k.std": "1 W/(m K)"}
 FILES |= {"unknowns.R_b.prior": "0.1 m K/W", "unknowns.R_b.std": "0.1 m K/W"}
 FILES |= {"options.rho_c": "2e6 J/(m^3 K)"}

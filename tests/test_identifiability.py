@@ -11,7 +11,8 @@ from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.cases.preview import StatedNoise
-from livepde.diagnostics import Identifiability, identifiability
+from livepde.diagnostics import Identifiability
+from livepde.diagnostics.information_gain import information_gains
 
 MESH = lp.interval(0.0, 1.0, 12)
 TIMES = 0.1 * np.arange(1, 31)
@@ -29,12 +30,12 @@ def learned(unknowns: dict[str, Any], rate: Any, points: Any = (0.5,), z: float 
     identifier = lp.Identifier(model, sensors, StatedNoise(modes=8), u0=1.0)
     for t in TIMES:
         identifier.step(t, np.full(len(points), z))
-    belief = identifier.latent_belief()
+    belief = identifier._latent_belief()
     return model, belief
 
 
 def report(*args: Any, **options: Any) -> Identifiability:
-    return identifiability(*learned(*args, **options))
+    return information_gains(*learned(*args, **options))
 
 
 @pytest.mark.slow
@@ -103,8 +104,8 @@ def test_one_that_moves_is_never_flat_for_good():
 @pytest.mark.slow
 def test_the_width_counts():
     model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
-    (known,) = identifiability(model, belief).unknowns
-    (wider,) = identifiability(model, replace(belief, q_factor=3.0 * belief.q_factor)).unknowns
+    (known,) = information_gains(model, belief).unknowns
+    (wider,) = information_gains(model, replace(belief, q_factor=3.0 * belief.q_factor)).unknowns
     assert wider.left == pytest.approx(3 * known.left)
 
 
@@ -112,4 +113,4 @@ def test_the_width_counts():
 def test_a_law_without_covariance():
     model, belief = learned({"a": lp.Normal(0.0, 1.0)}, lambda q: q.a)
     with pytest.raises(lp.errors.ConfigurationError, match="use SensitivityLaw"):
-        identifiability(model, replace(belief, q_factor=None))
+        information_gains(model, replace(belief, q_factor=None))

@@ -131,7 +131,7 @@ def test_before_assimilation_begins_data_are_only_scored():
 
 
 def test_configurations_that_do_not_fit():
-    with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and withheld"):
+    with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and for validation"):
         identifier(withheld=lp.Points({"a": 0.5}))
     with pytest.raises(lp.errors.ConfigurationError, match="dt_max"):
         identifier(dt_max=0.0)
@@ -376,7 +376,7 @@ def test_rows_of_a_pandas_table_count_by_name():
     by_step = identifier()
     for t, row in swapped.iterrows():
         last = by_step.step(t, row)
-    last = by_step.settled(last)
+    last = by_step._settled(last)
     assert np.array_equal(last.u, expected.u)
 
 

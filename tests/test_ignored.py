@@ -14,7 +14,7 @@ from livepde.errors import ConfigurationError
 
 @pytest.fixture
 def faulty(tmp_path, monkeypatch):
-    """Return the case of `livepde init` whose withheld sensor reads too much."""
+    """Return the case of `livepde init` whose validation sensor reads too much."""
     monkeypatch.chdir(tmp_path)
     path = short_rod(tmp_path / "rod", 61)
     table = pd.read_csv(path.parent / "rod.csv")
@@ -32,16 +32,16 @@ def outcome(path, settings, folder):
 
 @pytest.mark.long
 def test_a_faulty_sensor_counts_only_while_it_is_withheld(faulty):
-    found, numbers, _ = outcome(faulty, [], "withheld")
+    found, numbers, _ = outcome(faulty, [], "validation")
     assert found.level == "do not trust"
-    assert numbers["rmse.withheld"] > 1.5
-    (finding,) = (one for one in found.findings if one.what == "withheld")
+    assert numbers["rmse.validation"] > 1.5
+    (finding,) = (one for one in found.findings if one.what == "validation")
     assert 'role = "ignored"' in finding.sentence
     assert not any(cause.setting for cause in finding.causes)  # assimilating it mends nothing
     ignored = ["--set", "channels.T_20.role=ignored"]
     found, numbers, output = outcome(faulty, ignored, "ignored")
     assert found.level == "trusted"
-    assert not {name for name in numbers if name in ("rmse.withheld",)}
+    assert not {name for name in numbers if name in ("rmse.validation",)}
     assert numbers["rmse.T_20"] > 1.5  # it is shown
     assert numbers["rmse"] < 0.2
     assert "ignored" in output

@@ -43,7 +43,7 @@ def states(model, inputs, scheme) -> np.ndarray:
     one = lp.Identifier(model, points, filter_alone(), u0=0.0, scheme=scheme, halvings=0)
     for k, value in enumerate(inputs):
         one.step(H * k, {name: value})
-    belief = one.latent_belief()
+    belief = one._latent_belief()
     return one.observed.predict(belief.u, belief.q, None)
 
 
@@ -72,7 +72,7 @@ def test_the_uncertainty_of_the_state_is_that_of_all_readings(flux, scheme, tole
     )
     for k, value in enumerate(inputs):
         one.step(H * k, {name: value})
-    factor = one.observed.G @ one.latent_belief().u_factor
+    factor = one.observed.G @ one._latent_belief().u_factor
     assert factor.shape[1] <= 2 + ROWS
     ratio = np.sqrt((factor**2).sum(axis=1) / square)
     assert ratio[1] == pytest.approx(1.0, rel=tolerance)
@@ -105,7 +105,7 @@ def made_of_readings(law, errors, u_true, **unknowns):
 
 def test_the_readings_of_the_start_count_once():
     one, z = made_of_readings(lp.SensitivityLaw(), np.zeros(4), lambda x: 1.0 + x)
-    belief = one.latent_belief()
+    belief = one._latent_belief()
     seen = one.observed.G @ belief.u_factor
     assert np.sqrt((seen**2).sum(axis=1)) == pytest.approx(np.full(4, 0.1), rel=1e-9)
     assert one.observed.G @ belief.u == pytest.approx(z)
@@ -115,7 +115,7 @@ def test_the_readings_of_the_start_count_once():
 def test_an_offset_is_not_learned_from_the_state_that_was_made_with_it():
     extra = {"offset": lp.Normal(0.0, std=0.5)}
     one, _ = made_of_readings(lp.SensitivityLaw(), np.zeros(4), lambda x: 1.0 + x, **extra)
-    belief = one.latent_belief()
+    belief = one._latent_belief()
     assert np.sqrt((belief.q_factor[1] ** 2).sum()) == pytest.approx(0.5)
     seen = one.observed.G @ belief.u_factor
     assert np.sqrt((seen**2).sum(axis=1)) == pytest.approx([0.1, np.hypot(0.1, 0.5), 0.1, 0.1])
@@ -208,7 +208,7 @@ def test_readings_at_one_place_share_the_noise_of_the_start(tmp_path):
     x = identifier.model.state.mesh.p[0]
     assert readings["S"].weight == pytest.approx(np.interp(x, [0.0, 0.3], [0.0, 0.5]))
     identifier.step(0.0, {"left": 20.0, "T": 20.5, "S": 21.5})
-    there = identifier.observed.G[0] @ identifier.latent_belief().u_factor
+    there = identifier.observed.G[0] @ identifier._latent_belief().u_factor
     assert np.linalg.norm(there) == pytest.approx(0.1 / np.sqrt(2.0))
 
 
@@ -216,7 +216,7 @@ def test_an_exact_start_has_no_noise(tmp_path):
     identifier = of_two_sensors_at_one_place(tmp_path, "interpolate-exact")
     assert not identifier.problem.initial_readings
     identifier.step(0.0, {"left": 20.0})
-    there = identifier.observed.G[0] @ identifier.latent_belief().u_factor
+    there = identifier.observed.G[0] @ identifier._latent_belief().u_factor
     assert np.linalg.norm(there) == pytest.approx(0.0, abs=1e-9)
 
 

@@ -57,7 +57,7 @@ def test_the_lean_reference_has_the_numbers_of_the_law(nodes, unknowns, ends):
         state = lean.step(matrices, G, state, matrices.forcing(moment(sample)), z)
         np.testing.assert_allclose(latent(given, state)[0], estimate.q, rtol=0, atol=1e-10)
     np.testing.assert_allclose(state.x[0, matrices.place, 0], estimate.u, atol=1e-10)
-    belief = identifier.latent_belief()
+    belief = identifier._latent_belief()
     root = given.model.latent.deviations[:, None] * state.y[0, :, 1:]
     np.testing.assert_allclose(root @ root.T, belief.q_factor @ belief.q_factor.T, atol=1e-10)
     assert abs(estimate.q - 1.0).max() > 0.01  # something was learned

@@ -199,7 +199,7 @@ def case(folder: Path, name: str = "k", sensor: str = "T") -> cases.Case:
         ({"name": "status"}, "unknowns: Model: in tables and datasets of a run 'status' would be"),
         ({"name": "u"}, "unknowns: Model: in tables and datasets of a run 'u' would be the state"),
         ({"name": "jumps"}, r"unknowns.jumps: 'jumps' is another number in \[expect\]"),
-        ({"sensor": "withheld"}, "channels.withheld: 'withheld' is another number"),
+        ({"sensor": "validation"}, "channels.validation: 'validation' is another number"),
     ],
 )
 def test_a_case_says_which_key_has_such_a_name(tmp_path: Path, names: dict[str, str], message: str):

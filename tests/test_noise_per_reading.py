@@ -231,7 +231,7 @@ def test_a_reading_that_the_start_is_made_of_brings_its_noise():
     given = {"a": (lambda x: 0 * x[0] + 1.0, 0.02)}
     one = lp.Identifier(model, points, lp.SensitivityLaw(), u0=1.0, u0_from=given)
     one.step(0.0, [(1.0, 0.02)])
-    assert one.latent_belief().u_std.max() == pytest.approx(0.02)
+    assert one._latent_belief().u_std.max() == pytest.approx(0.02)
 
 
 # --- cases -------------------------------------------------------------------------------------

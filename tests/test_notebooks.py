@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 FOLDER = Path(__file__).parents[1] / "examples" / "notebooks"
-NAMES = ("pumping_test", "wall")
+NAMES = ("battery", "pumping_test", "stream_bed", "thermal_response", "wall")
 
 
 def cells(name: str) -> list[dict[str, Any]]:
@@ -57,3 +57,39 @@ def test_the_pumping_test_agrees_with_the_theis_equation(monkeypatch):
     for other in (theirs["value"], truth):
         assert (abs(ours["value"] - other) < 2.0 * ours["std"]).all()
     assert (ours["std"] / theirs["std"]).between(0.7, 3.0).all()
+
+
+@pytest.mark.long
+def test_the_stream_bed_is_followed_where_a_window_of_waves_mixes_two_flows(monkeypatch):
+    pytest.importorskip("matplotlib")
+    found = executed("stream_bed", monkeypatch)
+    table, kappas = found["comparison"], found["kappas"]
+    error = (table[["identification", "amplitude and phase"]].sub(table["truth"], axis=0)).abs()
+    assert (error["identification"] < 2.5 * table["std"]).all()
+    steady = [4.0, 7.0, 8.0]  # days on which no window contains the change of the flow
+    assert (error.loc[steady, "amplitude and phase"] < 0.5e-6).all()
+    assert (error.loc[[5.0, 5.5, 6.0], "amplitude and phase"] > 0.5e-6).all()
+    assert kappas.to_numpy() == pytest.approx(kappas["truth"], rel=0.03)
+
+
+@pytest.mark.slow
+def test_the_thermal_response_agrees_with_superposed_sources(monkeypatch):
+    pytest.importorskip("matplotlib")
+    found = executed("thermal_response", monkeypatch)
+    ours, theirs, truth = found["identified"], found["by_superposition"], found["truth"]
+    assert ((ours["value"] - theirs["value"]).abs() < 2.0 * ours["std"]).all()
+    for one in (ours, theirs):
+        assert ((one["value"] - truth).abs() < 3.0 * one["std"]).all()
+    assert (ours["std"] / theirs["std"]).between(0.7, 3.0).all()
+    assert abs(found["by_line"]["k"] - truth["k"]) < 2.0 * found["std_line"]
+    assert found["std_line"] > 10.0 * ours.loc["k", "std"]  # it takes the power for noise
+
+
+@pytest.mark.long
+def test_the_battery_agrees_with_a_least_squares_fit(monkeypatch):
+    pytest.importorskip("matplotlib")
+    found = executed("battery", monkeypatch)
+    ours, theirs = (found["comparison"].loc[name] for name in ("identification", "least squares"))
+    assert abs(ours["value"] - theirs["value"]) < 0.5 * theirs["std"]
+    assert abs(ours["value"] - found["truth"]) < 2.0 * ours["std"]
+    assert ours["std"] / theirs["std"] == pytest.approx(1.0, abs=0.3)

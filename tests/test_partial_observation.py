@@ -59,7 +59,7 @@ def found(seed: int, law: lp.SensitivityLaw) -> Found:
     identifier = lp.Identifier(model, points, law, u0=0.0, scheme=lp.Alexander2())
     for t, row in zip(TIMES, z, strict=True):
         estimate = identifier.step(float(t), row)
-    estimate = identifier.settled(estimate)
+    estimate = identifier._settled(estimate)
     low, high = estimate["q"].interval()
     prior = 2 * 1.959964 * np.sqrt(model.Q.variance)
     return Found(
@@ -146,7 +146,7 @@ def test_auto_takes_as_many_modes_as_a_field_needs():
             lp.Field(mesh, lp.linear(mesh)), {"q": q}, A=lambda q, u, v, x: q.q * u * v
         )
         identifier = lp.Identifier(model, lp.Points([0.5], noise=1.0), lp.SensitivityLaw(), u0=0.0)
-        return int(np.asarray(identifier.latent_belief().prior_factor).shape[1])
+        return int(np.asarray(identifier._latent_belief().prior_factor).shape[1])
 
     long, short = (count(lp.Sobolev(2, length)) for length in (1.0, 0.2))
     assert 3 <= long < 12 < short < 60

@@ -165,7 +165,7 @@ def test_sensors_are_named_with_their_error() -> None:
     figure = drawn(plots.overview(data))
     rms = float(np.sqrt((data["innovation"][:, 1] ** 2).mean()))
     assert f"s1: RMSE {rms:.3g}" in texts(panel(figure, "innovation"))
-    assert texts(panel(figure, "error of withheld")) == ["w0: RMSE 0.5"]
+    assert texts(panel(figure, "error of validation")) == ["w0: RMSE 0.5"]
 
 
 def test_many_sensors_become_one_range() -> None:
@@ -325,7 +325,7 @@ def test_measured_and_expected_curves_of_each_sensor() -> None:
     measured = np.column_stack([t, 2.0 * t, 3.0 * t])
     measured[4, 1] = np.nan
     (ax,) = drawn(plots.curves(data, t, measured, title="A run")).axes
-    assert texts(ax) == ["s0", "s1", "w0 (withheld)"]
+    assert texts(ax) == ["s0", "s1", "w0 (validation)"]
     assert [line.get_linestyle() for line in ax.lines[1::2]] == ["-", "-", "--"]
     points, lines = ax.lines[::2], ax.lines[1::2]
     errors = [data["innovation"][:, 0], data["innovation"][:, 1], data["withheld_error"][:, 0]]
@@ -339,7 +339,7 @@ def test_the_overview_begins_with_what_was_measured() -> None:
     t = data["time"].values
     first, *rest = drawn(plots.overview(data, measured=(t, np.ones((30, 3))))).axes
     assert first.get_title().startswith("measured (points)")
-    assert texts(first) == ["s0", "s1", "w0 (withheld)"]
+    assert texts(first) == ["s0", "s1", "w0 (validation)"]
     assert first.get_position().width > 1.6 * rest[0].get_position().width
     plain = drawn(plots.overview(data)).axes
     assert [ax.get_title() for ax in rest] == [ax.get_title() for ax in plain]

@@ -37,7 +37,7 @@ def samples(k: float, shifts, seed: int, count: int = 120):
     for j in range(count):
         left = 1.0 + np.sin(0.1 * j)
         one.step(0.05 * j, {"left": left})
-        belief = one.latent_belief()
+        belief = one._latent_belief()
         z = one.observed.predict(belief.u, belief.q, None) + 0.005 * rng.standard_normal(3)
         found.append((0.05 * j, {**dict(zip(AT, z.tolist(), strict=True)), "left": left}))
     return found
@@ -182,7 +182,7 @@ def test_a_case_states_it(tmp_path):
     )
     identifier = prepared.identifier
     assert "position[T]_std" in identifier.run(prepared.stream).to_xarray()
-    _, factor = identifier.latent_belief().q_factor
+    _, factor = identifier._latent_belief().q_factor
     assert 0.0 < np.linalg.norm(factor) < 0.01
 
 

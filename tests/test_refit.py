@@ -238,7 +238,7 @@ def test_a_reading_whose_place_is_missing_is_not_fitted():
         lost = {"x_p": math.nan} if k == 5 else place
         one = missing.step(0.1 * k, {"probe": z}, lost)
         other = never.step(0.1 * k, {"probe": math.nan if k == 5 else z}, place)
-    one, other = missing.settled(one), never.settled(other)
+    one, other = missing._settled(one), never._settled(other)
     assert one.fit is not None
     assert one.fit.cost == pytest.approx(other.fit.cost)
     (_, std) = one.parameters["alpha"]

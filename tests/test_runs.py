@@ -303,7 +303,7 @@ def test_measures_and_checks(driven):
     both = np.concatenate([data.innovation.values.ravel(), data.withheld_error.values.ravel()])
     assert found["rmse"] == pytest.approx(np.sqrt(np.mean(both**2)))
     assert found["rmse.a"] == found["rmse.assimilated"]
-    assert found["rmse.b"] == found["rmse.withheld"]
+    assert found["rmse.b"] == found["rmse.validation"]
     assert found["failed_steps"] == 0
     checks = checks_of({"alpha": (">=", -9.0), "beta": ("<=", 1.0)}, data)
     assert [check.ok for check in checks] == [True, False]
@@ -521,14 +521,14 @@ def test_a_report_of_numbers_that_overflow(tmp_path, driven):
 def test_the_last_fields_that_cannot_be_computed_are_an_event(tmp_path, monkeypatch):
     """The run ends with its data, its checkpoint and its status."""
 
-    usual = Result.snapshot
+    usual = Result._snapshot
 
     def broken(self, estimate):
         if estimate.t == TIMES[-1]:
             raise np.linalg.LinAlgError("SVD did not converge")
         return usual(self, estimate)
 
-    monkeypatch.setattr(Result, "snapshot", broken)
+    monkeypatch.setattr(Result, "_snapshot", broken)
     driven = drive(identifier(), samples(b=0.0), fields_every=10**9)
     assert driven.status == "finished"
     assert len(driven.journal) == len(TIMES)

@@ -435,7 +435,7 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
         estimate = one.step(0.3, {"T": 0.1, "Q": 0.1, "x": 7.0})
         assert np.isnan(estimate.innovation[0])
     np.testing.assert_array_equal(identifier.estimate().q, again.estimate().q)
-    # The channels of withheld sensors are inputs, too.
+    # The channels of validation sensors are inputs, too.
     hidden = lp.Identifier(
         model, lp.Points({"P": 0.5}, noise=0.1), law, withheld=lp.observation.Moving({"T": "x"})
     )

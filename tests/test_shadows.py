@@ -143,7 +143,7 @@ def test_the_shift_of_an_unknown_that_hardly_moves_is_that_of_a_constant_one() -
 @pytest.mark.slow
 def test_the_second_order_scheme_is_shifted_little() -> None:
     given = identifier(law=STATED)
-    estimate = given.settled(
+    estimate = given._settled(
         ran(given, samples())
     )  # else the last refit leaves as much to a later one
     actual = estimate.q - reference().q

@@ -34,13 +34,13 @@ def run(data_dir):
 @pytest.mark.parametrize("month", ["", "June"])
 def test_soil_with_offsets_meets_the_withheld_sensor(run, month):
     found = run("soil_offsets", month)
-    assert found["rmse.withheld"] <= 0.25
+    assert found["rmse.validation"] <= 0.25
     assert found["innovation_ratio"] <= 4
 
 
 def test_uniform_soil_is_visibly_worse(run):
     found = run("soil_uniform")
-    assert found["rmse.withheld"] >= 0.28
+    assert found["rmse.validation"] >= 0.28
     assert found["rmse"] >= 1.5 * run("soil_offsets")["rmse"]
 
 

@@ -66,7 +66,7 @@ def identifier(law: Any = None, **k: Any) -> lp.Identifier:
 def ran(given: lp.Identifier, taken: Any = None) -> lp.Estimate:
     for t, z, inputs in taken or rows():
         estimate = given.step(t, z, inputs)
-    return given.settled(estimate)
+    return given._settled(estimate)
 
 
 def parts_of(given: lp.Identifier) -> np.ndarray[Any, Any]:

@@ -216,7 +216,7 @@ def taken(identifier: lp.Identifier, samples: list[tuple[Any, ...]]) -> Numbers:
     found: Numbers = []
     for sample in samples:
         estimate = identifier.step(*sample)
-        belief = identifier.latent_belief()
+        belief = identifier._latent_belief()
         arrays = (estimate.q, estimate.u, estimate.innovation, belief.q_factor, belief.u_factor)
         seen = tuple(None if array is None else array.tobytes() for array in arrays)
         notes = {name: float(value).hex() for name, value in estimate.diagnostics.named().items()}

@@ -509,7 +509,7 @@ def test_the_worst_finding_decides_and_none_is_said_twice():
 def test_what_was_not_judged_is_never_trusted():
     """Neither with notes nor with a caution, which says more than is known; it may be worse."""
     note, caution = Finding("noise", "note", "n"), Finding("flat", "caution", "f")
-    grave = Finding("withheld", "do not trust", "w")
+    grave = Finding("validation", "do not trust", "w")
     for found in ([], [note], [note, caution]):
         one = Verdict.of(found, ["innovations: none"], judged=False)
         assert one.level == "not judged"

@@ -194,7 +194,7 @@ def _judged(scene: Scene, score: Score) -> Score:
             delay = k - half if estimate.verdict.level != "trusted" else -1
     if estimate is None:
         raise ValueError("a run of the census has no samples.")
-    estimate = identifier.settled(estimate)  # as at the end of a run
+    estimate = identifier._settled(estimate)  # as at the end of a run
     verdict = estimate.verdict
     kinds = about.kinds if about else ()
     return replace(

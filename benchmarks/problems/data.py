@@ -37,7 +37,7 @@ class Process:
         Coefficients of the exact parameter at each time, shape (times, m); None for a real
         process, of which nobody knows them.
     hidden
-        Measured values of the withheld sensors, shape (times, withheld).
+        Measured values of the validation sensors, shape (times, withheld).
     weights
         Gram matrix of Z, shape (sensors, sensors); None: Euclidean.
     """

@@ -55,7 +55,7 @@ def _process(_: int) -> Process:
 
 SOIL = Problem(
     name="soil",
-    summary="Soil, April 2025: a diffusivity for each layer; scored by a withheld sensor",
+    summary="Soil, April 2025: a diffusivity for each layer; scored by a validation sensor",
     make=_process,
     levels=(None,),
 )

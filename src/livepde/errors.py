@@ -46,7 +46,17 @@ __all__ = [
 
 
 class LivepdeError(Exception):
-    """Base of everything livepde raises on purpose; the message has place, problem and remedy."""
+    """Base of everything livepde raises on purpose; the message has place, problem and remedy.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> try:
+    ...     lp.LogNormal(-1.0, std=0.1)
+    ... except lp.LivepdeError as error:
+    ...     print(type(error).__name__)
+    SpaceError
+    """
 
 
 class ConfigurationError(LivepdeError, ValueError):

@@ -235,7 +235,7 @@ def layout_of(
 ) -> Layout:
     """Return names, units and coordinates of the records of a run.
 
-    `ignored`: names of withheld sensors that never count.
+    `ignored`: names of validation sensors that never count.
     """
     numbers: dict[str, dict[str, Any]] = {}
     for label in model.parameter_space.labels:

@@ -129,6 +129,19 @@ class Identifier(Shown):
     ------
     ConfigurationError
         Parts that do not fit together.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> identifier = lp.Identifier(rod, sensors, u0=1.0)
+    >>> for t, reading in [(0.5, 0.93), (1.0, 0.81), (2.0, 0.64)]:
+    ...     estimate = identifier.step(t, {"T_50": reading})
+    >>> low, high = estimate["alpha"].interval()
+    >>> low < estimate["alpha"].median < high
+    True
     """
 
     def __init__(
@@ -175,12 +188,15 @@ class Identifier(Shown):
                 )
         self._channels = Channels(model.channels, self.observed, self.withheld)
         # Positions of moving sensors are no inputs of the process: they move on lines.
-        held = Held.of(between or {}, [c for c in self.inputs if c not in self.optional_inputs])
+        held = Held.of(between or {}, [c for c in self.inputs if c not in self._optional_inputs])
         # The first steps after the start are short where intervals have to hold their error.
         start = float(t0) if law.graded_start else math.nan
         control = Advance(scheme or law.scheme, dt_max, halvings, held, start=start)
-        noise, readings = self._input_noise(input_noise or {}), self.initial_readings(u0_from or {})
-        errors = self.initial_errors(u0_errors)
+        noise, readings = (
+            self._input_noise(input_noise or {}),
+            self._initial_readings(u0_from or {}),
+        )
+        errors = self._initial_errors(u0_errors)
         self.problem = Problem(model, self.observed, control, noise, readings, errors, u0)
         self.assimilate_from = assimilate_from
         self._work = law.prepare(self.problem)
@@ -207,7 +223,7 @@ class Identifier(Shown):
         _, model = self.model._shown()
         rows = {name: text for name, text in model.items() if name.startswith("unknown ")}
         rows = {"equation": model["equation"], **rows, "law": options_of(self.law)}
-        for kind, sensors in (("sensors", self.observed), ("withheld", self.withheld)):
+        for kind, sensors in (("sensors", self.observed), ("validation", self.withheld)):
             if sensors is not None:
                 rows[kind] = listed(sensors.names)
         if self.inputs:
@@ -221,7 +237,7 @@ class Identifier(Shown):
         parts = self.law, self.problem, self.withheld
         return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
 
-    def started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
+    def _started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
         """Return an identifier of the same parts with another start; for `Fleet.identifier`.
 
         Latent parameter, state and its own errors have the shapes (m,), (n,) and (errors, n).
@@ -232,7 +248,7 @@ class Identifier(Shown):
         other._fingerprint = other._lazy_fingerprint()
         return other
 
-    def placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
+    def _placed(self, state: Any, ends: Mapping[str, Array], samples: int) -> Identifier:
         """Return an identifier of the same parts in another state; for `Fleet.identifier`.
 
         `state` is None before the first sample; `ends` is that of one member in `Fleet.ends`.
@@ -264,7 +280,7 @@ class Identifier(Shown):
                 )
         return dict(given)
 
-    def initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
+    def _initial_readings(self, u0_from: Mapping[str, Any]) -> dict[str, InitialReading]:
         """Return the readings that u0 was made of, each with the derivative of u0 in it."""
         known = {*self.observed.names, *self.model.channels}
         for name in u0_from:
@@ -280,7 +296,7 @@ class Identifier(Shown):
             found[name] = InitialReading(space.interpolate(weight), check_noise(name, noise))
         return found
 
-    def initial_errors(self, u0_errors: Iterable[Any]) -> Array:
+    def _initial_errors(self, u0_errors: Iterable[Any]) -> Array:
         """Return coefficients of the errors of u0, shape (errors, n)."""
         space = self.model.state_space
         found = np.array([space.interpolate(error) for error in u0_errors])
@@ -333,7 +349,7 @@ class Identifier(Shown):
         return self._channels.inputs
 
     @property
-    def optional_inputs(self) -> frozenset[str]:
+    def _optional_inputs(self) -> frozenset[str]:
         """Inputs that may be missing: positions of moving sensors."""
         return self._channels.optional
 
@@ -350,8 +366,8 @@ class Identifier(Shown):
         t
             Time in the unit of the model, or a date; the first date is at t0.
         z, inputs
-            As of a `Sample`: an array in the order of the sensors, a mapping or a row of a pandas
-            table by names.
+            As of a `Sample`: an array in the order of the sensors, or a mapping by names. In a row
+            of a pandas table that has all channels, other columns are ignored.
 
         Returns
         -------
@@ -381,7 +397,7 @@ class Identifier(Shown):
         t = self._time_of_next(t)
         measured, noise, withheld, named = self._channels.parse(z, inputs or {})
         if noise is not None:
-            self.check_weighs(noise)
+            self._check_weighs(noise)
         values, held = self._filled(named)
         unstated = self._begun_by(values, t) if self._state is None else ()
         # Spin-up: inputs drive the state, readings are only compared with it.
@@ -495,19 +511,19 @@ class Identifier(Shown):
         return unstated
 
     @property
-    def place(self) -> tuple[Any, ...]:
+    def _place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
         ledgers = self._withheld, self._gaps, self._steps, self._origin
         inputs = self._inputs, self._known
         return self._state, self._t, self._z, inputs, self._samples, ledgers
 
-    def return_to(self, place: tuple[Any, ...]) -> None:
+    def _return_to(self, place: tuple[Any, ...]) -> None:
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, inputs, self._samples, ledgers = place
         self._inputs, self._known = inputs
         self._withheld, self._gaps, self._steps, self._origin = ledgers
 
-    def check_weighs(self, noise: Array | None) -> None:
+    def _check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
         if noise is not None and not self.law.weighs_readings():
             raise SampleError(
@@ -515,7 +531,7 @@ class Identifier(Shown):
                 "of the samples."
             )
 
-    def latent_belief(self) -> Belief:
+    def _latent_belief(self) -> Belief:
         """Return the belief of the law: q and its factor in latent coefficients.
 
         Those are the coefficients of `Model.Q`: of logarithms, say, or of harmonics.
@@ -524,7 +540,7 @@ class Identifier(Shown):
         return belief
 
     def _belief(self) -> Belief:
-        return self.problem.physical(self.latent_belief())
+        return self.problem.physical(self._latent_belief())
 
     def _estimate(
         self,
@@ -570,7 +586,7 @@ class Identifier(Shown):
     def _judge(
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
-        """Return the verdict of the law with the findings on steps, withheld sensors and gaps."""
+        """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
         withheld, gaps, steps = self._withheld, self._gaps, self._steps
         names, ignored = self.withheld.names if self.withheld is not None else (), self.ignored
         inputs = self._channels.inputs
@@ -606,7 +622,7 @@ class Identifier(Shown):
         report = Report(Status(), predicted, diagnose=known)
         return self._estimate(self._t, nothing, hidden, self._inputs, report, ())
 
-    def settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
+    def _settled(self, estimate: Estimate, *, columns: bool = True) -> Estimate:
         """Return the last estimate after a fit of all stored samples, for the end of a run.
 
         The identifier does not change: the next sample finds it as it was. See `refit`.
@@ -805,7 +821,7 @@ class Identifier(Shown):
             if on_estimate is not None:
                 on_estimate(estimate)
         if result.last is not None:
-            result.settle(self.settled(result.last))
+            result._settle(self._settled(result.last))
             noise = self.law.reading_noise(self._work, self._state)
             if noise is not None and not begun._samples and not self.model.latent.moves:
                 result.expected = partial(begun._expected, taken, noise)
@@ -822,7 +838,7 @@ class Identifier(Shown):
             return cast("Iterable[Any]", data)
         from livepde.streams.given import Reading
 
-        optional = [name for name in self.inputs if name in self.optional_inputs]
+        optional = [name for name in self.inputs if name in self._optional_inputs]
         needed = [name for name in self.channels if name not in optional]
         units = {
             name: unit
@@ -849,7 +865,7 @@ class Identifier(Shown):
         return replace(layout, attrs={**layout.attrs, "origin": self.origin.isoformat(sep=" ")})
 
     @property
-    def unsmoothed(self) -> str:
+    def _unsmoothed(self) -> str:
         """Why the law smooths nothing; empty if it does."""
         return self.law.unsmoothed(self._work)
 
@@ -882,7 +898,7 @@ class Identifier(Shown):
                 "smoothed takes a run from its first sample on: call it of an identifier that has "
                 "taken none."
             )
-        if why := self.unsmoothed:
+        if why := self._unsmoothed:
             raise LawError(f"smoothed: {why}; use SensitivityLaw.")
         stream = self._samples_of(stream, {})
         who, run, before = copy.copy(self), Hindsight(self._q0), self._state
@@ -891,7 +907,7 @@ class Identifier(Shown):
             estimate, interval = who._taken(sample.t, sample.z, sample.inputs)
             if before is None:  # the law begins with the first sample
                 before = self._start(Inputs(interval.inputs0))
-            run.add(estimate, interval, who.latent_belief().q)
+            run.add(estimate, interval, who._latent_belief().q)
         result = Result(
             self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
         )
@@ -912,7 +928,7 @@ class Identifier(Shown):
         latent = self.model.latent
         centre = latent.inverse(q)
         found = LinearReadings(np.array([latent.inverse(draw) for draw in draws]) - centre)
-        who = self.started(centre, self._u0, self.problem.initial_errors)
+        who = self._started(centre, self._u0, self.problem.initial_errors)
         who._state = None
         if not who.inputs:
             who._begin(who._inputs)
@@ -923,7 +939,7 @@ class Identifier(Shown):
             estimate, interval = who._taken(sample.t, nothing, inputs)
             std = noise if own is None else np.where(np.isnan(own), noise, own)
             used = estimate.status.ok and estimate.t >= self.assimilate_from
-            latent_factor = who.latent_belief().q_factor
+            latent_factor = who._latent_belief().q_factor
             belief = who._belief()
             predicted = self.observed.predict(belief.u, belief.q, interval.end)
             rows = seen_rows(self.observed, belief, interval.end)

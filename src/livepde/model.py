@@ -126,6 +126,18 @@ class Model(Shown):
     -----
     UserWarning
         The diffusion is negative at the prior mean.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> mesh = lp.interval(0.0, 1.0, 20)
+    >>> model = lp.Model(  # u_t = div(k grad u)
+    ...     state=lp.Field(mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T_left")}),
+    ...     parameter={"k": lp.LogNormal(0.1, std=0.05)},
+    ...     A=lambda q, u, v, x: q.k * lp.dot(lp.grad(u), lp.grad(v)),
+    ... )
+    >>> model.channels
+    ('T_left',)
     """
 
     def __init__(

@@ -229,7 +229,7 @@ class RecordArrays:
 
     @property
     def withheld_error(self) -> Array:
-        """Errors of the withheld sensors, shape (samples, withheld)."""
+        """Errors of the validation sensors, shape (samples, withheld)."""
         return self._table(self._error)
 
     @property

@@ -70,7 +70,7 @@ class Estimate(Shown):
         For `GradientLaw`, which pulls the state to the sample within the step, the output error
         after the step.
     withheld_error
-        Measured minus estimated of each withheld channel.
+        Measured minus estimated of each validation channel.
     status
         Status of the step; unless ok, q and u are those of the last successful step.
     steps
@@ -88,6 +88,16 @@ class Estimate(Shown):
         Function that returns the verdict of the law on the run so far; see `verdict`.
     fit
         The last fit of all stored samples; None before it, and for laws without.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> estimate = lp.Identifier(rod, sensors, u0=1.0).step(1.0, {"T_50": 0.81})
+    >>> sorted(estimate.parameters), estimate.u.shape
+    (['alpha'], (9,))
     """
 
     t: float
@@ -302,7 +312,18 @@ class Result(Shown):
     count
         Number of earlier estimates, not all of which need be kept; default that of the records.
     ignored
-        Names of withheld sensors that never count, for the default layout.
+        Names of validation sensors that never count, for the default layout.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> sensors = lp.Points({"T_50": 0.5}, noise=0.01)
+    >>> data = [(0.5, [0.93]), (1.0, [0.81]), (2.0, [0.64])]
+    >>> result = lp.Identifier(rod, sensors, u0=1.0).run(data)
+    >>> len(result), list(result.summary().index)
+    (3, ['alpha'])
     """
 
     def __init__(
@@ -363,10 +384,10 @@ class Result(Shown):
 
     def add(self, estimate: Estimate) -> None:
         """Add one estimate."""
-        self.records.append(self.record(estimate, self._keeps))
+        self.records.append(self._record(estimate, self._keeps))
         self._follow(estimate)
 
-    def announce(self, estimate: Estimate) -> bool:
+    def _announce(self, estimate: Estimate) -> bool:
         """Count an estimate whose record is stored later; return whether it keeps its fields."""
         keeps = self._keeps
         self._follow(estimate)
@@ -382,13 +403,13 @@ class Result(Shown):
         self._settled, self._ended = None, False
         self.last = estimate
 
-    def settle(self, estimate: Estimate) -> None:
-        """Take the last parameter and state from `Identifier.settled`, in tables and datasets."""
+    def _settle(self, estimate: Estimate) -> None:
+        """Take the last parameter and state from the end of a run, in tables and datasets."""
         self._ended = True
         if estimate is not self.last:
             self.last, self._settled = estimate, estimate.belief
 
-    def record(self, estimate: Estimate, keeps: bool) -> Record:
+    def _record(self, estimate: Estimate, keeps: bool) -> Record:
         """Return the record of an estimate; `keeps`: with its fields."""
         return Record(
             t=estimate.t,
@@ -398,10 +419,10 @@ class Result(Shown):
             status=STATUS_CODES.index(estimate.status.code),
             steps=estimate.steps,
             notes=estimate.diagnostics.named(),
-            snapshot=self.snapshot(estimate) if keeps else None,
+            snapshot=self._snapshot(estimate) if keeps else None,
         )
 
-    def snapshot(self, estimate: Estimate) -> Snapshot:
+    def _snapshot(self, estimate: Estimate) -> Snapshot:
         """Return the fields at the vertices."""
         return snapshot_of(self.model, estimate.belief)
 
@@ -548,7 +569,7 @@ class Result(Shown):
 
     @property
     def measured(self) -> pd.DataFrame:
-        """Readings of the assimilated and then of the withheld sensors, one row for each sample.
+        """Readings of the assimilated and then of the validation sensors, one row for each sample.
 
         Raises
         ------
@@ -621,12 +642,12 @@ class Result(Shown):
             return records, last
         if self.last is not None and self._settled is not None:
             snapshot = (
-                None if records.last_snapshot < len(records) - 1 else self.snapshot(self.last)
+                None if records.last_snapshot < len(records) - 1 else self._snapshot(self.last)
             )
             records = records.with_last(np.array(self._readout(self._settled)), snapshot)
         if self.last is not None and records.last_snapshot < len(records) - 1:
             # The last fields are part of the dataset, also where `fields_every` has left them out.
-            last = self.snapshot(self.last)
+            last = self._snapshot(self.last)
         return records, last
 
     def __getstate__(self) -> dict[str, Any]:

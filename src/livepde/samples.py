@@ -21,7 +21,7 @@ from livepde.observation import Observed
 from livepde.stepping import own_noise
 
 Readings: TypeAlias = ArrayLike | Mapping[str, Any]
-# Values of the withheld sensors if there are none.
+# Values of the validation sensors if there are none.
 NOTHING = np.zeros(0)
 
 
@@ -35,11 +35,17 @@ class Sample:
         Time, in the unit of the model.
     z
         Measurements: an array of shape (sensors,), or channel name -> value for everything that
-        was measured at t (sensors, inputs, withheld channels). NaN or absent: missing. A sensor
+        was measured at t (sensors, inputs, validation channels). NaN or absent: missing. A sensor
         may have a pair (value, standard deviation of its noise), an array the shape (sensors, 2),
         and a mapping the noise by itself: "noise of T_1". NaN: the noise that the sensor states.
     inputs
         Input and boundary channels, if they are not in z.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Sample(60.0, {"T_10": 20.5, "T_left": 31.0}).t
+    60.0
     """
 
     t: float
@@ -230,7 +236,7 @@ class Channels:
     forced
         Channels that the model reads.
     observed, withheld
-        Assimilated sensors, and withheld sensors, which are only scored.
+        Assimilated sensors, and validation sensors, which are only scored.
 
     Raises
     ------
@@ -246,7 +252,7 @@ class Channels:
         both = [name for name in self.hidden if name in self.observed.names]
         if both:
             raise ConfigurationError(
-                f"channels {both} are both assimilated and withheld: rename the "
+                f"channels {both} are both assimilated and for validation: rename the "
                 'sensors, as in Points({"T_30": 0.3}).'
             )
         if taken := [name for name in self.inputs if name in self.noise]:
@@ -256,7 +262,7 @@ class Channels:
 
     @cached_property
     def hidden(self) -> tuple[str, ...]:
-        """Names of the withheld sensors."""
+        """Names of the validation sensors."""
         return self.withheld.names if self.withheld else ()
 
     @cached_property
@@ -300,7 +306,9 @@ class Channels:
         The noise is None if no value has one of its own, NaN where one has none. Among the inputs
         may be other channels.
         """
-        z = z if isinstance(z, (np.ndarray, dict)) else labelled(z)
+        if not isinstance(z, (np.ndarray, dict)):
+            row = labelled(z)
+            z = row if row is z else self._columns(row)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
             measured, noise, withheld, named = self._by_name(z, inputs)
         else:
@@ -308,8 +316,17 @@ class Channels:
             withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
         return measured, noise, withheld, named | self._named(inputs) if inputs else named
 
+    def _columns(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return a row of a table without the columns that are no channel, as `run` reads a table.
+
+        A row that lacks a channel keeps them: one may be this channel with a misspelt name.
+        """
+        if not (set(self.names) - self.optional).issubset(row):
+            return row
+        return {name: value for name, value in row.items() if name in self._known}
+
     def readings(self, samples: Sequence[Sample]) -> Array:
-        """Return the readings of assimilated and withheld sensors, shape (samples, sensors)."""
+        """Return the readings of assimilated and validation sensors, shape (samples, sensors)."""
         rows = [self.parse(sample.z, sample.inputs or {}) for sample in samples]
         shape = len(samples), self.observed.size + len(self.hidden)
         return np.reshape([[*measured, *hidden] for measured, _, hidden, _ in rows], shape)

@@ -96,7 +96,7 @@ class Prepared:
         """The identifier, before the first sample."""
         law = self.case.law
         identifier = self.identifier_with(law.live() if self.live else law)
-        if self.case.spec.output.smoothed and (why := identifier.unsmoothed):
+        if self.case.spec.output.smoothed and (why := identifier._unsmoothed):
             raise self.case.error("output.smoothed", f"{why}; leave it out.")
         return identifier
 
@@ -319,7 +319,7 @@ class Case(CaseContent):
     @cached_property
     def withheld(self) -> Observation | None:
         """The sensors that are predicted only, withheld or ignored; None if there are none."""
-        return observation_of(self, "withheld", "ignored")
+        return observation_of(self, "validation", "ignored")
 
     @property
     def ignored(self) -> tuple[str, ...]:

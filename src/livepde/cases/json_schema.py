@@ -149,7 +149,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "std": "Standard deviation of the error, in the unit of the channel.",
     },
     "ChannelSpec": {
-        "role": "sensor: assimilated. withheld: predicted only, for validation. ignored: shown "
+        "role": "sensor: assimilated. validation: predicted only. ignored: shown "
         "only. boundary: value of the state there. input: read by the equation. position: of a "
         "sensor that moves.",
         "column": "Column of the data; {} is replaced by the numbers of a family of sensors.",

@@ -217,6 +217,6 @@ class MemberBlock:
             )
             if self._taken:
                 result.last = identifier.estimate()
-                result.settle(identifier.settled(result.last))
-                journal.keep(result.snapshot(result.last))
+                result._settle(identifier._settled(result.last))
+                journal.keep(result._snapshot(result.last))
             yield identifier, Driven(result, journal, self.status, self.error)

@@ -77,7 +77,7 @@ bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
 [channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
 T_left = {{ role = "boundary", column = "T_left", at = "left" }}
 T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
-T_20 = {{ role = "withheld", column = "T_20", at = "20 cm" }}    # only scored
+T_20 = {{ role = "validation", column = "T_20", at = "20 cm" }}    # only scored
 T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
 T_right = {{ role = "boundary", column = "T_right", at = "right" }}
 
@@ -288,7 +288,7 @@ def _inputs(found: list[FoundChannel]) -> Iterator[str]:
 
 def _channels(equation: Equation, found: list[FoundChannel]) -> Iterator[str]:
     """Yield the lines of [channels], with comments on their options."""
-    yield f'# Remove what is not {equation.state.text}. role = "withheld": for validation only.'
+    yield f'# Remove what is not {equation.state.text}. role = "validation": predicted only.'
     for name, quantity in equation.quantities.items():
         yield f'# Instead of at = ...: quantity = "{name}", the {quantity.text}.'
     if equation.takes_values:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from livepde.cases.case import Prepared
-from livepde.diagnostics.information_gain import identifiability
+from livepde.diagnostics.information_gain import information_gains
 from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 from livepde.identifier import Identifier
@@ -123,7 +123,7 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     identifier = prepared.identifier_with(linear)
     count, estimate = _assimilated(identifier, samples, prepared.assimilate_from)
     model = prepared.case.model
-    belief = identifier.latent_belief()
+    belief = identifier._latent_belief()
     prior, posterior = belief.prior_factor, belief.q_factor
     if not count or estimate is None or prior is None or posterior is None:
         return Preview()
@@ -136,7 +136,7 @@ def _told(prepared: Prepared, linear: SensitivityLaw, samples: Iterable[Sample])
     )
     told = tuple(_compare(prepared, before, after))
     sentences = (
-        *identifiability(model, belief).sentences,
+        *information_gains(model, belief).sentences,
         *_shifted(estimate.diagnostics.shifts, {item.name: item.posterior for item in told}),
         *estimate.verdict.unseen,
     )
@@ -371,7 +371,7 @@ def _previewed(
         identifier.step(sample.t, z, sample.inputs)
         if seen and sample.t >= prepared.assimilate_from:
             count += 1
-            yield identifier.latent_belief()
+            yield identifier._latent_belief()
         if count >= MOST_SAMPLES:
             break
 

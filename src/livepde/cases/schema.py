@@ -48,7 +48,7 @@ from livepde.streams.csvfile import UTF_8
 from livepde.streams.intake import Policy
 from livepde.streams.mqtt import Broker
 
-SENSORS = ("sensor", "withheld", "ignored")  # roles of channels that measure the state
+SENSORS = ("sensor", "validation", "ignored")  # roles of channels that measure the state
 
 
 class Spec(BaseModel):
@@ -305,7 +305,7 @@ FLUX = "flux"  # quantity of a sensor that measures a flux
 class ChannelSpec(Spec):
     """One channel of the stream and its role."""
 
-    role: Literal["boundary", "sensor", "withheld", "ignored", "input", "position"]
+    role: Literal["boundary", "sensor", "validation", "ignored", "input", "position"]
     column: Name | None = None
     columns: tuple[Name, ...] | None = None
     at: Quantity | tuple[Quantity, ...] | None = None

@@ -35,7 +35,7 @@ EVERY = 1_000_000_000  # fields are not compared
 AS_STATED = "as stated"
 GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 1
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
-WORSE = 0.02  # share by which the error of withheld sensors may grow: about its own error
+WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
 MOST = 12  # variants that the program chooses
 PLACE = 0.01  # of the length of the domain: how far off a sensor may be
 SAMPLES = 64  # in which a source moves the state by the usual error
@@ -99,7 +99,7 @@ class VariantRun:
         Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
         one step ahead, second half of the samples.
     errors, withheld
-        Assimilated and withheld sensor -> root mean square of its errors one step ahead, second
+        Assimilated and validation sensor -> root mean square of its errors one step ahead, second
         half of the samples.
     unknowns
         How many numbers were unknown; of a field the number of modes.
@@ -129,7 +129,7 @@ class VariantRun:
 
     @property
     def withheld_error(self) -> float:
-        """Root mean square over the withheld sensors; NaN if there are none."""
+        """Root mean square over the validation sensors; NaN if there are none."""
         return _pooled(self.withheld.values())
 
     @property
@@ -236,7 +236,7 @@ def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Res
     for sample in samples:
         result.add(who.step(sample.t, sample.z, sample.inputs))
     if result.last is not None:
-        result.settle(who.settled(result.last, columns=columns))
+        result._settle(who._settled(result.last, columns=columns))
     return result
 
 
@@ -298,7 +298,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
         readings=readings,
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
-        withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "withheld"},
+        withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "validation"},
         estimates=estimates,
         unknowns=len(labels) + sum(modes),
     )
@@ -327,7 +327,7 @@ def _misfits(data: xr.Dataset) -> dict[str, float]:
 
 
 def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
-    """Return the variant with the best evidence that predicts the withheld sensors no worse.
+    """Return the variant with the best evidence that predicts the validation sensors no worse.
 
     Of several whose evidence is no strong one against each other it is the one with the fewest
     unknowns; the case itself if none has strong evidence against it.
@@ -341,7 +341,7 @@ def recommended(base: VariantRun, others: Sequence[VariantRun]) -> VariantRun:
 
 
 def _worse(one: VariantRun, base: VariantRun) -> bool:
-    """Return whether a run predicts one of the withheld sensors worse than another run does.
+    """Return whether a run predicts one of the validation sensors worse than another run does.
 
     Each sensor counts: they may have different units, and one may not hide behind another.
     """
@@ -349,7 +349,7 @@ def _worse(one: VariantRun, base: VariantRun) -> bool:
 
 
 def _worse_at(one: VariantRun, name: str, error: float) -> bool:
-    """Return whether a run predicts a withheld sensor worse than with this error, or not at all."""
+    """Return whether a run predicts a validation sensor worse than by this error, or not."""
     limit = error * (1.0 + WORSE)
     return math.isfinite(error) and not one.withheld.get(name, math.nan) <= limit
 
@@ -379,7 +379,7 @@ def _failures(others: Sequence[VariantRun]) -> Iterator[str]:
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
     if best is base:
-        which = " that predicts the withheld sensors as well" if base.withheld else ""
+        which = " that predicts the validation sensors as well" if base.withheld else ""
         return (
             f"Recommended: the case, unchanged. No variant{which} gains more than {GAINED:g} of "
             "log evidence."
@@ -390,9 +390,9 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
     )
     if math.isfinite(base.withheld_error):
         errors = f"{best.withheld_error:.3g} instead of {base.withheld_error:.3g}"
-        text += f" Its error at the withheld sensors is {errors}."
+        text += f" Its error at the validation sensors is {errors}."
     else:
-        text += " No withheld sensor confirms it."
+        text += " No validation sensor confirms it."
     return text
 
 
@@ -406,7 +406,7 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
                 if _worse_at(one, name, error)
             )
             yield (
-                f"'{one.variant.name}' fits the assimilated sensors better and predicts withheld "
+                f"'{one.variant.name}' fits the assimilated sensors better and predicts validation "
                 f"ones worse ({', '.join(errors)}): it is not recommended."
             )
     refuted = [f"'{one.variant.name}'" for one in others if one.gained(base) < -GAINED]

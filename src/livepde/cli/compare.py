@@ -64,8 +64,8 @@ def compare(
 ) -> None:
     """Run variants of a case side by side, and recommend one.
 
-    The recommended variant has the best evidence of those that do not predict the withheld sensors
-    worse. No run directory is written.
+    The recommended variant has the best evidence of those that do not predict the validation
+    sensors worse. No run directory is written.
 
     Example:  livepde compare mycase/case.toml
     By hand:  livepde compare mycase/case.toml --variant "offset: channels.T_10.offset='0.2 K'"
@@ -197,7 +197,14 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
                 *cells,
             )
         )
-    columns = ("variant", "verdict", "log evidence", "misfit / noise", "withheld RMSE", "unknowns")
+    columns = (
+        "variant",
+        "verdict",
+        "log evidence",
+        "misfit / noise",
+        "validation RMSE",
+        "unknowns",
+    )
     title = "Variants (* recommended; log evidence relative to the case)"
     tables = [Table(title, (*columns, "overlaps", *labels), rows)]
     more = [

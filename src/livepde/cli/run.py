@@ -373,7 +373,7 @@ def _traded(loaded: Case, identifier: Identifier) -> list[str]:
 
     if not isinstance(loaded.law, SensitivityLaw):
         return []
-    return identifiability(loaded.model, identifier.latent_belief()).sentences
+    return identifiability(identifier).sentences
 
 
 @dataclass(frozen=True)

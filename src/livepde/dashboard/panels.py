@@ -113,7 +113,7 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
         shown = [name for name in names if units[name] == unit]
         about = "Points: readings. Lines: what the model expected of them one step ahead."
         if any(name in data["withheld"] for name in shown if "withheld" in data):
-            about += " Dashed: withheld sensors, which it never uses."
+            about += " Dashed: validation sensors, which it never uses."
         if len(shown) > MOST_LINES:
             about += f" The first {MOST_LINES} of {len(shown)} sensors."
         title = f"Measured and modelled{f', {unit}' if len(set(units.values())) > 1 else ''}"
@@ -152,7 +152,7 @@ def measured(
                 showlegend=False,
                 **about,
             )
-            label = text(f"{name} (withheld)" if withheld else name)
+            label = text(f"{name} (validation)" if withheld else name)
             dash = "dash" if withheld else None
             mode = "lines+markers" if len(t) == 1 else "lines"
             line(
@@ -222,10 +222,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
             )
         title = "Sensors: measured − predicted"
         return Panel(variable, "sensors", title, about + _crowd(data, dimension), figure)
-    about = (
-        "Measured minus estimated, of the validation sensors (withheld), which the estimate does "
-        "not use."
-    )
+    about = "Measured minus estimated, of the validation sensors, which the estimate does not use."
     about += _crowd(data, dimension)
     return Panel(variable, "sensors", "Validation sensors: measured − estimated", about, figure)
 

@@ -25,7 +25,7 @@ from livepde.runs.journal import Event
 T = TypeVar("T")
 
 # Errors of sensors -> name of their readings in the dataset of a view, which no unknown has.
-READINGS = {"innovation": "readings of sensors", "withheld_error": "readings of withheld sensors"}
+READINGS = {"innovation": "readings of sensors", "withheld_error": "readings of validation sensors"}
 ROWS = 2000  # estimates that are kept to be drawn
 NOTABLE = 500  # failed steps and jumps that are kept beside them
 FIELDS = 400  # snapshots
@@ -111,7 +111,7 @@ class RunView:
 
 
 def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
-    """Return a dataset with the readings of its sensors and withheld sensors, `READINGS`.
+    """Return a dataset with the readings of its sensors and validation sensors, `READINGS`.
 
     `readings`: shape (time, sensors), the withheld ones last.
     """

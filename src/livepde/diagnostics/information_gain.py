@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from livepde.errors import ConfigurationError
+from livepde.identifier import Identifier
 from livepde.laws import Belief
 from livepde.linalg import Array
 from livepde.model import Model
@@ -114,8 +115,8 @@ class Identifiability:
         return found
 
 
-def identifiability(model: Model, belief: Belief) -> Identifiability:
-    """Compare a belief in latent coefficients, `Identifier.latent_belief()`, with its prior.
+def identifiability(identifier: Identifier) -> Identifiability:
+    """Compare the estimates of an identifier with their priors.
 
     Raises
     ------
@@ -134,10 +135,15 @@ def identifiability(model: Model, belief: Belief) -> Identifiability:
     >>> identifier = lp.Identifier(model, lp.Points([0.5], noise=0.01), lp.SensitivityLaw(), u0=1.0)
     >>> for t in (1.0, 2.0, 3.0):
     ...     _ = identifier.step(t, [1.0])
-    >>> (found,) = identifiability(model, identifier.latent_belief()).pairs
+    >>> (found,) = identifiability(identifier).pairs
     >>> found[:2]
     ('a', 'b')
     """
+    return information_gains(identifier.model, identifier._latent_belief())
+
+
+def information_gains(model: Model, belief: Belief) -> Identifiability:
+    """Compare a belief in latent coefficients with its prior, as `identifiability` does."""
     prior, posterior = belief.prior_factor, belief.q_factor
     if prior is None or posterior is None:
         raise ConfigurationError(

@@ -192,7 +192,7 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         columns = " and ".join(channel.sources)
         text = f"Channel of role {channel.role}, as column {columns} of the data."
         ports[name] = Port(name, unit, text, column)
-    withheld = case.roles("withheld", "ignored")
+    withheld = case.roles("validation", "ignored")
     return UnitProcess(
         case.name,
         case.title,

@@ -42,7 +42,16 @@ Predicate: TypeAlias = Callable[[Array], Any]
 
 @dataclass(frozen=True)
 class Channel:
-    """A value supplied by the stream, identified by the name of its channel."""
+    """A value supplied by the stream, identified by the name of its channel.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> ends = {"left": lp.Channel("T_left")}
+    >>> heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), ends).channels
+    ('T_left',)
+    """
 
     name: str
 
@@ -97,6 +106,13 @@ def interval(
     through
         Points that must be nodes of the mesh: the nearest inner node is moved to each, so that a
         `Subdomain`, a layer or a sensor ends at a node.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.interval(0.0, 0.4, 40).nelements
+    40
+    >>> graded = lp.interval(0.1, 1000.0, 60, geometric=True)
     """
     if not stop > start or cells < 1 or cells != int(cells):
         raise SpaceError(
@@ -239,6 +255,15 @@ class Field(_Declared):
     periodic
         Pairs of boundaries of equal shape, as in (("left", "right"),), whose coefficients are
         identified.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> mesh = lp.interval(0.0, 1.0, 20)
+    >>> state = lp.Field(
+    ...     mesh, lp.linear(mesh), dirichlet={"left": lp.Channel("T_left")}, unit="degC"
+    ... )
+    >>> source = lp.Field(mesh, lp.linear(mesh), prior=lp.Normal(0.0, std=1.0), inner="H1")
     """
 
     mesh: Mesh
@@ -362,6 +387,12 @@ class Scalar(_Declared):
     corrects
         True for a correction of an input, as an offset of a boundary value. As for those of
         sensors, how well it is known does not change the level of a verdict.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Scalar(lp.LogNormal(1e-4, std=5e-5), unit="m^2/s").unit
+    'm^2/s'
     """
 
     prior: Prior
@@ -388,6 +419,14 @@ class Piecewise(_Declared):
     own
         Name of a region -> prior of a constant that holds there instead, or a `Scalar` with prior,
         evolution and within. The unknown then needs a name: parameter={"k": Piecewise(...)}.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> layers = {"sand": lambda x: x[0] < 0.2, "clay": lambda x: x[0] >= 0.2}
+    >>> k = lp.Piecewise(layers, lp.LogNormal(1.5, std=0.5), unit="W/(m K)")
+    >>> list(k.regions)
+    ['sand', 'clay']
     """
 
     regions: Mapping[str, Predicate | str]
@@ -427,6 +466,12 @@ class Scalars(_Declared):
     """One unknown number for each name, with a common prior, such as an offset of each sensor.
 
     Forms and sensors see a mapping, q.offset["T_10"]. The other options are those of `Scalar`.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Scalars(["T_10", "T_30"], lp.Normal(0.0, std=0.2), unit="K").names
+    ['T_10', 'T_30']
     """
 
     names: Sequence[str]

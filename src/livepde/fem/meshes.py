@@ -55,7 +55,14 @@ QUADRATIC: dict[Any, Any] = {
 
 
 def linear(mesh: Mesh) -> Element:
-    """Return the continuous element of first order for a mesh of any dimension."""
+    """Return the continuous element of first order for a mesh of any dimension.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> type(lp.linear(lp.interval(0.0, 1.0, 8))).__name__
+    'ElementLineP1'
+    """
     return _of(LINEAR, mesh, "first")
 
 
@@ -98,6 +105,12 @@ def rectangle(
     """Return a mesh of [x0, x1] x [y0, y1] with boundaries "left", "right", "bottom", "top".
 
     `regions` are named subdomains, each a predicate on the midpoints of the elements.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.rectangle((0.0, 2.0), (0.0, 1.0), (20, 10)).nelements
+    200
     """
     if not (x[1] > x[0] and y[1] > y[0] and min(cells) >= 1):
         raise SpaceError(
@@ -183,6 +196,11 @@ def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:
     ------
     SpaceError
         The file does not exist, cannot be read, or contains no mesh.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> mesh = lp.read_mesh("plate.msh")  # doctest: +SKIP
     """
     path = Path(path)
     if not (np.isfinite(scale) and scale > 0):

@@ -62,6 +62,14 @@ class RandomWalk(Evolution):
 
     The rate is in the unit of the unknown (of its logarithm for a `LogNormal`) per square root of
     the model's unit of time.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> day = 86400.0  # s
+    >>> flux = lp.Scalar(lp.Normal(0.0, std=1e-6), evolution=lp.RandomWalk(1e-7 / day**0.5))
+    >>> flux.evolution.moves
+    True
     """
 
     rate: float
@@ -76,7 +84,15 @@ class RandomWalk(Evolution):
 
 @dataclass(frozen=True)
 class MeanReverting(Evolution):
-    """Ornstein-Uhlenbeck process: relaxation time `time`, stationary law the prior."""
+    """Ornstein-Uhlenbeck process: relaxation time `time`, stationary law the prior.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> load = lp.Scalar(lp.Normal(0.0, std=10.0), evolution=lp.MeanReverting(time=3600.0))
+    >>> load.evolution.moves
+    True
+    """
 
     time: float
 
@@ -370,6 +386,13 @@ class Normal(Prior):
     """Normal distribution of q with `mean` and `std`, in the unit of the unknown.
 
     Estimates are clipped to `bounds`, (lower, upper).
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> prior = lp.Normal(2.0, std=0.5)
+    >>> prior.centre, prior.std
+    (2.0, 0.5)
     """
 
     mean: float = 0.0
@@ -408,6 +431,13 @@ class LogNormal(Prior):
         Standard deviation to first order, in the same unit: the logarithm has std/(median - lower).
     bounds
         (lower, inf) with a finite lower bound.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> prior = lp.LogNormal(1e-4, std=5e-5)
+    >>> prior.centre
+    0.0001
     """
 
     median: float
@@ -444,6 +474,13 @@ class LogitNormal(Prior):
         Standard deviation to first order, in the same unit.
     bounds
         (lower, upper), both finite.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> porosity = lp.LogitNormal(0.3, bounds=(0.0, 1.0), std=0.1)
+    >>> porosity.centre
+    0.3
     """
 
     median: float

@@ -191,8 +191,8 @@ class FleetResult:
         self._rows.append(_NumbersRow.of(estimate, parameters=estimate.parameters))
         self.last = estimate
 
-    def settle(self, estimate: FleetEstimate) -> None:
-        """Take the last parameters from `Fleet.settled`."""
+    def _settle(self, estimate: FleetEstimate) -> None:
+        """Take the last parameters from the end of a run."""
         self._rows[-1] = replace(self._rows[-1], parameters=estimate.parameters)
         self.last = estimate
 

@@ -135,7 +135,7 @@ class Fleet:
                 stated = model.boundary_readings(u)
             self._stated[k] = [stated.get(name, np.nan) for name in self.inputs]
         self.note = law.stepped_alone(self._work)
-        self._errors = [self._one.initial_errors(one) for one in off]
+        self._errors = [self._one._initial_errors(one) for one in off]
         self._engine = self._stepper(made_of, u0s)
         count = len(self)
         self._state: Any = None
@@ -156,7 +156,7 @@ class Fleet:
     def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return the engine that steps members as blocks if the law can, else one by one."""
         if not self.note:
-            readings = [self._one.initial_readings(one) for one in made_of]
+            readings = [self._one._initial_readings(one) for one in made_of]
             return BlockEngine(self.law, self._work, readings, self._errors, u0s)
         if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
             raise ConfigurationError(
@@ -261,7 +261,7 @@ class Fleet:
         if not np.isfinite(t):
             raise SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, withheld, named = self._parsed(z, inputs or {})
-        self._one.check_weighs(noise)
+        self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
         if t < last or (t == last and self._samples):
@@ -395,8 +395,8 @@ class Fleet:
         rows = [observed.predict(u[k], q[k], span.end.member(k)) for k in range(len(span))]
         return np.array(rows)
 
-    def settled(self, estimate: FleetEstimate) -> FleetEstimate:
-        """Return the last estimate, settled as that of an identifier; see `Identifier.settled`."""
+    def _settled(self, estimate: FleetEstimate) -> FleetEstimate:
+        """Return the last estimate, settled as that of an identifier; see an identifier."""
         engine, state = self._engine, self._engine.settled(self._state)
         read, belief = lambda: engine.beliefs(state), lambda k: self._believed(state, k)
         return replace(estimate, read=read, belief=belief)
@@ -410,9 +410,9 @@ class Fleet:
         state = None if self._state is None else self._engine.member(self._state, k)
         ends = {name: values[k].copy() for name, values in self.ends.items()}
         # Kept, since its fingerprint is computed once for all checkpoints of this member.
-        start = self._starts.get(k) or self._one.started(self._q0[k], self._u0[k], self._errors[k])
+        start = self._starts.get(k) or self._one._started(self._q0[k], self._u0[k], self._errors[k])
         self._starts[k] = start
-        return start.placed(state, ends, self._samples)
+        return start._placed(state, ends, self._samples)
 
     def template(self) -> Any:
         """Return the state of the first member at its start without inputs: for its structure."""
@@ -461,7 +461,7 @@ class Fleet:
         for sample in stream:
             result.add(self.step(*sample))
         if result.last is not None:
-            result.settle(self.settled(result.last))
+            result._settle(self._settled(result.last))
         return result
 
     def _parsed(
@@ -542,7 +542,7 @@ class Fleet:
         for k, name in enumerate(self.inputs):
             column = named.get(name, values[:, k])
             missing = np.isnan(column)
-            if name not in self._one.optional_inputs and missing.any():
+            if name not in self._one._optional_inputs and missing.any():
                 column = np.where(missing, self._known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]

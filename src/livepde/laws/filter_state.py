@@ -53,7 +53,7 @@ class InputHistory:
         if not length.all():
             return self
         pause: Mask = (length > PAUSE * self.pace) & (self.count >= SETTLED)
-        known = self.low.shape[1]  # a fleet's withheld sensors may read more channels
+        known = self.low.shape[1]  # a fleet's validation sensors may read more channels
         first, last = span.inputs0[:, :known], span.inputs1[:, :known]
         slopes = np.abs(last - first) / length[:, None]
         if np.count_nonzero(pause):

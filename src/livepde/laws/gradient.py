@@ -341,6 +341,13 @@ class GradientLaw(Law[GradientParts, GradientState]):
     gate
         With a number for gain: when q is held, because nothing excites it but noise, with which it
         would drift; None: never.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.Normal(0.1, std=0.05), {"left": 0.0})
+    >>> identifier = lp.Identifier(rod, lp.Full(noise=0.1), lp.GradientLaw(), u0=1.0)
     """
 
     gain: float | Literal["auto"] = 1.0

@@ -48,6 +48,12 @@ class Refit:
         samples in between, until all are taken. The numbers do not depend on the time that the fit
         takes: a call waits for it where it is due and not there yet. Members of a fleet are fitted
         at once. None: in runs of a case that wait for their source.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> law = lp.SensitivityLaw(refit=lp.Refit())
+    >>> never = lp.SensitivityLaw(refit=None)
     """
 
     start: int = 4096
@@ -194,6 +200,11 @@ class Jumps:
     unknowns
         Names of the unknowns that may jump; default all. A material constant that is not among them
         keeps its estimate and its covariance.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> law = lp.SensitivityLaw(jumps=lp.Jumps())
     """
 
     probability: float = 1e-5

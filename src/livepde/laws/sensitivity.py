@@ -130,6 +130,15 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
     verdict
         Judge the run as it goes on (`Estimate.verdict`): True; "cheap", without the directions that
         cost solves, those of terms that the process may lack; False: not at all.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> law = lp.SensitivityLaw(
+    ...     modes=20, gate=5.0
+    ... )  # fields have 20 modes; 5 deviations are outliers
+    >>> law.gate
+    5.0
     """
 
     modes: int | str | dict[str, int] = "auto"

@@ -34,6 +34,13 @@ class Subdomain(Observation):
 
     Elements cut by the boundary of omega are excluded. If that strip matters, place mesh nodes at
     the ends of omega: `interval(0, 1, 30, through=(0.3, 0.87))`.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> left = lp.Subdomain(lambda x: x[0] < 0.5, noise=0.1)
+    >>> left.noise
+    0.1
     """
 
     omega: Predicate
@@ -176,6 +183,14 @@ def _everywhere(x: object) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Full(Subdomain):
-    """Observation of the whole state, omega = Omega: P is zero except on the Dirichlet boundary."""
+    """Observation of the whole state, omega = Omega: P is zero except on the Dirichlet boundary.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> whole = lp.Full(noise=0.1)
+    >>> whole.noise
+    0.1
+    """
 
     omega: Predicate = _everywhere

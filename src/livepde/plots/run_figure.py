@@ -1,4 +1,4 @@
-"""Overview figure of a run: unknowns, fields, innovations, withheld channels."""
+"""Overview figure of a run: unknowns, fields, innovations, validation channels."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
 RESIDUALS = (  # variable, its dimension, title of its panel
     ("innovation", "sensor", "innovation"),
-    ("withheld_error", "withheld", "error of withheld channels"),
+    ("withheld_error", "withheld", "error of validation channels"),
 )
 SLENDER = 6.0  # length over width from which a map has an axis of its own for each
 
@@ -53,7 +53,7 @@ def overview(
     times: Sequence[float] | int = 5,
     measured: tuple[Array, Array] | None = None,
 ) -> Figure:
-    """Draw a run: readings, unknowns, fields, innovations and withheld channels, one panel each.
+    """Draw a run: readings, unknowns, fields, innovations and validation channels, one panel each.
 
     Parameters
     ----------
@@ -98,8 +98,8 @@ def curves(data: xr.Dataset, t: Array, measured: Array, *, title: str = "") -> F
     data
         Dataset as returned by `Result.to_xarray()`.
     t, measured
-        Times, and readings of the assimilated and then of the withheld sensors, NaN where missing,
-        shapes (samples,) and (samples, sensors).
+        Times, and readings of the assimilated and then of the validation sensors, NaN where
+        missing, shapes (samples,) and (samples, sensors).
     title
         Title above all panels.
     """
@@ -134,7 +134,7 @@ def measured_and_predicted(
 ) -> Axes:
     """Draw readings of sensors with one unit, and what the model predicted of them.
 
-    Lines of withheld sensors are dashed: they are predicted after the sample, and never used.
+    Lines of validation sensors are dashed: they are predicted after the sample, and never used.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def measured_and_predicted(
         withheld = i >= data.sizes.get("sensor", 0)
         style: dict[str, Any] = {"label": name}
         if withheld:
-            style = {"label": f"{name} (withheld)", "linestyle": "--"}
+            style = {"label": f"{name} (validation)", "linestyle": "--"}
         ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, **style)
     time_axis(ax, data)
     ax.set_ylabel(labelled("", "".join(several)).strip())
@@ -216,18 +216,18 @@ def residuals(data: xr.Dataset, *, withheld: bool = False, ax: Axes | None = Non
     data
         Dataset as returned by `Result.to_xarray()`.
     withheld
-        Draw those of the withheld sensors instead.
+        Draw those of the validation sensors instead.
     ax
         Where to draw; default a new figure.
 
     Raises
     ------
     ConfigurationError
-        The run has no withheld sensors.
+        The run has no validation sensors.
     """
     variable, dimension, what = RESIDUALS[withheld]
     if variable not in data:
-        raise ConfigurationError("plots: the run has no withheld sensors.")
+        raise ConfigurationError("plots: the run has no validation sensors.")
     return _residual_panel(data, variable, dimension, what, panel(ax))
 
 

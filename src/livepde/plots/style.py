@@ -126,7 +126,7 @@ def scored_from(data: xr.Dataset) -> int:
 
 
 def sensor_names(data: xr.Dataset) -> list[str]:
-    """Return the names of the assimilated and then of the withheld sensors."""
+    """Return the names of the assimilated and then of the validation sensors."""
     return [str(name) for of in ("sensor", "withheld") if of in data for name in data[of].values]
 
 

@@ -40,9 +40,9 @@ LONG_NAMES = {
     "y": "y of the vertices",
     "z": "z of the vertices",
     "sensor": "assimilated channel",
-    "withheld": "withheld channel",
+    "withheld": "validation channel",
     "innovation": "measured minus predicted, one step ahead",
-    "withheld_error": "measured minus predicted of withheld channels, one step ahead",
+    "withheld_error": "measured minus predicted of validation channels, one step ahead",
     "status": "outcome of the step",
     "correlation": "correlation of the last estimates",
 }
@@ -385,7 +385,7 @@ def _over_time(run: Run) -> pd.DataFrame:
     dates = instants(data, times)
     if dates is not None:
         columns["date"] = dates
-    # Estimates come first; innovations and errors of withheld channels last.
+    # Estimates come first; innovations and errors of validation channels last.
     for name in ("time", *sorted(map(str, data.data_vars), key=DIFFERENCES.__contains__)):
         variable = data[name]
         own = str(variable.attrs.get("units", ""))

@@ -429,17 +429,17 @@ class Live:
         if last is not None:
             try:
                 with interruptible(self._check):
-                    settled = self.identifier.settled(last)
+                    settled = self.identifier._settled(last)
                     verdict = settled.verdict
                 last = settled
-                self.result.settle(last)
+                self.result._settle(last)
                 self._keep_verdict(verdict)
             except Interrupted:
                 self._tell("unfinished", "the final fit was skipped, because the run was stopped")
         if self.journal.estimated:
             # Nothing was left to do where there is no last estimate: the fields stay the same.
-            final = last or self.identifier.settled(self.identifier.estimate())
-            self.journal.keep(self.result.snapshot(final))
+            final = last or self.identifier._settled(self.identifier.estimate())
+            self.journal.keep(self.result._snapshot(final))
 
     def _run(self) -> None:
         ended = False
@@ -501,7 +501,7 @@ class Live:
         try:
             while self._unread:
                 number, estimate, keeps = self._unread[0]
-                self.journal.append(self.result.record(estimate, keeps), number)
+                self.journal.append(self.result._record(estimate, keeps), number)
                 self._unread.popleft()
         finally:
             self.busy = before
@@ -694,13 +694,13 @@ class Live:
 
     def _estimate(self, taken: Taken) -> Estimate | None:
         """Take a step; return None if the sample was rejected or skipped."""
-        before, begun = self.identifier.place, time.monotonic()
+        before, begun = self.identifier._place, time.monotonic()
         self._tell_pause(taken.t)
         try:
             estimate = self.identifier.step(taken.t, taken.values)
             self._seconds += time.monotonic() - begun
             if self._group:
-                self._unread.append((taken.id, estimate, self.result.announce(estimate)))
+                self._unread.append((taken.id, estimate, self.result._announce(estimate)))
             else:
                 self.result.add(estimate)
         except DataError as error:
@@ -714,14 +714,14 @@ class Live:
         except RunError:  # of the journal
             raise
         except Interrupted:
-            self.identifier.return_to(before)
+            self.identifier._return_to(before)
             raise
         except Exception as error:
             # A failure of the numerics belongs to this sample; any other is an error in the code.
             if self.strict and numerical(error) is None:
                 raise
             # A step that fails midway may have changed a part of the identifier.
-            self.identifier.return_to(before)
+            self.identifier._return_to(before)
             self._set_aside(taken.t, f"{type(error).__name__}: {error}")
         else:
             return estimate
@@ -816,7 +816,7 @@ class Live:
         if not self.waits:  # the end is near, and has them
             return estimate.verdict
         if _due(len(self.result) // JUDGED):
-            settled = self.identifier.settled(estimate, columns=False)
+            settled = self.identifier._settled(estimate, columns=False)
             self._errors = settled.verdict.errors or self._errors
         if self._errors is None:
             return estimate.verdict

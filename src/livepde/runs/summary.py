@@ -27,7 +27,7 @@ LAYERS, SURFACES = "wall_layers", "surface_resistance"
 MOST_ROWS = 40
 DIGITS = 15  # of a number
 TOTALS = ("rmse", "innovation_ratio", "jumps", "failed_steps")  # numbers of a run as a whole
-ROLES = ("assimilated", "withheld")  # of channels, of which there are totals, too
+ROLES = ("assimilated", "validation")  # of channels, of which there are totals, too
 IGNORED = "ignored"  # role of channels that are shown and count in no total
 MOVED = 3.0  # deviations by which an unknown has moved after an alarm
 JUMP = "jump"  # what the law notes of each sample
@@ -226,9 +226,9 @@ def measures(data: xr.Dataset) -> dict[str, float]:
     Each scalar unknown by its label; with `.std` its standard deviation, and if it has a
     reference, with `.error` the relative error and with `.deviations` the distance from the
     reference in standard deviations;
-    `rmse` one-step, of all sensors with the withheld ones; `rmse.assimilated`, `rmse.withheld`,
-    `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to their expected square;
-    `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
+    `rmse` one-step, of all sensors, also those for validation; `rmse.assimilated`,
+    `rmse.validation`, `rmse.CHANNEL`; `innovation_ratio` at the end, of squared innovations to
+    their expected square; `jumps`, the number of alarms, if the law tests for them; `failed_steps`.
     """
     found: dict[str, float] = {}
     for label in scalars(data) if data.sizes["time"] else ():

@@ -445,6 +445,16 @@ def simulate(
     ------
     StepFailed
         A step failed even when halved as often as `control` allows.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> from livepde.models import heat
+    >>> rod = heat(lp.interval(0.0, 1.0, 8), lp.LogNormal(0.1, std=0.05), {"left": 0.0})
+    >>> q = rod.initial_parameter({"alpha": 0.07})
+    >>> run = lp.simulate(rod, q, 1.0, [0.0, 0.5, 1.0], lp.Advance(lp.Alexander2()))
+    >>> [t for t, u in run]
+    [0.0, 0.5, 1.0]
     """
     values = inputs or (lambda t: {})
     forward = ForwardStage(model)

@@ -75,7 +75,14 @@ class Scheme(ABC):
 
 @dataclass(frozen=True)
 class ImplicitEuler(Scheme):
-    """The paper's scheme: one stage, first order, L-stable."""
+    """The paper's scheme: one stage, first order, L-stable.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Advance(lp.ImplicitEuler()).scheme.order
+    1
+    """
 
     order: ClassVar[int] = 1
 
@@ -92,6 +99,12 @@ class Alexander2(Scheme):
     """Alexander's two-stage SDIRK: second order, L-stable, stiffly accurate (1977).
 
     Both stages have the same matrix; gamma = 1 - 1/sqrt(2).
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> lp.Advance(lp.Alexander2()).scheme.order
+    2
     """
 
     order: ClassVar[int] = 2
@@ -130,6 +143,13 @@ class Advance:
         longer than half of the time since then, unless `halvings` is 0. Data that do not fit the
         initial state, as a heat flux that sets in, leave a boundary layer that goes with the
         square root of time.
+
+    Examples
+    --------
+    >>> import livepde as lp
+    >>> control = lp.Advance(lp.Alexander2(), dt_max=0.5)
+    >>> control.count(2.0)
+    4
     """
 
     scheme: Scheme

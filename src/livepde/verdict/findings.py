@@ -117,7 +117,7 @@ class Finding:
     Attributes
     ----------
     what
-        Name of the test, such as "misfit", "constancy", "withheld", "prior" or "stuck".
+        Name of the test, such as "misfit", "constancy", "validation", "prior" or "stuck".
     severity
         "note" (worth knowing), "caution" or "do not trust".
     text

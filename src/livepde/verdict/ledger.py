@@ -32,7 +32,7 @@ ROOM = 2**16  # numbers at most that they take while they wait
 BLOCKS = 16  # of the record of an unknown that stays; they double in length, and pairs merge
 CLIP = 4.0  # times the usual size: no whitened innovation counts for more (Huber)
 HELD = 0.02  # share of the samples in which the last value of an input was held
-CHANCE = 5e-4  # probability of a false alarm of all withheld sensors of a run
+CHANCE = 5e-4  # probability of a false alarm of all validation sensors of a run
 SIMILAR = 0.05  # relative difference of a slope to that of a unit
 UNITS = (
     ("degF", "degC", 1.8, 32.0),
@@ -309,7 +309,7 @@ class InputLedger:
 
 @dataclass(frozen=True, eq=False)
 class WithheldLedger:
-    """Sums over the values of each withheld sensor, in constant memory."""
+    """Sums over the values of each validation sensor, in constant memory."""
 
     # Shape (9, sensors): number of values and of successive pairs; sums of half the squared
     # difference of those, of squared errors, errors, predictions p, p p, p z, and of the variance
@@ -372,15 +372,15 @@ class WithheldLedger:
             if p > CHANCE:
                 continue
             size, mean = math.sqrt(squares / count), errors / count
-            text, _ = FINDINGS["withheld"].filled(
+            text, _ = FINDINGS["validation"].filled(
                 name=name, size=size, mean=mean, ratio=math.sqrt(ratio)
             )
-            likely, remedy = LIKELY["withheld"].filled(name=name)
-            cause = self._unit(k, name) or Cause("withheld", name, likely, remedy=remedy)
+            likely, remedy = LIKELY["validation"].filled(name=name)
+            cause = self._unit(k, name) or Cause("validation", name, likely, remedy=remedy)
             # A small error shows that the model is not exact, a gross one that it is wrong.
             gross = size > FAILED * math.sqrt(noise) and size > OF_SIGNAL * self._scatter(k)
             severity: Severity = "do not trust" if gross or cause.kind == "unit" else "caution"
-            yield Finding("withheld", severity, text, name, p, "p-value", (cause,))
+            yield Finding("validation", severity, text, name, p, "p-value", (cause,))
 
     def _scatter(self, k: int) -> float:
         count, _, _, squares, errors, p, pp, pz, _ = self.sums[:, k]

@@ -162,8 +162,8 @@ FINDINGS: dict[str, Sentence] = {
         "standard deviations from the prediction.",
         f"Check these sensors, {RAISE_GATE}",
     ),
-    "withheld": Sentence(
-        "The prediction of {name} (withheld for validation) has an error of {size:.2g} (mean "
+    "validation": Sentence(
+        "The prediction of {name} (validation sensor) has an error of {size:.2g} (mean "
         "{mean:+.2g}), {ratio:.1f} times what prediction and noise allow."
     ),
     # --- inputs
@@ -315,7 +315,7 @@ LIKELY: dict[str, Sentence] = {
     ),
     "stuck": Sentence("{name} or its transmission may be faulty", CHECK),
     "aside": Sentence("{name} may be broken or displaced"),
-    "withheld": Sentence(
+    "validation": Sentence(
         "the model may not hold at {name}, or its position or calibration may be wrong",
         f"{CHECK} If it is not, the model is wrong at this position.",
     ),
