@@ -21,6 +21,7 @@ from livepde.verdict import Cause, Dictionary, Finding, Shifts, Verdict, Withhel
 from livepde.verdict.assess import FACTOR, LONGEST, _possible
 from livepde.verdict.directions import GAIN, LAG, ScoreDirection
 from livepde.verdict.findings import flat
+from livepde.verdict.ledger import Ledger, summed
 
 TIMES = np.linspace(0.0, 8.0, 161)
 NOISE = 0.02
@@ -446,6 +447,8 @@ def test_withheld_sensors_are_judged_against_what_is_predicted():
     places = {"A": 0.25, "C": 0.75}
     withheld = lp.Points({"W": 0.5}, noise=NOISE)
     assert run(z, places=places, withheld=withheld)[1].verdict.level == "trusted"
+    slow = {**z, "W": np.where(np.arange(len(TIMES)) % 2, z["W"], np.nan)}
+    assert run(slow, places=places, withheld=withheld)[1].verdict.level == "trusted"
     fahrenheit = {**z, "W": 32.0 + 1.8 * z["W"]}
     found = run(fahrenheit, places=places, withheld=withheld)[1].verdict
     assert ("unit", "W") in named(found)
@@ -457,6 +460,35 @@ def test_a_withheld_sensor_with_few_values_is_not_judged():
     for _ in range(10):
         ledger = ledger.add(np.array([9.0]), np.zeros(1), np.zeros(1))
     assert list(ledger.findings(["W"])) == []
+
+
+def test_sums_of_a_sensor_do_not_depend_on_samples_without_it():
+    """Sums of rows in which each sensor has its own gaps are those of its values alone."""
+    windows, directions, rows = 2, 3, 12
+    start = Ledger.start(2, directions, 0, 0, 0, windows, 1, rows, 1)
+    rng = np.random.default_rng(2)
+    used = rng.random((1, rows, 2)) < 0.5
+    due = np.zeros((1, windows), dtype=bool)
+    whitened = rng.standard_normal((1, rows, 2, 1 + windows * directions)) * used[..., None]
+    found = start
+    for part in (slice(0, 5), slice(5, 6), slice(6, rows)):
+        batch = summed(found, due, whitened[:, part], used[:, part].astype(float))
+        found = replace(found, **batch)
+    for sensor in range(2):
+        own = whitened[:, used[0, :, sensor]]
+        alone = summed(start, due, own, np.ones(own.shape[:3]))
+        for name in ("sums", "noise"):
+            expected = alone[name][..., sensor]
+            np.testing.assert_allclose(getattr(found, name)[..., sensor], expected, atol=1e-12)
+        assert expected[0, 4, 0] == used[..., sensor].sum() - 1  # pairs
+
+
+@pytest.mark.slow
+def test_sensors_that_read_in_turn_show_the_noise_of_their_readings():
+    z, turn = shown() + errors(), np.arange(len(TIMES))[:, None] % 3
+    verdict = run(np.where(turn == np.arange(3), z, np.nan))[1].verdict
+    assert verdict.level == "trusted"
+    assert verdict.findings == ()  # none that the residuals scatter more than stated
 
 
 def test_few_samples_are_too_few():

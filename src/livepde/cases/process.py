@@ -434,9 +434,9 @@ def _with_offsets(case: CaseContent) -> CaseContent:
 
 
 def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
-    """Return the conditions of a boundary that is held at a channel plus its unknown offset.
+    """Return the conditions of a boundary that is held at a channel less its unknown offset.
 
-    A boundary value knows no unknowns: D u_n = h (channel + offset - u) with a coefficient so large
+    A boundary value knows no unknowns: D u_n = h (channel - offset - u) with a coefficient so large
     that u differs from the value by 1e-4 of what it changes over a cell.
     """
     case, label = names.case, _offset_label(name)
@@ -451,7 +451,7 @@ def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
     dimension, cells = len(case.mesh.p), case.mesh.t.shape[1]
     cell = float(np.ptp(case.mesh.p, axis=1).max()) / cells ** (1.0 / dimension)
     h = HELD * D / cell
-    return [Exchange(h, Channel(name)), Flux(Multiple(label, h))]
+    return [Exchange(h, Channel(name)), Flux(Multiple(label, -h))]
 
 
 def _check_drive(case: CaseContent, storage: str) -> None:

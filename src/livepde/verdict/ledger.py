@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -66,12 +66,13 @@ class Ledger:
     # sensor, shape (members, 4, windows, directions, sensors)
     sums: Array
     # Number of r, and sums of r, r r, r_k r_(k-1) and the number of such pairs, of each window and
-    # sensor, shape (members, 5, windows, sensors)
+    # sensor, shape (members, 5, windows, sensors); r_(k-1) is the last value of the same sensor,
+    # however many samples were without one
     noise: Array
-    # Whitened innovation and responses of the last sample, (members, 1 + windows times directions,
-    # sensors)
+    # Whitened innovation and responses of the last value of each sensor, (members, 1 + windows
+    # times directions, sensors)
     before: Array
-    present: Array  # 1 where the last sample had a value, shape (members, sensors)
+    present: Array  # 1 where a sensor has had a value, shape (members, sensors)
     # score, information: of each block and sensor, about the prior mean: sums of Y r, (members,
     # blocks, sensors, k), and of Y Y^T, (members, blocks, sensors, k, k); k = 0 where they are not
     # kept
@@ -188,20 +189,23 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     windows, directions = old.sums.shape[2:4]
     # Sums of windows that begin anew start from nothing.
     kept = ~(due & (old.age > 0))
-    # The last sample before the batch comes first: products of successive values need it.
+    # The last value before the batch comes first: products of successive values need it.
     before = old.before.copy()
     before[:, 1:].reshape(members, windows, -1)[~kept] = 0.0
     row = np.concatenate([before.swapaxes(1, 2)[:, None], whitened], axis=1)
-    now, earlier = row[:, 1:], row[:, :-1]
     present = np.concatenate([old.present[:, None], used], axis=1)
-    # Such products count where both samples had a value.
-    pair = present[:, 1:] * present[:, :-1]
-    if not pair.all():
-        earlier = earlier * pair[..., None]
+    # Row of the last value of each sensor: sensors need not have values in the same samples.
+    place = np.arange(row.shape[1])[:, None]
+    newest = np.maximum.accumulate(np.where(present > 0.0, place, 0), axis=1)
+    now, earlier = row[:, 1:], row[:, :-1]
+    if not (present > 0.0).all():
+        earlier = np.take_along_axis(row, newest[:, :-1, :, None], axis=1)
+    pair = used * np.maximum.accumulate(present, axis=1)[:, :-1]
     # Weights of g in two sums: of g_k r_k, and of g_k r_(k-1) + g_(k-1) r_k.
     weights = np.zeros((2, *row.shape[:3]))
     weights[0, :, 1:], weights[1, :, 1:] = now[..., 0], earlier[..., 0]
-    weights[1, :, :-1] += now[..., 0] * pair
+    each = np.arange(members)[:, None, None], newest[:, :-1], np.arange(sensors)
+    np.add.at(weights[1], each, now[..., 0])
     crossed = weights.transpose(1, 3, 0, 2) @ row.swapaxes(1, 2)  # (members, sensors, 2, columns)
     squares = np.einsum("mbsc,mbsc->msc", now, now)
     lagged = np.einsum("mbsc,mbsc->msc", now, earlier)
@@ -212,8 +216,8 @@ def summed(old: Ledger, due: Mask, whitened: Array, used: Array) -> dict[str, Ar
     return {
         "sums": old.sums * kept[:, None, :, None, None] + sums.transpose(0, 1, 3, 4, 2),
         "noise": old.noise * kept[:, None, :, None] + np.stack(parts, axis=1)[:, :, None],
-        "before": row[:, -1].swapaxes(1, 2),
-        "present": used[:, -1],
+        "before": np.take_along_axis(row, newest[:, -1:, :, None], axis=1)[:, 0].swapaxes(1, 2),
+        "present": np.maximum(old.present, used.max(axis=1)),
     }
 
 
@@ -330,7 +334,8 @@ class WithheldLedger:
         error = z - predicted
         seen = np.isfinite(error)
         if not seen.any():
-            return replace(self, last=np.full_like(self.last, np.nan))
+            return self
+        # A sensor need not have a value in each sample: its last value is where it had one.
         step = error - self.last
         pair = np.isfinite(step)
         rows = np.array(
@@ -347,7 +352,8 @@ class WithheldLedger:
             ],
             dtype=float,
         )
-        return WithheldLedger(self.sums + np.where(seen, rows, 0.0), np.where(seen, error, np.nan))
+        last = np.where(seen, error, self.last)
+        return WithheldLedger(self.sums + np.where(seen, rows, 0.0), last)
 
     def findings(self, names: Sequence[str], ignored: Collection[str] = ()) -> Iterator[Finding]:
         """Return which sensors, but ignored ones, are missed by more than is allowed.
