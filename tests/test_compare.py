@@ -54,7 +54,9 @@ def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
     given = [FREED, "far: channels.T_10.at='9 m'", "channels.T_10.role=ignored"]
     options = [part for text in given for part in ("--variant", text)]
     written = biased.parent / "better.toml"
-    code, output = call("compare", biased, *options, "--json", "--jobs", "1", "--write", written)
+    code, output = call(
+        "compare", biased, *options, "--json", "--jobs", "1", "--write", written, "--figure", drawn
+    )
     assert code == 0
     content = json.loads(output)
     assert content["recommended"] == "offset"

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from livepde.cases.variants import LastEstimate, Variant, VariantRun
     from livepde.runs import Table
 
+WIDE = 3  # panels beside each other
 COLUMNS = 4  # unknowns of the case in the table of variants; the others have one of their own
 
 
@@ -59,6 +60,10 @@ def compare(
     force: Annotated[
         bool, typer.Option("--force", help="With --write: replace an existing file.")
     ] = False,
+    figure: Annotated[
+        Path | None,
+        option("Draw the intervals of all variants to a figure.", metavar="FILE.png"),
+    ] = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
 ) -> None:
@@ -110,6 +115,9 @@ def compare(
         notes.append(f"{write} is not written: the case itself is recommended.")
     elif write is not None:
         notes.append(_written(write, case, settings, best.variant.settings))
+    if figure is not None:
+        _draw([base, *found], best, figure)
+        notes.append(f"Wrote {figure}.")
     present(
         _tables(base, found, best),
         [],
@@ -220,6 +228,27 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
         tables.append(Table("Variants that failed", ("variant", "reason"), failed))
     changed = [(one.variant.name, "; ".join(one.variant.settings)) for one in found]
     return [*tables, Table("Settings of the variants", ("variant", "settings"), changed)]
+
+
+def _draw(runs: Sequence[VariantRun], best: VariantRun, target: Path) -> None:
+    """Draw the intervals of each unknown, those of the case first."""
+    from livepde.plots import figure, intervals
+
+    labels = list(runs[0].estimates)
+    wide = min(len(labels), WIDE)
+    drawn, axes = figure(-(-len(labels) // wide), wide, "Variants (* recommended)")
+    for label, ax in zip(labels, axes, strict=False):
+        of = {
+            f"{one.variant.name}{' *' if one is best else ''} ({one.level})": one.estimates[label]
+            for one in runs
+            if label in one.estimates
+        }
+        each = {name: (known.value, known.low, known.high) for name, known in of.items()}
+        intervals(each, runs[0].estimates[label].unit, ax=ax)
+        ax.set_title(label)
+    for ax in axes[len(labels) :]:
+        ax.set_visible(False)
+    drawn.savefig(target)
 
 
 def _interval(known: LastEstimate | None) -> str:

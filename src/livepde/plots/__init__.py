@@ -7,7 +7,7 @@ changed.
 
 from __future__ import annotations
 
-from livepde.plots.curves import ensemble, history, loops, profiles
+from livepde.plots.curves import ensemble, history, intervals, loops, profiles
 from livepde.plots.run_figure import (
     RunPlots,
     corner,
@@ -42,6 +42,7 @@ __all__ = [
     "figure",
     "history",
     "interval_95",
+    "intervals",
     "labelled",
     "loops",
     "measured_and_predicted",

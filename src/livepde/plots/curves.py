@@ -212,6 +212,35 @@ def _loop_panel(ax: Axes, data: xr.Dataset, name: str, t: Array) -> None:
     ax.plot(t, values, color=PALETTE[0], linewidth=1.2, drawstyle=drawstyle)
 
 
+def intervals(
+    estimates: Mapping[str, tuple[float, float, float]], unit: str = "", *, ax: Axes | None = None
+) -> Axes:
+    """Draw intervals of one number below each other, the first with a line through its value.
+
+    Parameters
+    ----------
+    estimates
+        Label -> value, lower and upper end, as of the variants of `livepde compare`. Ends that are
+        not finite are left out.
+    unit
+        Unit of the number.
+    ax
+        Axes to draw on; default those of a new figure.
+    """
+    ax = panel(ax)
+    for row, (value, low, high) in enumerate(estimates.values()):
+        colour = PALETTE[0] if row else PALETTE[1]
+        ax.plot([value], [row], "o", color=colour)
+        if np.isfinite(high - low):
+            ax.plot([low, high], [row, row], color=colour, linewidth=2.0)
+        if not row:
+            ax.axvline(value, color=GREY, linestyle="--", linewidth=1.0)
+    ax.set_yticks(range(len(estimates)), list(estimates))
+    ax.invert_yaxis()
+    ax.set_xlabel(labelled("95 % interval", unit))
+    return ax
+
+
 def ensemble(
     times: ArrayLike,
     values: ArrayLike,
