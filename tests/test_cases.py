@@ -537,7 +537,7 @@ REFUSED = [
     ("bounds = [", 'evolution = { kind = "periodic", rate = 1 } #', "takes harmonics and period"),
     ("bounds = [", 'evolution = { kind = "periodic", perod = 1 } #', "did you mean 'period'?"),
     ("bounds = [", 'evolution = { kind = "mean-reverting", time = "2 m" } #', "time: 'm'"),
-    ('time = "time_s"', "", "time is missing"),
+    ('time = "time_s"', "", "there is no column 'time'; did you mean 'time_s'?"),
     ("time_unit", "options = { a = 1 }\ntime_unit", "options require a reader"),
     ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
     ("[expect]", REFERENCE.replace("alpha", "alhpa"), "there is no unknown number 'alhpa'; did"),

@@ -54,10 +54,11 @@ def test_the_variant_that_frees_the_fault_is_recommended_and_written(biased):
     given = [FREED, "far: channels.T_10.at='9 m'", "channels.T_10.role=ignored"]
     options = [part for text in given for part in ("--variant", text)]
     written = biased.parent / "better.toml"
-    code, output = call(
-        "compare", biased, *options, "--json", "--jobs", "1", "--write", written, "--figure", drawn
-    )
+    drawn = biased.parent / "compare.png"
+    files = ("--write", written, "--figure", drawn)
+    code, output = call("compare", biased, *options, "--json", "--jobs", "1", *files)
     assert code == 0
+    assert drawn.read_bytes().startswith(b"\x89PNG")
     content = json.loads(output)
     assert content["recommended"] == "offset"
     found = {one["name"]: one for one in content["variants"]}

@@ -181,8 +181,6 @@ class DataSpec(Spec):
 
     @model_validator(mode="after")
     def _one_source(self) -> DataSpec:
-        if self.reader is None and "time" not in self.model_fields_set:
-            raise ValueError("time is missing: the name of the column of times")
         if self.reader is None and self.options:
             raise ValueError("options require a reader")
         sources = [n for n in ("file", "reader", "mqtt", "opcua") if getattr(self, n) is not None]
