@@ -537,7 +537,6 @@ REFUSED = [
     ("bounds = [", 'evolution = { kind = "periodic", rate = 1 } #', "takes harmonics and period"),
     ("bounds = [", 'evolution = { kind = "periodic", perod = 1 } #', "did you mean 'period'?"),
     ("bounds = [", 'evolution = { kind = "mean-reverting", time = "2 m" } #', "time: 'm'"),
-    ('time = "time_s"', "", "there is no column 'time'; did you mean 'time_s'?"),
     ("time_unit", "options = { a = 1 }\ntime_unit", "options require a reader"),
     ("time_unit", 'reader = "a.py:b"\ntime_unit', "are two sources"),
     ("[expect]", REFERENCE.replace("alpha", "alhpa"), "there is no unknown number 'alhpa'; did"),
@@ -1151,3 +1150,9 @@ def test_every_option_of_the_sensitivity_law_is_a_key_with_the_same_default():
     assert set(SensitivitySpec.model_fields) == {
         "kind", *(option.name for option in dataclasses.fields(lp.SensitivityLaw))
     }  # fmt: skip
+
+
+def test_the_column_of_times_is_time_unless_another_is_named(rod):
+    path = rod(('time = "time_s"', ""))
+    with pytest.raises(lp.errors.SampleError, match="there is no column 'time'; did you mean"):
+        cases.load(path).prepare()
