@@ -95,7 +95,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
         law,
         u0=process.u0,
         t0=float(process.times[0]),
-        withheld=process.withheld,
+        validation=process.validation,
         scheme=process.scheme,
         dt_max=process.dt_max,
         halvings=process.halvings,
@@ -108,7 +108,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
         sample = samples[at]
         estimate = identifier.step(sample.t, sample.z, sample.inputs)
         failed += not estimate.status.ok
-        missed.append(estimate.withheld_error)
+        missed.append(estimate.validation_error)
         if at == len(samples) - 1:
             identifier.refit()  # as at the end of a batch run
 
@@ -124,7 +124,7 @@ def run_law(data: Data, observation: Observation, law: AnyLaw) -> Score:
 
 
 def _hidden(data: Data, missed: Array) -> float:
-    """Return the root mean square of what validation sensors missed, shape (times, withheld)."""
+    """Return the root mean square of what validation sensors missed, shape (times, validation)."""
     late = data.process.times >= data.process.assimilate_from
     return float(np.sqrt(np.nanmean(missed[late][1:] ** 2)))
 

@@ -298,7 +298,8 @@ def _paired(prepared: Prepared) -> tuple[xr.Dataset, xr.Dataset, float]:
     runs = [prepared.identifier, prepared.identifier_with(frozen)]
     every = prepared.case.spec.output.fields_every
     results = [
-        Result(one.model, one.observed, one.withheld, every, layout=prepared.layout) for one in runs
+        Result(one.model, one.observed, one.validation, every, layout=prepared.layout)
+        for one in runs
     ]
     seconds = 0.0
     for count, sample in enumerate(prepared.stream):
@@ -359,8 +360,8 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             quality.append((job.label, *["–"] * 5, "failed", "–"))
             continue
         numbers = run.numbers
-        rmse, withheld = numbers["rmse"], numbers.get("rmse.validation", math.nan)
-        errors = [shown(value) for value in (rmse, withheld, run.prior)]
+        rmse, validation = numbers["rmse"], numbers.get("rmse.validation", math.nan)
+        errors = [shown(value) for value in (rmse, validation, run.prior)]
         steps = int(numbers["failed_steps"])
         cost = shown(run.ratio, ".1f")
         quality.append((job.label, *errors, run.samples, cost, steps, run.verdict))

@@ -42,7 +42,7 @@ class Fit:
         Latent coefficients at each time, shape (times, dim), and a function of the time's number
         that returns a square root of their covariance, shape (dim, coordinates).
     predicted, hidden
-        What assimilated and validation sensors show, shapes (times, sensors), (times, withheld).
+        What assimilated and validation sensors show, shapes (times, sensors), (times, validation).
     seconds, evaluations
         Processor time, and runs of the forward model with sensitivities.
     converged
@@ -91,7 +91,9 @@ class Trajectory:
         self.size = self.Phi.shape[1] + self.growth.size
         self.forward = ForwardStage(self.model)
         spaces = (self.model.state_space, self.model.X, self.model.parameter_space)
-        self.withheld = process.withheld.bind(*spaces) if process.withheld is not None else None
+        self.validation = (
+            process.validation.bind(*spaces) if process.validation is not None else None
+        )
         self.used = np.isfinite(data.z) & (process.times >= process.assimilate_from)[:, None]
         self.used[0] = False  # describes the start, which is known
         self.evaluations = 0
@@ -120,7 +122,7 @@ class Trajectory:
         return Inputs(dict(values))
 
     def run(self, a: Array, sensitivities: bool = True) -> tuple[Array, Array, Array]:
-        """Return predictions (times, sensors), withheld ones, and the Jacobian of the first.
+        """Return predictions (times, sensors), validation ones, and the Jacobian of the first.
 
         Raises
         ------
@@ -132,7 +134,7 @@ class Trajectory:
         none = np.zeros(0)
         width = self.size if sensitivities else 0
         predicted = np.full(self.data.z.shape, np.nan)
-        hidden = np.full((len(times), self.withheld.size if self.withheld else 0), np.nan)
+        hidden = np.full((len(times), self.validation.size if self.validation else 0), np.nan)
         jacobian = np.zeros((*self.data.z.shape, width))
         y = np.zeros((model.X.dim, 1 + width))
         at = Interval(
@@ -173,8 +175,8 @@ class Trajectory:
             y[:, : 1 + live] = end
             u, physical = y[:, 0], model.latent.value(q)
             predicted[k] = observed.predict(u, physical, interval.end)
-            if self.withheld is not None:
-                hidden[k] = self.withheld.predict(u, physical, interval.end)
+            if self.validation is not None:
+                hidden[k] = self.validation.predict(u, physical, interval.end)
             if width:
                 H_u, H_q = observed.jacobian(u, physical, interval.end)
                 jacobian[k, :, :live] = H_u @ y[:, 1 : 1 + live]

@@ -45,7 +45,7 @@ def rows(count: int):
 
 def journal(path: Path) -> Journal:
     who = identifier()
-    layout = layout_of(who.model, who.observed, who.withheld)
+    layout = layout_of(who.model, who.observed, who.validation)
     return Journal.create(path, ("a", "b", "left"), layout)
 
 

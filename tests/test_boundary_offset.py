@@ -34,7 +34,7 @@ def test_the_offset_of_a_boundary_value_is_found(tmp_path):
     assert offset.std < 0.2
     assert alpha.low < 9.7e-5 < alpha.high
     assert found.gained(plain) > 100.0
-    assert found.withheld_error < plain.withheld_error
+    assert found.validation_error < plain.validation_error
     assert plain.level == "do not trust"
     assert found.level == "trusted"  # the offset itself is less certain than alpha
 

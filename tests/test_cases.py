@@ -113,7 +113,7 @@ def test_template_runs_and_finds_the_truth(tmp_path):
     assert case.title == "A metal rod, heated and cooled at its left end"
     assert data.sizes["time"] == 181
     assert int(np.isnan(data.innovation.sel(sensor="T_10")).sum()) == 2
-    assert set(data.withheld.values) == {"T_20"}
+    assert set(data.validation.values) == {"T_20"}
     found = preview(prepared, prepared.stream)
     rows, count = found.unknowns, found.samples
     assert count == 181
@@ -259,7 +259,9 @@ def test_tikhonov_from_a_case(rod, keys, expected):
     kind = ('kind = "sensitivity" ', f'kind = "gradient"\ngain = 1e-12\ntikhonov = {keys}\n#')
     prepared = cases.load(rod(kind)).prepare()
     assert prepared.identifier.observed.observation.reconstruction == expected
-    assert prepared.identifier.withheld.observation.reconstruction == lp.observation.Pseudoinverse()
+    assert (
+        prepared.identifier.validation.observation.reconstruction == lp.observation.Pseudoinverse()
+    )
     for sample in list(prepared.stream)[:4]:
         estimate = prepared.identifier.step(sample.t, sample.z, sample.inputs)
     assert estimate.status.ok
@@ -748,8 +750,8 @@ def test_families(rod):
     path = rod((old, 'T = { role = "validation", column = "T_{}0", each = ["0 cm", "40 cm", 5] }'),
                ("T_10 =", "first ="), ("T_30 =", "third ="))  # fmt: skip
     case = cases.load(path)
-    assert case.withheld.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
-    np.testing.assert_allclose(list(case.withheld.points.values()), [0.0, 0.1, 0.2, 0.3, 0.4])
+    assert case.validation.names(5) == ("T_0", "T_1", "T_2", "T_3", "T_4")
+    np.testing.assert_allclose(list(case.validation.points.values()), [0.0, 0.1, 0.2, 0.3, 0.4])
     assert case.columns["T_3"].names == ("T_30",)
     with pytest.raises(lp.errors.CaseError, match="there is a channel 'T_1' already"):
         cases.load(rod(("first =", "T_1 =")))
@@ -986,7 +988,7 @@ def test_settings(rod):
     case = cases.load(path, settings=given)
     assert (case.title, case.law.noise, case.law.memory) == ("A rod", 0.2, 3600.0)
     assert case.model.parameter_space.prior[0] == 6e-5
-    assert case.withheld is None
+    assert case.validation is None
     assert case.original == path.read_text()
     other = path.with_name("resolved.toml")
     other.write_text(case.text)
@@ -1004,7 +1006,7 @@ def test_keys_are_taken_away(rod):
     path = rod()
     assert cases.load(path).expected
     taken = cases.load(path, settings=parse(["expect=", "channels.T_20=", "steps.dt_max="]))
-    assert (taken.expected, taken.withheld, taken.dt_max) == ({}, None, np.inf)
+    assert (taken.expected, taken.validation, taken.dt_max) == ({}, None, np.inf)
     assert "expect" not in taken.text
 
 

@@ -139,19 +139,19 @@ def test_a_variant_has_a_name_and_settings():
             variant_of(text)
 
 
-def ended(name: str, evidence: float, withheld: float, unknowns: int = 2, **more) -> VariantRun:
+def ended(name: str, evidence: float, validation: float, unknowns: int = 2, **more) -> VariantRun:
     return VariantRun(
         Variant(name),
         verdict=Verdict.of(()).to_dict(),
         log_evidence=evidence,
         readings=more.pop("readings", {"a": 100}),
-        withheld={"w": withheld} if math.isfinite(withheld) else {},
+        validation={"w": validation} if math.isfinite(validation) else {},
         unknowns=unknowns,
         **more,
     )
 
 
-def test_the_best_evidence_counts_unless_withheld_sensors_are_predicted_worse():
+def test_the_best_evidence_counts_unless_validation_sensors_are_predicted_worse():
     base = ended("as stated", 10.0, 1.0, 1)
     good, tied = ended("good", 50.0, 0.9), ended("tied", 51.0, 0.9, 5)
     worse, other = ended("worse", 90.0, 1.5), ended("other", 99.0, 0.5, readings={"a": 99})
@@ -165,7 +165,7 @@ def test_the_best_evidence_counts_unless_withheld_sensors_are_predicted_worse():
     assert "evidence of 'other' is missing or counts other readings" in notes
 
 
-def test_without_withheld_sensors_the_evidence_decides():
+def test_without_validation_sensors_the_evidence_decides():
     base, better = ended("as stated", 10.0, math.nan), ended("better", 50.0, math.nan)
     assert recommended(base, [better]) is better
 
@@ -188,10 +188,10 @@ def test_an_unknown_that_depends_on_the_variant_is_named():
     assert "its interval in 'as stated' does not" in " ".join(conclusions(base, [best]))
 
 
-def test_no_withheld_sensor_may_be_predicted_worse():
-    base = replace(ended("as stated", 10.0, 1.0), withheld={"v": 5.0, "w": 1.0})
-    hidden = replace(ended("hidden", 50.0, 1.0), withheld={"v": 1.0, "w": 1.5})
-    fewer = replace(ended("fewer", 50.0, 1.0), withheld={"w": 1.0})
+def test_no_validation_sensor_may_be_predicted_worse():
+    base = replace(ended("as stated", 10.0, 1.0), validation={"v": 5.0, "w": 1.0})
+    hidden = replace(ended("hidden", 50.0, 1.0), validation={"v": 1.0, "w": 1.5})
+    fewer = replace(ended("fewer", 50.0, 1.0), validation={"w": 1.0})
     assert recommended(base, [hidden, fewer]) is base
     assert "(w 1.5 instead of 1)" in " ".join(conclusions(base, [hidden]))
 

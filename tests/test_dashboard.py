@@ -52,7 +52,7 @@ def identifier(kind: str = "line", *, field: bool = False, law=None) -> lp.Ident
         ),
         lp.Points({"a": spot[0]}, noise=0.1, unit="degC"),
         law or lp.SensitivityLaw(refit=None),
-        withheld=lp.Points({"b": spot[1]}),
+        validation=lp.Points({"b": spot[1]}),
     )
 
 
@@ -67,7 +67,7 @@ def samples(count: int, pause: float = 0.0):
 def begun(folder: Path, who: lp.Identifier, title: str = "A rod", **attrs) -> Journal:
     """Make a run directory, and return the journal to fill."""
     RunWriter.create(folder, version="1", command=["livepde"], title=title)
-    layout = layout_of(who.model, who.observed, who.withheld)
+    layout = layout_of(who.model, who.observed, who.validation)
     return Journal.create(folder / JOURNAL, who.channels, replace(layout, attrs=attrs))
 
 
@@ -93,7 +93,7 @@ def dataset(kind: str = "line", count: int = 6, **options):
 def test_every_kind_of_run_has_its_panels(kind, field):
     data = dataset(kind, field=field)
     found = {panel.name: panel for panel in panels.panels(data)}
-    assert {"field:u", "innovation", "withheld_error", "told", "unknown:loss"} <= {*found}
+    assert {"field:u", "innovation", "validation_error", "told", "unknown:loss"} <= {*found}
     assert ("field:alpha" in found) is field
     assert ("correlation" in found) is not field
     for panel in found.values():
@@ -193,9 +193,9 @@ def test_a_map_is_exact_for_what_is_linear(kind):
 
 def test_sensors_are_on_the_map():
     data = dataset("triangle", count=1)
-    sensor, withheld = field_views.field_map(data, "u").data[1:]
+    sensor, validation = field_views.field_map(data, "u").data[1:]
     assert [*sensor.text, *sensor.x, *sensor.y] == ["a", 0.6, 0.4]
-    assert [*withheld.text, *withheld.x, *withheld.y] == ["b", 0.3, 0.4]
+    assert [*validation.text, *validation.x, *validation.y] == ["b", 0.3, 0.4]
 
 
 def test_a_hole_stays_open():
@@ -278,7 +278,7 @@ def test_a_view_follows_a_run(tmp_path, monkeypatch):
     assert (panel.name, panel.section) == ("measured:degC", "measured")
     assert next(iter(panels.SECTIONS)) == "measured"
     points, lines = panel.figure.data[::2], panel.figure.data[1::2]
-    errors = [seen.dataset[name].values[:, 0] for name in ("innovation", "withheld_error")]
+    errors = [seen.dataset[name].values[:, 0] for name in ("innovation", "validation_error")]
     for k, error in enumerate(errors):
         assert np.array_equal(points[k].y, readings[:, k])
         assert np.allclose(lines[k].y, readings[:, k] - error)

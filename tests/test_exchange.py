@@ -99,7 +99,7 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
             estimate = prepared.identifier.step(sample.t, z)
             found = taken(instance, sample.t, [z[name] for name in INPUTS])
             ((alpha, std),) = estimate.parameters.values()
-            model = [z["T_20"] - estimate.withheld_error[0], 0.0]
+            model = [z["T_20"] - estimate.validation_error[0], 0.0]
             assert found[:2] == pytest.approx([alpha, std], rel=1e-10)
             assert found[3:] == pytest.approx(model, rel=1e-10)
     assert k == 60

@@ -51,7 +51,7 @@ def identifier(kind: str = "line", field: bool = False) -> lp.Identifier:
         heat(mesh, alpha, {"left": lp.Channel("T0")}, loss=loss),
         lp.Points({"a": points[0]}, noise=0.1, unit="degC"),
         lp.SensitivityLaw(refit=None),
-        withheld=lp.Points({"b, inside": points[1]}),
+        validation=lp.Points({"b, inside": points[1]}),
     )
 
 
@@ -61,7 +61,7 @@ def samples(count: int = SAMPLES):
 
 
 def described(who: lp.Identifier, **attrs):
-    layout = layout_of(who.model, who.observed, who.withheld)
+    layout = layout_of(who.model, who.observed, who.validation)
     return replace(layout, length_unit="m", attrs={"title": "A rod", "equation": "u_t", **attrs})
 
 
@@ -156,7 +156,7 @@ def test_what_belongs_to_a_number(rod):
 def test_temperatures_and_their_differences(rod):
     found = cf(rod.dataset)
     assert found["u"].attrs["units_metadata"] == "temperature: on_scale"
-    for name in ("u_std", "innovation", "withheld_error"):
+    for name in ("u_std", "innovation", "validation_error"):
         assert found[name].attrs["units_metadata"] == "temperature: difference"
     assert "units_metadata" not in found["loss"].attrs
 
@@ -188,7 +188,7 @@ def test_xarray_opens_times_as_dates(rod, tmp_path, ending):
     assert found.attrs["source"] == "livepde 1.2"
     assert found.attrs["history"].endswith("livepde run rod.toml")
     assert list(found["sensor"].values) == ["a"]
-    assert list(found["withheld"].values) == ["b, inside"]
+    assert list(found["validation"].values) == ["b, inside"]
     assert np.array_equal(found["u"], rod.dataset["u"])
     assert found["u"].dims == ("snapshot", "vertex")
     assert found["x"].dims == ("vertex",)
@@ -276,7 +276,9 @@ def test_pandas_opens_what_is_over_time(rod, tmp_path):
     low, _ = interval_95(data, "loss")
     assert np.array_equal(found["loss_low [s-1]"], low)
     assert np.array_equal(found["innovation:a [degC]"], data["innovation"][:, 0])
-    assert np.array_equal(found["withheld_error:b, inside [degC]"], data["withheld_error"][:, 0])
+    assert np.array_equal(
+        found["validation_error:b, inside [degC]"], data["validation_error"][:, 0]
+    )
     assert found["status"].tolist() == ["ok"] * SAMPLES
     assert len(found) == SAMPLES
     pytest.importorskip("pyarrow")

@@ -87,12 +87,12 @@ def rod(change: str = "", **options: Any) -> list[str]:
             z[:, 2] += (rods.shown(k=0.14) - rods.shown())[:, 2]
         case "far from the prior":
             z = rods.shown(k=0.4) + rods.errors()
-        case "withheld" | "withheld in degF":
+        case "validation" | "validation in degF":
             clean = rods.shown(places=(0.25, 0.75, 0.5)) + rods.errors()
             W = 32.0 + 1.8 * clean[:, 2] if change.endswith("F") else clean[:, 2]
             names = {"A": clean[:, 0], "C": clean[:, 1], "W": W}
             places = {"A": 0.25, "C": 0.75}
-            options["withheld"] = lp.Points({"W": 0.5}, noise=rods.NOISE)
+            options["validation"] = lp.Points({"W": 0.5}, noise=rods.NOISE)
     return kinds(rods.run(names or z, places=places, **options)[1].verdict)
 
 
@@ -288,7 +288,7 @@ RUNS = {
     "assess: refused": Pair(partial(rod, "spikes"), rod),
     "assess: prior": Pair(partial(rod, "far from the prior"), rod),
     "ledger: input": Pair(partial(fed, gaps=True), fed),
-    "ledger: validation": Pair(partial(rod, "withheld in degF"), partial(rod, "withheld")),
+    "ledger: validation": Pair(partial(rod, "validation in degF"), partial(rod, "validation")),
     "findings: hold": Pair(partial(fed, between="next"), fed),
     "findings: discretisation": Pair(partial(meshed, 10), partial(meshed, 80)),
     "findings: effect": Pair(partial(ended, 0.08), ended),

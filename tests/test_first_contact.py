@@ -310,7 +310,7 @@ def test_a_smoothed_table_has_its_dates():
 @cache
 def found() -> lp.Result:
     """Return the run of a table of dates."""
-    return identifier(withheld=lp.Points({"T_60 again": 0.6})).run(
+    return identifier(validation=lp.Points({"T_60 again": 0.6})).run(
         dated().assign(**{"T_60 again": dated()["T_60"]})
     )
 
@@ -359,7 +359,7 @@ def test_numbers_over_time_as_a_table():
     assert table["alpha"].iloc[-1] == found().last["alpha"].median
     assert (table["alpha_low"] < table["alpha_high"]).all()
     assert set(table["status"]) == {"ok"}
-    assert np.allclose(table["withheld_error:T_60 again"], found().residuals["T_60 again"])
+    assert np.allclose(table["validation_error:T_60 again"], found().residuals["T_60 again"])
     assert (identifier().run(measured()).to_dataframe().index == measured().index).all()
 
 
@@ -619,7 +619,7 @@ def test_terms_of_a_model_are_shown_as_they_are_written():
 
 
 def test_an_identifier_shows_law_sensors_and_time():
-    who = identifier(withheld=lp.Points({"W": 0.5}))
+    who = identifier(validation=lp.Points({"W": 0.5}))
     shown = repr(who)
     for line in ("law: SensitivityLaw()", "sensors: T_30, T_60\n", "validation: W\n", "time: 0 s"):
         assert line in shown
@@ -702,10 +702,10 @@ def test_residuals():
     pytest.importorskip("matplotlib")
     ax = found().plot.residuals()
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_30"]) for x in ax.lines)
-    ax = found().plot.residuals(withheld=True)
+    ax = found().plot.residuals(validation=True)
     assert any(np.array_equal(x.get_ydata(), found().residuals["T_60 again"]) for x in ax.lines)
     with pytest.raises(lp.errors.ConfigurationError, match="no validation sensors"):
-        two().plot.residuals(withheld=True)
+        two().plot.residuals(validation=True)
 
 
 def test_corner():

@@ -391,14 +391,14 @@ def test_a_fleet_that_has_not_begun_is_saved_too():
 
 
 @pytest.mark.slow
-def test_channels_by_name_and_withheld_sensors():
+def test_channels_by_name_and_validation_sensors():
     model, hidden = rod(), lp.Points({"T_4": 0.6})
-    fleet = lp.Fleet(model, SENSORS, LAWS["plain"], 2, withheld=hidden)
-    one = lp.Identifier(model, SENSORS, LAWS["plain"], withheld=hidden)
+    fleet = lp.Fleet(model, SENSORS, LAWS["plain"], 2, validation=hidden)
+    one = lp.Identifier(model, SENSORS, LAWS["plain"], validation=hidden)
     row = {"T_1": 0.2, "T_2": 0.1, "T_4": 0.05, "T_0": 0.3, "ambient": 0.0}
     estimate = fleet.step(0.1, {**row, "T_1": [0.9, 0.2]})
     other = one.step(0.1, row)
-    np.testing.assert_allclose(estimate.withheld_error[1], other.withheld_error, rtol=1e-9)
+    np.testing.assert_allclose(estimate.validation_error[1], other.validation_error, rtol=1e-9)
     np.testing.assert_allclose(estimate.innovation[1], other.innovation, rtol=1e-9)
     assert estimate.innovation[0, 0] == pytest.approx(estimate.innovation[1, 0] + 0.7)
 
@@ -408,7 +408,7 @@ def test_a_run_becomes_a_dataset_with_a_dimension_of_members():
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], ["north", "south"])
     result = fleet.run(samples(fleet, steps=6))
     data = result.to_xarray()
-    assert dict(data.sizes) == {"member": 2, "time": 6, "sensor": 3, "withheld": 0}
+    assert dict(data.sizes) == {"member": 2, "time": 6, "sensor": 3, "validation": 0}
     assert data["alpha"].dims == ("member", "time")
     assert data["innovation"].dims == ("member", "time", "sensor")
     last = data.sel(member="south").isel(time=-1)
@@ -555,9 +555,9 @@ def test_what_is_kept_is_what_the_results_of_separate_runs_keep(name):
     """Numbers, ends of intervals, shares of the prior, fields, correlations, notes."""
     model = MODELS[name]()
     law = lp.SensitivityLaw(gate=3.0, noise="auto", refit=lp.laws.Refit(start=4), verdict=False)
-    fleet = lp.Fleet(model, SENSORS, law, 3, withheld=lp.Points({"hidden": 0.4}))
+    fleet = lp.Fleet(model, SENSORS, law, 3, validation=lp.Points({"hidden": 0.4}))
     kept = FleetRecords(model, 4)
-    results = [Result(model, fleet.observed, fleet.withheld, 4) for _ in range(3)]
+    results = [Result(model, fleet.observed, fleet.validation, 4) for _ in range(3)]
     for t, z, inputs in samples(fleet, 9):
         estimate = fleet.step(t, z, inputs)
         kept.add(estimate)

@@ -29,7 +29,7 @@ def rod(law, **unknown):
         f=lambda x, _: x.inputs["heat"],
         inputs=("heat",),
     )
-    return lp.Identifier(model, SENSORS, law, withheld=HIDDEN)
+    return lp.Identifier(model, SENSORS, law, validation=HIDDEN)
 
 
 def plate(law):
@@ -42,7 +42,7 @@ def plate(law):
         inputs=("heat",),
     )
     sensors = lp.Points({"a": (0.3, 0.4), "b": (0.6, 0.7)}, noise=0.01)
-    return lp.Identifier(model, sensors, law, withheld=lp.Points({"c": (0.8, 0.2)}))
+    return lp.Identifier(model, sensors, law, validation=lp.Points({"c": (0.8, 0.2)}))
 
 
 PAIRS = [*((law, rod) for law in LAWS), ("gradient", plate), ("sensitivity", plate)]
@@ -57,7 +57,7 @@ def samples(count, seed=0):
 
 
 def numbers(estimate):
-    return [estimate.q, estimate.u, estimate.innovation, estimate.withheld_error]
+    return [estimate.q, estimate.u, estimate.innovation, estimate.validation_error]
 
 
 def same(one, other):
@@ -89,7 +89,7 @@ def test_a_horizon_is_steps_in_which_nothing_is_measured(law, build):
     other = copy.deepcopy(identifier)
     for k, t in enumerate(times):
         estimate = other.step(t, {"heat": heat_plan[k], "c": 0.0})
-        shown = -estimate.withheld_error[0]
+        shown = -estimate.validation_error[0]
         assert found["c"][k] == pytest.approx(shown, rel=1e-13)
     assert found.status.ok
     assert np.array_equal(found.z[-1], other.forecast(other.t).z[0])
@@ -131,7 +131,7 @@ def test_a_forecast_begins_where_nothing_was_measured_yet():
 def test_a_sensor_that_moves_is_where_the_last_sample_had_it():
     fixed = rod(LAWS["sensitivity"])
     moving = lp.Identifier(
-        fixed.model, SENSORS, fixed.law, withheld=lp.observation.Moving({"c": "x"}, noise=0.1)
+        fixed.model, SENSORS, fixed.law, validation=lp.observation.Moving({"c": "x"}, noise=0.1)
     )
     for t, z in samples(5):
         moving.step(t, {**z, "x": 0.8})
@@ -154,7 +154,7 @@ def test_the_deviation_is_that_of_the_unknown_times_the_derivative():
     inputs, h = {"T_end": 1.0, "heat": 1.0}, 1e-4
     law = lp.SensitivityLaw(shadows=None)  # whose steps are those of the times
     shown = [
-        lp.Identifier(i.model, SENSORS, i.law, withheld=HIDDEN, q0={"k": k})
+        lp.Identifier(i.model, SENSORS, i.law, validation=HIDDEN, q0={"k": k})
         .forecast([0.1, 0.3], inputs)
         .z
         for i in [rod(law)]

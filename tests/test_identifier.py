@@ -33,7 +33,7 @@ HIDDEN = lp.Points({"c": 0.8}, unit="degC")
 
 
 def identifier(**options):
-    options = {"withheld": HIDDEN, **options}
+    options = {"validation": HIDDEN, **options}
     return lp.Identifier(rod(), SENSORS, lp.SensitivityLaw(refit=lp.laws.Refit(start=4)), **options)
 
 
@@ -111,13 +111,13 @@ def test_nan_and_absent_are_missing_samples():
 
 
 @pytest.mark.long
-def test_withheld_channels_are_scored_and_never_used():
+def test_validation_channels_are_scored_and_never_used():
     one, two = identifier(), identifier()
     for k in range(1, 5):
         first = one.step(*sample(0.1 * k, c=0.3))
         second = two.step(*sample(0.1 * k, c=99.0))
     np.testing.assert_array_equal(first.q, second.q)
-    assert second.withheld_error[0] - first.withheld_error[0] == pytest.approx(98.7)
+    assert second.validation_error[0] - first.validation_error[0] == pytest.approx(98.7)
 
 
 @pytest.mark.long
@@ -132,7 +132,7 @@ def test_before_assimilation_begins_data_are_only_scored():
 
 def test_configurations_that_do_not_fit():
     with pytest.raises(lp.errors.ConfigurationError, match="both assimilated and for validation"):
-        identifier(withheld=lp.Points({"a": 0.5}))
+        identifier(validation=lp.Points({"a": 0.5}))
     with pytest.raises(lp.errors.ConfigurationError, match="dt_max"):
         identifier(dt_max=0.0)
     with pytest.raises(lp.errors.ConfigurationError, match="t0"):
@@ -303,9 +303,9 @@ def test_a_result_has_named_axes_and_units(tmp_path):
     assert data["u"].attrs["units"] == "degC"
     assert data["snapshot"].values == pytest.approx([0.0, 0.7, 1.4, 1.9])
     assert list(data["sensor"].values) == ["a", "b"]
-    assert list(data["withheld"].values) == ["c"]
+    assert list(data["validation"].values) == ["c"]
     assert data["innovation"].shape == (20, 2)
-    assert data["withheld_error"].shape == (20, 1)
+    assert data["validation_error"].shape == (20, 1)
     assert np.all(np.diff(data["x"].values) > 0)
     assert set(data["status"].values) == {0}
     assert list(data["steps"].values[1:4]) == [6, 2, 1]  # graded at the start
@@ -318,12 +318,12 @@ def test_a_result_has_named_axes_and_units(tmp_path):
 @pytest.mark.long
 def test_a_table_of_a_result():
     law = lp.SensitivityLaw(gate=np.inf)  # of the readings that are used
-    result = lp.Identifier(rod(), SENSORS, law, withheld=HIDDEN).run(stream())
+    result = lp.Identifier(rod(), SENSORS, law, validation=HIDDEN).run(stream())
     table = result.table()
     assert table["k"]["value"] == pytest.approx(float(result.last.q[0]))
     errors = result.to_xarray()["innovation"].sel(sensor="a").values
     assert table["innovation:a"]["rmse"] == pytest.approx(np.sqrt(np.mean(errors**2)))
-    assert table["withheld_error:c"]["count"] == 20
+    assert table["validation_error:c"]["count"] == 20
 
 
 def test_a_field_in_the_plane():
@@ -340,7 +340,7 @@ def test_a_field_in_the_plane():
     data = result.to_xarray()
     assert data["q"].shape == (3, mesh.p.shape[1])
     np.testing.assert_array_equal(data["y"].values, mesh.p[1])
-    assert "withheld_error" not in data
+    assert "validation_error" not in data
 
 
 @pytest.mark.long
@@ -386,13 +386,13 @@ def test_samples_of_other_tables():
 
     twice = pd.Series([1.0, 2.0, 3.0], index=["a", "b", "b"])
     with pytest.raises(lp.errors.SampleError, match="two values of the sample have the same name"):
-        identifier(withheld=None).step(0.1, twice, {"heat": 1.0, "T_end": 0.0})
+        identifier(validation=None).step(0.1, twice, {"heat": 1.0, "T_end": 0.0})
     _, named = sample()
     expected = identifier().step(0.1, named).u
     by_names = xr.Dataset({name: ((), value) for name, value in named.items()})
     assert np.array_equal(identifier().step(0.1, by_names).u, expected)
-    plain, inputs = identifier(withheld=None), {"heat": 1.0, "T_end": 0.5}
-    by_order = identifier(withheld=None).step(0.1, [0.1, 0.2], inputs).u
+    plain, inputs = identifier(validation=None), {"heat": 1.0, "T_end": 0.5}
+    by_order = identifier(validation=None).step(0.1, [0.1, 0.2], inputs).u
     assert np.array_equal(plain.step(0.1, xr.DataArray([0.1, 0.2]), inputs).u, by_order)
 
 

@@ -1,4 +1,4 @@
-"""Sensors that are withheld to be predicted count against a run; those that are ignored do not."""
+"""Validation sensors count against a run; those that are ignored do not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def outcome(path, settings, folder):
 
 
 @pytest.mark.long
-def test_a_faulty_sensor_counts_only_while_it_is_withheld(faulty):
+def test_a_faulty_sensor_counts_only_while_it_is_validation(faulty):
     found, numbers, _ = outcome(faulty, [], "validation")
     assert found.level == "do not trust"
     assert numbers["rmse.validation"] > 1.5
@@ -58,9 +58,9 @@ def test_an_ignored_sensor_keeps_its_keys(faulty):
     assert case.prepare().identifier.ignored == ("T_10",)
 
 
-def test_only_withheld_sensors_can_be_ignored(faulty):
+def test_only_validation_sensors_can_be_ignored(faulty):
     case = cases.load(faulty)
-    with pytest.raises(ConfigurationError, match="none of the sensors in withheld"):
+    with pytest.raises(ConfigurationError, match="none of the sensors in validation"):
         lp.Identifier(
-            case.model, case.observation, case.law, withheld=case.withheld, ignored=["T_10"]
+            case.model, case.observation, case.law, validation=case.validation, ignored=["T_10"]
         )

@@ -18,13 +18,13 @@ from livepde.readout import ScalarReadout
 from livepde.records import Record, RecordArrays, Snapshot
 
 
-def rod(unknown=None, law=None, withheld=None, cells=30):
+def rod(unknown=None, law=None, validation=None, cells=30):
     ends = {"left": lp.Channel("T_left"), "right": lp.Channel("T_right")}
     alpha = unknown or lp.Normal(0.02, std=0.01, bounds=(1e-3, 1.0))
     model = heat(lp.interval(0.0, 1.0, cells), alpha, ends, source=lp.Normal(0.0, std=1.0))
     sensors = lp.Points({f"T_{k}": k / 6 for k in range(1, 6)}, noise=0.01)
     law = law or lp.SensitivityLaw()
-    return lp.Identifier(model, sensors, law, withheld=withheld, u0=1.0)
+    return lp.Identifier(model, sensors, law, validation=validation, u0=1.0)
 
 
 def samples(count, extra=()):
@@ -137,7 +137,7 @@ def test_numbers_of_a_record_are_those_of_the_estimate(unknown, law):
 
 @pytest.mark.long
 def test_a_result_keeps_little_more_than_its_numbers():
-    identifier = rod(withheld=lp.Points({"T_0": 0.4}))
+    identifier = rod(validation=lp.Points({"T_0": 0.4}))
     count = 300
     result = identifier.run(samples(count, ["T_0"]))
     records, axes = result.records, {"time", "snapshot"}
@@ -162,7 +162,7 @@ def test_arrays_give_back_the_records_that_they_took():
             t=t,
             numbers=numbers,
             innovation=innovation,
-            withheld_error=np.zeros(0),
+            validation_error=np.zeros(0),
             status=status,
             steps=steps,
             notes=notes,
@@ -184,7 +184,7 @@ def test_arrays_give_back_the_records_that_they_took():
             assert getattr(one, name) == getattr(other, name)
         np.testing.assert_array_equal(one.numbers, other.numbers)
         np.testing.assert_array_equal(one.innovation, other.innovation)
-        assert one.withheld_error.shape == (0,)
+        assert one.validation_error.shape == (0,)
         assert (one.snapshot is None) == (other.snapshot is None)
         if one.snapshot is not None:
             assert one.snapshot.told == other.snapshot.told

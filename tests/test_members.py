@@ -178,10 +178,10 @@ def test_members_are_taken_put_and_joined_and_square_roots_widened():
 
 
 @pytest.mark.slow
-def test_a_fleet_whose_withheld_sensors_read_channels_of_their_own():
+def test_a_fleet_whose_validation_sensors_read_channels_of_their_own():
     model = rod({"left": lp.Channel("T_0"), "right": 0.0})
     sensors, hidden = lp.Points([0.3, 0.6], noise=0.01), lp.observation.Moving({"probe": "x_p"})
-    fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, withheld=hidden)
+    fleet = lp.Fleet(model, sensors, lp.SensitivityLaw(), 2, validation=hidden)
     for k in range(4):
         inputs = {"T_0": 1.0, "x_p": 0.5}
         assert fleet.step(0.1 * (k + 1), [[0.5, 0.3], [0.4, 0.2]], inputs).ok.all()

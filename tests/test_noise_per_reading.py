@@ -173,11 +173,11 @@ def test_a_channel_with_the_name_of_noise_is_refused():
         lp.Identifier(model, lp.Points({"a": 0.3}, noise=0.1), lp.SensitivityLaw(), u0=0.0)
 
 
-def test_a_withheld_reading_may_have_noise_and_is_scored_all_the_same():
+def test_a_validation_reading_may_have_noise_and_is_scored_all_the_same():
     points, hidden = lp.Points({"a": 0.3}, noise=0.1), lp.Points({"b": 0.6})
-    one = lp.Identifier(rod(), points, lp.SensitivityLaw(), u0=0.0, withheld=hidden)
+    one = lp.Identifier(rod(), points, lp.SensitivityLaw(), u0=0.0, validation=hidden)
     estimate = one.step(H, {"a": (0.1, 0.2), "b": (0.5, 0.3)})
-    assert estimate.withheld_error == pytest.approx([0.5], abs=0.2)
+    assert estimate.validation_error == pytest.approx([0.5], abs=0.2)
 
 
 @pytest.mark.slow

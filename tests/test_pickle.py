@@ -36,7 +36,7 @@ def rod(**parts):
     model = lp.Model(lp.Field(MESH, lp.linear(MESH), dirichlet={"left": 1.0}), unknowns, A=A)
     hidden = lp.Points({"W": 0.8})
     return lp.Identifier(
-        model, lp.Points({"T": 0.5}, noise=0.01), lp.SensitivityLaw(), u0=0.0, withheld=hidden
+        model, lp.Points({"T": 0.5}, noise=0.01), lp.SensitivityLaw(), u0=0.0, validation=hidden
     )
 
 
@@ -66,7 +66,7 @@ def samples(count=6):
 def test_an_estimate_has_the_same_values(name):
     estimate = RODS[name]().run(samples()).last
     again = pickle.loads(pickle.dumps(estimate))
-    for attribute in ("q", "u", "q_std", "u_std", "innovation", "withheld_error"):
+    for attribute in ("q", "u", "q_std", "u_std", "innovation", "validation_error"):
         np.testing.assert_array_equal(getattr(again, attribute), getattr(estimate, attribute))
     assert again.to_dict() == estimate.to_dict()
     assert again.parameters == estimate.parameters
@@ -104,7 +104,7 @@ def test_a_model_is_built_again_from_its_parts():
         lp.Points({"T": 0.5}, noise=0.01),
         lp.SensitivityLaw(),
         u0=0.0,
-        withheld=lp.Points({"W": 0.8}),
+        validation=lp.Points({"W": 0.8}),
     )
     other.restore(identifier.dump())  # which refuses any other model
     one, two = (who.run(samples()).last for who in (identifier, other))

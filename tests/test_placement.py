@@ -26,7 +26,7 @@ FIELD = {
     "unknowns.alpha.length": "20 cm",
     "unknowns.alpha.transform": "logit",
 }
-SENSOR = "channels.T_20"  # withheld in the template: now a third sensor, somewhere
+SENSOR = "channels.T_20"  # for validation in the template: now a third sensor, somewhere
 
 
 @pytest.fixture

@@ -28,7 +28,7 @@ def dataset(
     fields: tuple[str, ...] = (),
     points: np.ndarray | None = None,
     sensors: int = 2,
-    withheld: int = 0,
+    validation: int = 0,
     samples: int = 30,
     span: float = 10.0,
     unit: str = "",
@@ -43,7 +43,7 @@ def dataset(
             "time": ("time", t, {"units": unit}),
             "snapshot": t[::3],
             "sensor": [f"s{k}" for k in range(sensors)],
-            "withheld": [f"w{k}" for k in range(withheld)],
+            "validation": [f"w{k}" for k in range(validation)],
             **{axis: ("vertex", p) for axis, p in zip("xyz", points, strict=False)},
         }
     )
@@ -56,8 +56,8 @@ def dataset(
         if np.isfinite(std):
             data[f"{name}_std"] = (("snapshot", "vertex"), np.full(shape, std))
     data["innovation"] = (("time", "sensor"), rng.standard_normal((samples, sensors)))
-    if withheld:
-        data["withheld_error"] = (("time", "withheld"), np.full((samples, withheld), 0.5))
+    if validation:
+        data["validation_error"] = (("time", "validation"), np.full((samples, validation), 0.5))
     data["status"] = ("time", np.zeros(samples, dtype=int))
     data.attrs = {"fields": " ".join(fields), "scalars": "\n".join(scalars or {}), "state": "u"}
     return data
@@ -160,7 +160,7 @@ def test_long_runs_in_seconds_are_shown_in_days() -> None:
 
 
 def test_sensors_are_named_with_their_error() -> None:
-    data = dataset(sensors=3, withheld=1)
+    data = dataset(sensors=3, validation=1)
     data["innovation"].values[5:9] = np.nan
     figure = drawn(plots.overview(data))
     rms = float(np.sqrt((data["innovation"][:, 1] ** 2).mean()))
@@ -320,7 +320,7 @@ def test_an_unknown_over_orders_of_magnitude_has_a_logarithmic_axis() -> None:
 
 
 def test_measured_and_expected_curves_of_each_sensor() -> None:
-    data = dataset(withheld=1)
+    data = dataset(validation=1)
     t = data["time"].values
     measured = np.column_stack([t, 2.0 * t, 3.0 * t])
     measured[4, 1] = np.nan
@@ -328,14 +328,14 @@ def test_measured_and_expected_curves_of_each_sensor() -> None:
     assert texts(ax) == ["s0", "s1", "w0 (validation)"]
     assert [line.get_linestyle() for line in ax.lines[1::2]] == ["-", "-", "--"]
     points, lines = ax.lines[::2], ax.lines[1::2]
-    errors = [data["innovation"][:, 0], data["innovation"][:, 1], data["withheld_error"][:, 0]]
+    errors = [data["innovation"][:, 0], data["innovation"][:, 1], data["validation_error"][:, 0]]
     for k, (point, line) in enumerate(zip(points, lines, strict=True)):
         np.testing.assert_array_equal(point.get_ydata(), measured[:, k])
         np.testing.assert_allclose(line.get_ydata(), measured[:, k] - errors[k].values)
 
 
 def test_the_overview_begins_with_what_was_measured() -> None:
-    data = dataset(scalars={"k": 3.0}, withheld=1)
+    data = dataset(scalars={"k": 3.0}, validation=1)
     t = data["time"].values
     first, *rest = drawn(plots.overview(data, measured=(t, np.ones((30, 3))))).axes
     assert first.get_title().startswith("measured (points)")

@@ -34,7 +34,7 @@ from livepde.runs.summary import digits
 TIMES = range(6)
 
 
-def identifier(unknown=None, withheld=True):
+def identifier(unknown=None, validation=True):
     mesh = lp.interval(0.0, 1.0, 8)
     model = heat(
         mesh, unknown or lp.Scalar(lp.Normal(0.1, 0.05), unit="m^2/s"), {"left": lp.Channel("T0")}
@@ -43,7 +43,7 @@ def identifier(unknown=None, withheld=True):
         model,
         lp.Points({"a": 0.25}, noise=0.1, unit="degC"),
         lp.SensitivityLaw(modes=3),
-        withheld=lp.Points({"b": 0.5}) if withheld else None,
+        validation=lp.Points({"b": 0.5}) if validation else None,
     )
 
 
@@ -169,8 +169,8 @@ def test_a_run_comes_back_as_it_was(tmp_path, driven):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("field", [True, False])
-def test_fields_and_runs_without_withheld_channels(tmp_path, field):
-    one = identifier(withheld=False)
+def test_fields_and_runs_without_validation_channels(tmp_path, field):
+    one = identifier(validation=False)
     if field:
         mesh = lp.interval(0.0, 1.0, 8)
         from livepde.models import EQUATIONS
@@ -300,7 +300,7 @@ def test_measures_and_checks(driven):
     found = measures(data)
     assert found["alpha"] == float(data.alpha[-1])
     assert found["alpha.std"] == float(data.alpha_std[-1])
-    both = np.concatenate([data.innovation.values.ravel(), data.withheld_error.values.ravel()])
+    both = np.concatenate([data.innovation.values.ravel(), data.validation_error.values.ravel()])
     assert found["rmse"] == pytest.approx(np.sqrt(np.mean(both**2)))
     assert found["rmse.a"] == found["rmse.assimilated"]
     assert found["rmse.b"] == found["rmse.validation"]

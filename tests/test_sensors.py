@@ -437,12 +437,12 @@ def test_positions_are_inputs_that_may_be_missing(tmp_path):
     np.testing.assert_array_equal(identifier.estimate().q, again.estimate().q)
     # The channels of validation sensors are inputs, too.
     hidden = lp.Identifier(
-        model, lp.Points({"P": 0.5}, noise=0.1), law, withheld=lp.observation.Moving({"T": "x"})
+        model, lp.Points({"P": 0.5}, noise=0.1), law, validation=lp.observation.Moving({"T": "x"})
     )
     assert hidden.inputs == ("x",)
     hidden.step(0.0, {"P": 0.0, "T": 1.0})
-    assert np.isnan(hidden.step(0.1, {"P": 0.0, "T": 1.0}).withheld_error).all()
-    assert np.isfinite(hidden.step(0.2, {"P": 0.0, "T": 1.0, "x": 0.2}).withheld_error).all()
+    assert np.isnan(hidden.step(0.1, {"P": 0.0, "T": 1.0}).validation_error).all()
+    assert np.isfinite(hidden.step(0.2, {"P": 0.0, "T": 1.0, "x": 0.2}).validation_error).all()
 
 
 @pytest.mark.parametrize(

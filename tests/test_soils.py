@@ -32,7 +32,7 @@ def run(data_dir):
 
 
 @pytest.mark.parametrize("month", ["", "June"])
-def test_soil_with_offsets_meets_the_withheld_sensor(run, month):
+def test_soil_with_offsets_meets_the_validation_sensor(run, month):
     found = run("soil_offsets", month)
     assert found["rmse.validation"] <= 0.25
     assert found["innovation_ratio"] <= 4

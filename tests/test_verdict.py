@@ -17,7 +17,15 @@ from livepde.errors import LawError
 from livepde.laws import Fit
 from livepde.laws.verdict import after_fit
 from livepde.runs import doubts, drive, verdict
-from livepde.verdict import Cause, Dictionary, Finding, Shifts, Verdict, WithheldLedger, discretised
+from livepde.verdict import (
+    Cause,
+    Dictionary,
+    Finding,
+    Shifts,
+    ValidationLedger,
+    Verdict,
+    discretised,
+)
 from livepde.verdict.assess import FACTOR, LONGEST, _possible
 from livepde.verdict.directions import GAIN, LAG, ScoreDirection
 from livepde.verdict.findings import flat
@@ -86,13 +94,13 @@ def run(
     stated: float = 1.0,
     law: Any = None,
     places: Any = None,
-    withheld: Any = None,
+    validation: Any = None,
     u0: float = 0.0,
 ) -> tuple[lp.Identifier, lp.Estimate]:
     """Return identifier and last estimate of a run with some readings."""
     sensors = lp.Points(places or PLACES, noise=NOISE * stated, unit="degC")
     law = law or lp.SensitivityLaw()
-    identifier = lp.Identifier(rod(), sensors, law, u0=u0, withheld=withheld)
+    identifier = lp.Identifier(rod(), sensors, law, u0=u0, validation=validation)
     estimate: Any = None
     for k, t in enumerate(TIMES.tolist()):
         readings = z[k] if not isinstance(z, dict) else {name: z[name][k] for name in z}
@@ -441,22 +449,22 @@ def test_a_checkpoint_carries_the_ledger():
 
 
 @pytest.mark.slow
-def test_withheld_sensors_are_judged_against_what_is_predicted():
+def test_validation_sensors_are_judged_against_what_is_predicted():
     clean = shown(places=(0.25, 0.75, 0.5)) + errors()
     z = {"A": clean[:, 0], "C": clean[:, 1], "W": clean[:, 2]}
     places = {"A": 0.25, "C": 0.75}
-    withheld = lp.Points({"W": 0.5}, noise=NOISE)
-    assert run(z, places=places, withheld=withheld)[1].verdict.level == "trusted"
+    validation = lp.Points({"W": 0.5}, noise=NOISE)
+    assert run(z, places=places, validation=validation)[1].verdict.level == "trusted"
     slow = {**z, "W": np.where(np.arange(len(TIMES)) % 2, z["W"], np.nan)}
-    assert run(slow, places=places, withheld=withheld)[1].verdict.level == "trusted"
+    assert run(slow, places=places, validation=validation)[1].verdict.level == "trusted"
     fahrenheit = {**z, "W": 32.0 + 1.8 * z["W"]}
-    found = run(fahrenheit, places=places, withheld=withheld)[1].verdict
+    found = run(fahrenheit, places=places, validation=validation)[1].verdict
     assert ("unit", "W") in named(found)
     assert "W may be in degF" in found.sentences[0]
 
 
-def test_a_withheld_sensor_with_few_values_is_not_judged():
-    ledger = WithheldLedger.start(1)
+def test_a_validation_sensor_with_few_values_is_not_judged():
+    ledger = ValidationLedger.start(1)
     for _ in range(10):
         ledger = ledger.add(np.array([9.0]), np.zeros(1), np.zeros(1))
     assert list(ledger.findings(["W"])) == []

@@ -65,7 +65,7 @@ class Damage:
 
 def same(one: Record, other: Record) -> bool:
     """Return whether two records agree in every bit."""
-    names = ("numbers", "innovation", "withheld_error")
+    names = ("numbers", "innovation", "validation_error")
     if any(getattr(one, name).tobytes() != getattr(other, name).tobytes() for name in names):
         return False
     if (one.t, one.status, one.steps) != (other.t, other.status, other.steps):

@@ -27,7 +27,7 @@ class Process:
 
     Attributes
     ----------
-    model, observation, u0, scheme, dt_max, halvings, inputs, withheld, assimilate_from
+    model, observation, u0, scheme, dt_max, halvings, inputs, validation, assimilate_from
         As an `Identifier` takes them; `inputs` are the channels at each time.
     times
         Of the samples, shape (times,); the first is the initial time.
@@ -37,7 +37,7 @@ class Process:
         Coefficients of the exact parameter at each time, shape (times, m); None for a real
         process, of which nobody knows them.
     hidden
-        Measured values of the validation sensors, shape (times, withheld).
+        Measured values of the validation sensors, shape (times, validation).
     weights
         Gram matrix of Z, shape (sensors, sensors); None: Euclidean.
     """
@@ -53,7 +53,7 @@ class Process:
     halvings: int = Advance.halvings
     inputs: Sequence[Mapping[str, float]] | None = None
     weights: Array | None = None
-    withheld: Observation | None = None
+    validation: Observation | None = None
     hidden: Array | None = None
     assimilate_from: float = -np.inf
 
@@ -93,7 +93,7 @@ class Data:
     def __iter__(self) -> Iterator[Sample]:
         process = self.process
         names = self.observed.names
-        hidden = process.withheld.names(0) if process.withheld is not None else ()
+        hidden = process.validation.names(0) if process.validation is not None else ()
         for k, t in enumerate(process.times):
             z: Any = self.z[k]
             if process.hidden is not None:

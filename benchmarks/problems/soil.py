@@ -25,7 +25,7 @@ def _process(_: int) -> Process:
     prepared = load(path).prepare()
     identifier = prepared.identifier
     samples = list(prepared.stream)
-    names, hidden = identifier.observed.names, prepared.identifier.withheld
+    names, hidden = identifier.observed.names, prepared.identifier.validation
     rows = [dict(sample.z) for sample in samples]  # type: ignore[arg-type]
     rows = [row | dict(sample.inputs or {}) for row, sample in zip(rows, samples, strict=True)]
 
@@ -47,7 +47,7 @@ def _process(_: int) -> Process:
         scheme=case.scheme,
         dt_max=case.dt_max,
         inputs=[dict(zip(identifier.inputs, row, strict=True)) for row in inputs.tolist()],
-        withheld=case.withheld,
+        validation=case.validation,
         hidden=values(hidden.names if hidden else ()),
         assimilate_from=prepared.assimilate_from,
     )

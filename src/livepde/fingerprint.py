@@ -95,7 +95,7 @@ def _alike(one: Array, other: Array) -> bool:
 
 @nonfinite_allowed()  # at states that the process never has
 def fingerprint(
-    law: AnyLaw, problem: Problem, withheld: Observed | None, q0: Array, u0: Array
+    law: AnyLaw, problem: Problem, validation: Observed | None, q0: Array, u0: Array
 ) -> Fingerprint:
     """Return the fingerprint of an identifier.
 
@@ -103,7 +103,7 @@ def fingerprint(
     """
     probes = _Probes(problem, q0, u0)
     control = replace(problem.control, start=math.nan)
-    sensors = [problem.observed] if withheld is None else [problem.observed, withheld]
+    sensors = [problem.observed] if validation is None else [problem.observed, validation]
     shown = [each for one in sensors for each in probes.of_sensors(one)]
     own: dict[str, tuple[Any, Iterable[Array]]] = {
         "model": ((problem.model.channels, problem.model.X.dim), probes.of_model()),

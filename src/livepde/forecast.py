@@ -27,7 +27,7 @@ class Forecast:
     t
         Times, shape (times,).
     names
-        The assimilated sensors, then the withheld ones.
+        The assimilated sensors, then those for validation.
     z
         Predicted readings, shape (times, sensors); NaN for a sensor whose position is not known.
     z_std

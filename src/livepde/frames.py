@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 MEDIAN = "the median"
 FIRST_ORDER = "to first order: that of the latent value, times the slope of the transform"
 STATISTICS = ("value", "std", "low", "high")
-ERRORS = (("innovation", "sensor"), ("withheld_error", "withheld"))
+ERRORS = (("innovation", "sensor"), ("validation_error", "validation"))
 
 
 def model_errors(data: xr.Dataset) -> ModelErrors | None:
@@ -231,7 +231,7 @@ def _factor(belief: Belief) -> Array:
 
 
 def layout_of(
-    model: Model, observed: Observed, withheld: Observed | None, ignored: Sequence[str] = ()
+    model: Model, observed: Observed, validation: Observed | None, ignored: Sequence[str] = ()
 ) -> Layout:
     """Return names, units and coordinates of the records of a run.
 
@@ -252,10 +252,10 @@ def layout_of(
             comments |= {name: MEDIAN, f"{name}_std": FIRST_ORDER}
     points = model.mesh.p[:, vertex_order(model)]
     components = model.state_space.fields.items()
-    places = {**observed.places, **({} if withheld is None else withheld.places)}
+    places = {**observed.places, **({} if validation is None else validation.places)}
     units = {
         name: unit
-        for one in (observed, withheld)
+        for one in (observed, validation)
         if one is not None
         for name, unit in zip(one.names, one.units, strict=True)
     }
@@ -267,7 +267,7 @@ def layout_of(
         coordinates={axis: x.tolist() for axis, x in zip("xyz", points, strict=False)},
         cells={kind: corners.tolist() for kind, corners in cells(model.mesh).items()},
         sensors=list(observed.names),
-        withheld=None if withheld is None else list(withheld.names),
+        validation=None if validation is None else list(validation.names),
         numbers=numbers,
         units=_units(model),
         scalars=list(model.parameter_space.labels),
@@ -320,7 +320,7 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
             "value": float(data[label][-1]),
             "std": float(data[f"{label}_std"][-1]),
         }
-    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if variable not in data:
             continue
         columns = used_errors(data, variable, dimension).T

@@ -74,7 +74,7 @@ class Hindsight:
         """Return smoothed beliefs, given in reverse time order, as a dataset of the run."""
         records = list(self._records(result, problem, beliefs))
         data = result.layout.dataset(reversed(records))
-        return data.drop_vars("steps").drop_dims(["sensor", "withheld"], errors="ignore")
+        return data.drop_vars("steps").drop_dims(["sensor", "validation"], errors="ignore")
 
     def _records(
         self, result: Result, problem: Problem, beliefs: Iterable[Belief]
@@ -90,12 +90,12 @@ class Hindsight:
 
     @staticmethod
     def _estimate(result: Result, t: float, belief: Belief, status: Status) -> Estimate:
-        withheld = 0 if result.withheld is None else result.withheld.size
+        validation = 0 if result.validation is None else result.validation.size
         return Estimate(
             t=t,
             belief=belief,
             innovation=np.full(result.observed.size, np.nan),
-            withheld_error=np.full(withheld, np.nan),
+            validation_error=np.full(validation, np.nan),
             status=status,
             steps=0,
             diagnose=Diagnostics,

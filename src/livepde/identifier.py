@@ -61,7 +61,7 @@ from livepde.samples import (
 from livepde.showing import Shown, listed, options_of
 from livepde.stepping import MOST_SUBSTEPS, Advance, Between, End, Held, Interval, Scheme
 from livepde.units import conversion
-from livepde.verdict import InputLedger, Verdict, WithheldLedger
+from livepde.verdict import InputLedger, ValidationLedger, Verdict
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -93,10 +93,10 @@ class Identifier(Shown):
         may update the unknowns of the initial state by it. Without one, channels of the model
         whose value at t0 is not known hold their first one over the first interval: the estimate
         (`Estimate.held`) and the verdict name them.
-    withheld
+    validation
         Sensors that are never assimilated, only predicted: a run that misses them is doubted.
     ignored
-        Names of those of `withheld` that are only shown, such as a faulty sensor: how the run
+        Names of those of `validation` that are only shown, such as a faulty sensor: how the run
         predicts them never counts against it.
     scheme, dt_max
         Time scheme, default that of the law (`Law.scheme`); a longer interval between samples is
@@ -153,7 +153,7 @@ class Identifier(Shown):
         q0: Any = None,
         u0: Any = None,
         t0: float = 0.0,
-        withheld: Observation | None = None,
+        validation: Observation | None = None,
         ignored: Collection[str] = (),
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
@@ -178,15 +178,15 @@ class Identifier(Shown):
         self.law = law
         spaces = (model.state_space, model.X, model.parameter_space)
         self.observed: Observed = observation.bind(*spaces)
-        self.withheld = withheld.bind(*spaces) if withheld is not None else None
+        self.validation = validation.bind(*spaces) if validation is not None else None
         self.ignored = tuple(ignored)
-        known_names = self.withheld.names if self.withheld is not None else ()
+        known_names = self.validation.names if self.validation is not None else ()
         for name in self.ignored:
             if name not in known_names:
                 raise ConfigurationError(
-                    f"ignored: '{name}' is none of the sensors in withheld, {list(known_names)}."
+                    f"ignored: '{name}' is none of the sensors in validation, {list(known_names)}."
                 )
-        self._channels = Channels(model.channels, self.observed, self.withheld)
+        self._channels = Channels(model.channels, self.observed, self.validation)
         # Positions of moving sensors are no inputs of the process: they move on lines.
         held = Held.of(between or {}, [c for c in self.inputs if c not in self._optional_inputs])
         # The first steps after the start are short where intervals have to hold their error.
@@ -211,7 +211,7 @@ class Identifier(Shown):
         self._known = self._inputs  # the same, or what holds since the sample of a failed step
         self._samples = 0
         self._fingerprint = self._lazy_fingerprint()
-        self._withheld = WithheldLedger.start(self.withheld.size if self.withheld else 0)
+        self._validation = ValidationLedger.start(self.validation.size if self.validation else 0)
         self._gaps = InputLedger.start(len(self.inputs))
         self._steps = StepLedger.start()
         # Boundary values may come with the first sample; the initial state has to wait for them
@@ -223,7 +223,7 @@ class Identifier(Shown):
         _, model = self.model._shown()
         rows = {name: text for name, text in model.items() if name.startswith("unknown ")}
         rows = {"equation": model["equation"], **rows, "law": options_of(self.law)}
-        for kind, sensors in (("sensors", self.observed), ("validation", self.withheld)):
+        for kind, sensors in (("sensors", self.observed), ("validation", self.validation)):
             if sensors is not None:
                 rows[kind] = listed(sensors.names)
         if self.inputs:
@@ -234,7 +234,7 @@ class Identifier(Shown):
         return f"Identifier after {self._samples} samples", rows
 
     def _lazy_fingerprint(self) -> Callable[[], Fingerprint]:
-        parts = self.law, self.problem, self.withheld
+        parts = self.law, self.problem, self.validation
         return cache(partial(fingerprint, *parts, self._q0, self._u0))  # copies share it
 
     def _started(self, q0: Array, u0: Array, errors: Array) -> Identifier:
@@ -395,7 +395,7 @@ class Identifier(Shown):
         """Take one sample; return the estimate, and the interval that the law was given."""
         t, origin = self._counted(t)
         t = self._time_of_next(t)
-        measured, noise, withheld, named = self._channels.parse(z, inputs or {})
+        measured, noise, validation, named = self._channels.parse(z, inputs or {})
         if noise is not None:
             self._check_weighs(noise)
         values, held = self._filled(named)
@@ -425,7 +425,7 @@ class Identifier(Shown):
             last = {name: values[name] for name in self.problem.control.held.last}
             self._known = Inputs({**self._known, **last})
         held = (*held, *unstated)
-        estimate = self._estimate(t, measured, withheld, values, report, held, scored=True)
+        estimate = self._estimate(t, measured, validation, values, report, held, scored=True)
         return estimate, replace(interval, parts=report.parts)
 
     def _filled(self, named: Mapping[str, float]) -> tuple[Inputs, tuple[str, ...]]:
@@ -513,7 +513,7 @@ class Identifier(Shown):
     @property
     def _place(self) -> tuple[Any, ...]:
         """Snapshot for `return_to`, of values that a step replaces but never changes in place."""
-        ledgers = self._withheld, self._gaps, self._steps, self._origin
+        ledgers = self._validation, self._gaps, self._steps, self._origin
         inputs = self._inputs, self._known
         return self._state, self._t, self._z, inputs, self._samples, ledgers
 
@@ -521,7 +521,7 @@ class Identifier(Shown):
         """Go back to a snapshot by `place`, as if no sample had been taken since then."""
         self._state, self._t, self._z, inputs, self._samples, ledgers = place
         self._inputs, self._known = inputs
-        self._withheld, self._gaps, self._steps, self._origin = ledgers
+        self._validation, self._gaps, self._steps, self._origin = ledgers
 
     def _check_weighs(self, noise: Array | None) -> None:
         """Refuse the noise of readings where the law does not weigh them; None: there is none."""
@@ -546,7 +546,7 @@ class Identifier(Shown):
         self,
         t: float,
         measured: Array,
-        withheld: Array,
+        validation: Array,
         inputs: Inputs,
         report: Report,
         held: tuple[str, ...],
@@ -556,23 +556,23 @@ class Identifier(Shown):
         # Estimates that are kept hold the small state of the law; mean and factors are computed
         # when read.
         latent, judge = self.law.deferred(self._work, self._state)
-        problem, error = self.problem, withheld
+        problem, error = self.problem, validation
         read = latent if self.model.latent.plain else lambda: problem.physical(latent())
-        if self.withheld is not None:
+        if self.validation is not None:
             belief = read()
             read = lambda: belief  # noqa: E731
-            predicted = self.withheld.predict(belief.u, belief.q, Moment(t, inputs))
-            error = withheld - predicted
+            predicted = self.validation.predict(belief.u, belief.q, Moment(t, inputs))
+            error = validation - predicted
             if scored and t >= self.assimilate_from:
                 # Of the predicted values, without the noise of the sensors.
-                rows = seen_rows(self.withheld, belief, Moment(t, inputs))
+                rows = seen_rows(self.validation, belief, Moment(t, inputs))
                 variance = np.zeros(len(error)) if rows is None else (rows * rows).sum(axis=1)
-                self._withheld = self._withheld.add(withheld, predicted, variance)
+                self._validation = self._validation.add(validation, predicted, variance)
         return Estimate.deferred(
             read,
             t=t,
             innovation=measured - report.predicted,
-            withheld_error=error,
+            validation_error=error,
             status=report.status,
             steps=report.steps,
             diagnose=lambda: report.diagnostics,
@@ -587,8 +587,8 @@ class Identifier(Shown):
         self, judge: Callable[[], Verdict], diagnose: Callable[[], Diagnostics[float]]
     ) -> Callable[[], Verdict]:
         """Return the verdict of the law with the findings on steps, validation sensors and gaps."""
-        withheld, gaps, steps = self._withheld, self._gaps, self._steps
-        names, ignored = self.withheld.names if self.withheld is not None else (), self.ignored
+        validation, gaps, steps = self._validation, self._gaps, self._steps
+        names, ignored = self.validation.names if self.validation is not None else (), self.ignored
         inputs = self._channels.inputs
         if not names and not steps.irregular and gaps.silent:
             return judge
@@ -596,7 +596,7 @@ class Identifier(Shown):
         def found() -> Verdict:
             held = gaps.findings(inputs, diagnose().shifts)
             return judge().with_findings(
-                [*steps.findings(), *withheld.findings(names, ignored), *held]
+                [*steps.findings(), *validation.findings(names, ignored), *held]
             )
 
         return found
@@ -614,7 +614,7 @@ class Identifier(Shown):
                 f"No estimate before the first sample: it brings the inputs {list(self.inputs)}."
             )
         nothing = np.full(self.observed.size, np.nan)
-        hidden = np.full(self.withheld.size if self.withheld else 0, np.nan)
+        hidden = np.full(self.validation.size if self.validation else 0, np.nan)
         belief = self._belief()
         moment = Moment(self._t, self._inputs)
         predicted = self.observed.predict(belief.u, belief.q, moment)
@@ -801,7 +801,7 @@ class Identifier(Shown):
         given = {name: value for name, value in options.items() if value is not None}
         stream = self._samples_of(stream, given)
         result = Result(
-            self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
+            self.model, self.observed, self.validation, fields_every, ignored=self.ignored
         )
         begun, taken = copy.copy(self), list[Sample]()  # states of laws are values
         result.smoother = partial(begun.smoothed, taken, fields_every=fields_every)
@@ -909,7 +909,7 @@ class Identifier(Shown):
                 before = self._start(Inputs(interval.inputs0))
             run.add(estimate, interval, who._latent_belief().q)
         result = Result(
-            self.model, self.observed, self.withheld, fields_every, ignored=self.ignored
+            self.model, self.observed, self.validation, fields_every, ignored=self.ignored
         )
         result.layout = who._dated(result.layout)
         data = run.fixed_interval(fields_every)
@@ -976,8 +976,8 @@ class Identifier(Shown):
             "samples": self._samples,
             "inputs": np.array([self._inputs[c] for c in self._inputs]),
             "known": np.array([self._known[c] for c in self._known]),
-            "withheld": self._withheld.sums,
-            "withheld_last": self._withheld.last,
+            "validation": self._validation.sums,
+            "validation_last": self._validation.last,
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
             "steps": self._steps.counts,
@@ -1026,7 +1026,7 @@ class Identifier(Shown):
             t, samples = float(leaves["t"]), int(leaves["samples"])
             origin = float(leaves["origin"])
             z = checkpoint.rebuild(self._z, leaves, "z")
-            withheld = WithheldLedger(leaves["withheld"], leaves["withheld_last"])
+            validation = ValidationLedger(leaves["validation"], leaves["validation_last"])
             gaps = InputLedger(
                 counts=leaves["held_counts"].astype(np.int64),
                 held=leaves["held"],
@@ -1047,7 +1047,7 @@ class Identifier(Shown):
             ) from error
         self._t, self._samples, self._z, self._origin = t, samples, z, origin
         self._inputs, self._known = inputs, known
-        self._state, self._withheld, self._gaps, self._steps = state, withheld, gaps, steps
+        self._state, self._validation, self._gaps, self._steps = state, validation, gaps, steps
         if state is None and not self.inputs:
             self._begin(inputs)
 

@@ -100,7 +100,7 @@ class Record:
 
     Attributes
     ----------
-    t, steps, notes, innovation, withheld_error
+    t, steps, notes, innovation, validation_error
         Attributes of the estimate.
     numbers
         Values of the variables `Layout.numbers`, shape (numbers,).
@@ -113,7 +113,7 @@ class Record:
     t: float
     numbers: Array
     innovation: Array
-    withheld_error: Array
+    validation_error: Array
     status: int
     steps: int
     notes: Mapping[str, float]
@@ -162,7 +162,7 @@ class RecordArrays:
         count = len(self._t)
         # All is converted before anything is kept: a value that is no number changes nothing.
         notes = {name: float(value) for name, value in record.notes.items()}
-        found = (record.numbers, record.innovation, record.withheld_error)
+        found = (record.numbers, record.innovation, record.validation_error)
         numbers, innovation, error = (np.asarray(part, dtype=float).tobytes() for part in found)
         for name, value in notes.items():
             column = self._notes.get(name)
@@ -188,7 +188,7 @@ class RecordArrays:
 
     def __iter__(self) -> Iterator[Record]:
         kept = dict(self.snapshots())
-        rows = zip(self.numbers, self.innovation, self.withheld_error, strict=True)
+        rows = zip(self.numbers, self.innovation, self.validation_error, strict=True)
         notes = self.notes
         for k, (numbers, innovation, error) in enumerate(rows):
             said = {name: float(column[k]) for name, column in notes.items()}
@@ -196,7 +196,7 @@ class RecordArrays:
                 t=self._t[k],
                 numbers=numbers,
                 innovation=innovation,
-                withheld_error=error,
+                validation_error=error,
                 status=self._status[k],
                 steps=self._steps[k],
                 notes={name: value for name, value in said.items() if not math.isnan(value)},
@@ -228,8 +228,8 @@ class RecordArrays:
         return self._table(self._innovation)
 
     @property
-    def withheld_error(self) -> Array:
-        """Errors of the validation sensors, shape (samples, withheld)."""
+    def validation_error(self) -> Array:
+        """Errors of the validation sensors, shape (samples, validation)."""
         return self._table(self._error)
 
     @property
@@ -343,9 +343,9 @@ class Layout:
     # Kind of cell as meshio names it ("triangle", "tetra", ...) -> vertices of each; of an interval
     # none, its vertices are in order
     cells: Mapping[str, Sequence[Sequence[int]]]
-    # sensors, withheld: names of the sensors; `withheld` is None if no sensor is withheld
+    # sensors, validation: names of the sensors; `validation` is None if there are none
     sensors: Sequence[str]
-    withheld: Sequence[str] | None
+    validation: Sequence[str] | None
     # Variable over time -> its attributes, in the order of `Record.numbers`
     numbers: Mapping[str, Mapping[str, Any]]
     units: Mapping[str, str]  # unknown or component of the state -> unit
@@ -355,13 +355,13 @@ class Layout:
     fields: Sequence[str]
     state: Sequence[str]
     length_unit: str = ""  # unit of coordinates
-    # Sensor, withheld or not, that is at one point -> its coordinates
+    # Sensor, of either kind, that is at one point -> its coordinates
     places: Mapping[str, Sequence[float]] = field(default_factory=dict)
     # Attributes of the dataset: title, origin (the date of t = 0), equation
     attrs: Mapping[str, Any] = field(default_factory=dict)
     # Variable of a field -> what its numbers are, where that is not a mean or a standard deviation
     comments: Mapping[str, str] = field(default_factory=dict)
-    # Sensor, withheld or not -> its unit; empty if they have one in common
+    # Sensor, of either kind -> its unit; empty if they have one in common
     sensor_units: Mapping[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -416,17 +416,17 @@ class Layout:
 
     def _coordinates(self, times: Array, snapshots: Array) -> dict[str, Any]:
         """Return the coordinates of the dataset: times of samples and of fields, and places."""
-        unit, withheld = {"units": self.length_unit}, self.withheld or ()
+        unit, validation = {"units": self.length_unit}, self.validation or ()
         return {
             "time": ("time", times, {"units": self.time_unit}),
             "snapshot": ("snapshot", snapshots),
             "sensor": ("sensor", list(self.sensors)),
-            **({"withheld": ("withheld", list(withheld))} if withheld else {}),
+            **({"validation": ("validation", list(validation))} if validation else {}),
             **{axis: ("vertex", np.array(x), unit) for axis, x in self.coordinates.items()},
             **self._places("sensor", self.sensors),
-            **self._places("withheld", withheld),
+            **self._places("validation", validation),
             **self._sensor_units("sensor", self.sensors),
-            **self._sensor_units("withheld", withheld),
+            **self._sensor_units("validation", validation),
         }
 
     def _places(self, dimension: str, names: Sequence[str]) -> dict[str, Any]:
@@ -476,7 +476,7 @@ class Layout:
                 t=0.0,
                 numbers=np.zeros(0),
                 innovation=np.zeros(1),
-                withheld_error=np.zeros(1),
+                validation_error=np.zeros(1),
                 status=0,
                 steps=1,
                 notes={},
@@ -514,9 +514,9 @@ class Layout:
         unit = {"units": self.sensor_unit}
         innovations = np.reshape(rows.innovation, (len(rows), len(self.sensors)))
         data: dict[str, Any] = {"innovation": (("time", "sensor"), innovations, unit)}
-        if self.withheld:
-            errors = np.reshape(rows.withheld_error, (len(rows), len(self.withheld)))
-            data["withheld_error"] = (("time", "withheld"), errors, unit)
+        if self.validation:
+            errors = np.reshape(rows.validation_error, (len(rows), len(self.validation)))
+            data["validation_error"] = (("time", "validation"), errors, unit)
         return data
 
 

@@ -69,7 +69,7 @@ class Estimate(Shown):
         Measured minus expected before the sample was used, shape (sensors,); NaN where missing.
         For `GradientLaw`, which pulls the state to the sample within the step, the output error
         after the step.
-    withheld_error
+    validation_error
         Measured minus estimated of each validation channel.
     status
         Status of the step; unless ok, q and u are those of the last successful step.
@@ -103,7 +103,7 @@ class Estimate(Shown):
     t: float
     belief: Belief
     innovation: Array
-    withheld_error: Array
+    validation_error: Array
     status: Status
     steps: int
     diagnose: Callable[[], Diagnostics[float]]
@@ -330,7 +330,7 @@ class Result(Shown):
         self,
         model: Model,
         observed: Observed,
-        withheld: Observed | None,
+        validation: Observed | None,
         fields_every: int = 1,
         records: Records | None = None,
         layout: Layout | None = None,
@@ -339,7 +339,7 @@ class Result(Shown):
     ) -> None:
         self.model = model
         self.observed = observed
-        self.withheld = withheld
+        self.validation = validation
         self.fields_every = fields_every
         self.last: Estimate | None = None
         self._settled: Belief | None = None
@@ -349,7 +349,7 @@ class Result(Shown):
         # From q and draws of it to the readings that they lead to, and their deviations.
         self.expected: Callable[[Array, Array], tuple[Array, Array]] | None = None
         self.records: Records = RecordArrays() if records is None else records
-        self.layout = layout or layout_of(model, observed, withheld, ignored)
+        self.layout = layout or layout_of(model, observed, validation, ignored)
         # Of a result that was pickled: its records are complete, and the model is not there.
         self._complete, self._last_fields = False, cast("Snapshot | None", None)
         self._count = len(self.records) if count is None else count
@@ -415,7 +415,7 @@ class Result(Shown):
             t=estimate.t,
             numbers=np.array(self._readout(estimate.belief)),
             innovation=estimate.innovation,
-            withheld_error=estimate.withheld_error,
+            validation_error=estimate.validation_error,
             status=STATUS_CODES.index(estimate.status.code),
             steps=estimate.steps,
             notes=estimate.diagnostics.named(),
@@ -441,7 +441,7 @@ class Result(Shown):
 
         The index has dates if the samples have. Columns are, for an unknown `alpha`: `alpha`,
         `alpha_std`, `alpha_low` and `alpha_high`; for a sensor `T_1` `innovation:T_1`, or
-        `withheld_error:T_1` if it is withheld; and `status`.
+        `validation_error:T_1` for validation; and `status`.
         """
         return frame(self.dataset())
 
@@ -589,7 +589,7 @@ class Result(Shown):
     def predicted(self) -> pd.DataFrame:
         """Readings as the model predicted them, one row for each sample.
 
-        Of assimilated sensors before their reading was used, of withheld ones after the update;
+        Of assimilated sensors before a reading was used, of validation sensors after the update;
         NaN where there is no reading. Raises as `measured`.
         """
         return self.measured - self.residuals
@@ -601,7 +601,9 @@ class Result(Shown):
 
         data = self.dataset()
         columns = over_time(data, "innovation", "sensor")
-        return pd.DataFrame(columns | over_time(data, "withheld_error", "withheld"), times(data))
+        return pd.DataFrame(
+            columns | over_time(data, "validation_error", "validation"), times(data)
+        )
 
     def _last(self, what: str) -> Estimate:
         if self.last is None:
@@ -611,7 +613,7 @@ class Result(Shown):
     def dataset(self) -> xr.Dataset:
         """Return the dataset that a run directory holds.
 
-        Its dimensions are time, snapshot, vertex, sensor and withheld.
+        Its dimensions are time, snapshot, vertex, sensor and validation.
         Scalar unknowns are variables over `time`, fields over (`snapshot`, `vertex`), with `_std`
         variables beside them, and `_low` and `_high`, the ends of the 95 % interval, for unknowns
         with a transform or bounds; innovations over (`time`, `sensor`). Units are attributes. Of a
@@ -662,12 +664,12 @@ class Result(Shown):
         }
         if self.readings is not None:
             own["readings"] = partial(kept, self.readings())
-        left = ("model", "observed", "withheld", "_readout", "_settled")
+        left = ("model", "observed", "validation", "_readout", "_settled")
         return {k: v for k, v in vars(self).items() if k not in left} | own
 
     def __getattr__(self, name: str) -> Any:
         # Python calls this only for names that are not there: those that `__getstate__` leaves out.
-        if name in ("model", "observed", "withheld", "_readout", "_settled"):
+        if name in ("model", "observed", "validation", "_readout", "_settled"):
             raise ConfigurationError(
                 "this result was pickled, without its model: it has its estimates, datasets and "
                 "tables. To add samples or to smooth, run an identifier again."

@@ -235,7 +235,7 @@ class Channels:
     ----------
     forced
         Channels that the model reads.
-    observed, withheld
+    observed, validation
         Assimilated sensors, and validation sensors, which are only scored.
 
     Raises
@@ -246,7 +246,7 @@ class Channels:
 
     forced: tuple[str, ...]
     observed: Observed
-    withheld: Observed | None
+    validation: Observed | None
 
     def __post_init__(self) -> None:
         both = [name for name in self.hidden if name in self.observed.names]
@@ -263,12 +263,12 @@ class Channels:
     @cached_property
     def hidden(self) -> tuple[str, ...]:
         """Names of the validation sensors."""
-        return self.withheld.names if self.withheld else ()
+        return self.validation.names if self.validation else ()
 
     @cached_property
     def sensors(self) -> list[Observed]:
-        """Observation operators: the assimilated, and the withheld one if present."""
-        return [item for item in (self.observed, self.withheld) if item is not None]
+        """Observation operators: the assimilated, and that for validation if present."""
+        return [item for item in (self.observed, self.validation) if item is not None]
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -301,7 +301,7 @@ class Channels:
     def parse(
         self, z: Readings, inputs: Mapping[str, float]
     ) -> tuple[Array, Array | None, Array, dict[str, float]]:
-        """Return assimilated values and their noise, withheld values, and inputs, all checked.
+        """Return assimilated values and their noise, validation values, and inputs, all checked.
 
         The noise is None if no value has one of its own, NaN where one has none. Among the inputs
         may be other channels.
@@ -310,11 +310,11 @@ class Channels:
             row = labelled(z)
             z = row if row is z else self._columns(row)
         if not isinstance(z, np.ndarray) and isinstance(z, Mapping):
-            measured, noise, withheld, named = self._by_name(z, inputs)
+            measured, noise, validation, named = self._by_name(z, inputs)
         else:
             measured, noise = readings(z, self.observed)
-            withheld, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
-        return measured, noise, withheld, named | self._named(inputs) if inputs else named
+            validation, named = np.full(len(self.hidden), np.nan) if self.hidden else NOTHING, {}
+        return measured, noise, validation, named | self._named(inputs) if inputs else named
 
     def _columns(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return a row of a table without the columns that are no channel, as `run` reads a table.
@@ -351,8 +351,8 @@ class Channels:
             usual = type(value) is float and math.isfinite(value)
             values[name] = value if usual else number(value, f"channel '{name}'")
         noise = own_noise(_row(self.observed.names, stds)) if stds else None
-        withheld = _row(self.hidden, values) if self.hidden else NOTHING
-        return _row(self.observed.names, values), noise, withheld, values
+        validation = _row(self.hidden, values) if self.hidden else NOTHING
+        return _row(self.observed.names, values), noise, validation, values
 
     def _pair(self, name: str, given: Sequence[Any]) -> tuple[Any, float]:
         """Return value and noise of a reading given as a pair."""

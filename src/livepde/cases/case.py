@@ -109,7 +109,7 @@ class Prepared:
             law,
             u0=self.u0,
             t0=float(self.first.t),
-            withheld=case.withheld,
+            validation=case.validation,
             ignored=case.ignored,
             scheme=case.scheme,
             dt_max=case.dt_max,
@@ -152,7 +152,7 @@ class Prepared:
     def layout(self) -> Layout:
         """Layout of the records of a run, with title, start, units and references of the case."""
         who = self.identifier
-        return self.described(layout_of(who.model, who.observed, who.withheld, who.ignored))
+        return self.described(layout_of(who.model, who.observed, who.validation, who.ignored))
 
     def described(self, found: Layout) -> Layout:
         """Return a layout with the references, unit of length and attributes of the case."""
@@ -243,7 +243,7 @@ class Case(CaseContent):
     def check(self) -> None:
         """Build all parts that need no data; raises `CaseError`."""
         # In this order: an error about the mesh comes before those about what lies on it.
-        _ = self.mesh, self.options, self.model, self.observation, self.withheld, self.law
+        _ = self.mesh, self.options, self.model, self.observation, self.validation, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
         _ = input_noise_of(self), wall_attributes(self, self.model)
         check_initial(self)
@@ -317,8 +317,8 @@ class Case(CaseContent):
         return tuple(self.roles("sensor"))
 
     @cached_property
-    def withheld(self) -> Observation | None:
-        """The sensors that are predicted only, withheld or ignored; None if there are none."""
+    def validation(self) -> Observation | None:
+        """The sensors that are predicted only, or ignored; None if there are none."""
         return observation_of(self, "validation", "ignored")
 
     @property

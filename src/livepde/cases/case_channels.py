@@ -342,7 +342,7 @@ def between_of(case: CaseContent) -> dict[str, Between]:
 def initial_of(case: CaseContent, first: Sample) -> Any:
     """Return the initial state: a number (of each component), or the first sample interpolated.
 
-    Withheld channels take no part.
+    Validation channels take no part.
     """
     if case.spec.initial is None:
         raise case.missing("initial", "a number, or 'interpolate' from the first sample.")

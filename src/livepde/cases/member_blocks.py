@@ -114,7 +114,7 @@ class MemberBlock:
             list(self.members),
             u0=[member.u0 for member in self._each],
             t0=float(one.first.t),
-            withheld=case.withheld,
+            validation=case.validation,
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=one.assimilate_from,
@@ -175,7 +175,7 @@ class MemberBlock:
         if self._written:
             return Journal.open(path, write=True)
         layout = layout_of(
-            identifier.model, identifier.observed, identifier.withheld, one.case.ignored
+            identifier.model, identifier.observed, identifier.validation, one.case.ignored
         )
         journal = Journal.create(path, identifier.channels, one.described(layout))
         for (kind, channel), number in self._tables[k].remarks.items():
@@ -209,7 +209,7 @@ class MemberBlock:
             result = Result(
                 fleet.model,
                 fleet.observed,
-                fleet.withheld,
+                fleet.validation,
                 self._kept.fields_every,
                 journal,
                 layout=journal.layout,

@@ -98,7 +98,7 @@ class VariantRun:
     misfits
         Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
         one step ahead, second half of the samples.
-    errors, withheld
+    errors, validation
         Assimilated and validation sensor -> root mean square of its errors one step ahead, second
         half of the samples.
     unknowns
@@ -113,7 +113,7 @@ class VariantRun:
     same_readings: float | None = None
     misfits: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
-    withheld: Mapping[str, float] = field(default_factory=dict)
+    validation: Mapping[str, float] = field(default_factory=dict)
     estimates: Mapping[str, LastEstimate] = field(default_factory=dict)
     unknowns: int = 0
 
@@ -128,9 +128,9 @@ class VariantRun:
         return _pooled(self.misfits.values())
 
     @property
-    def withheld_error(self) -> float:
+    def validation_error(self) -> float:
         """Root mean square over the validation sensors; NaN if there are none."""
-        return _pooled(self.withheld.values())
+        return _pooled(self.validation.values())
 
     @property
     def causes(self) -> list[Cause]:
@@ -175,7 +175,7 @@ class VariantRun:
             "log_evidence": _number(self.log_evidence),
             "readings": dict(self.readings),
             "misfit": _number(self.misfit),
-            "withheld_error": _number(self.withheld_error),
+            "validation_error": _number(self.validation_error),
             "unknowns": self.unknowns,
             "estimates": numbers,
             "verdict": dict(self.verdict),
@@ -232,7 +232,7 @@ def run_variant(
 def _run(prepared: Prepared, samples: Iterable[Sample], *, columns: bool) -> Result:
     """Run a case; `columns`: whether its verdict looks for errors of single columns."""
     who = prepared.identifier
-    result = Result(who.model, who.observed, who.withheld, EVERY, layout=prepared.layout)
+    result = Result(who.model, who.observed, who.validation, EVERY, layout=prepared.layout)
     for sample in samples:
         result.add(who.step(sample.t, sample.z, sample.inputs))
     if result.last is not None:
@@ -298,7 +298,7 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
         readings=readings,
         misfits=_misfits(data) if errors is None else dict(errors.sensors),
         errors={n: rmse(one.later) for n, one in channels.items() if one.role == "assimilated"},
-        withheld={n: rmse(one.later) for n, one in channels.items() if one.role == "validation"},
+        validation={n: rmse(one.later) for n, one in channels.items() if one.role == "validation"},
         estimates=estimates,
         unknowns=len(labels) + sum(modes),
     )
@@ -345,13 +345,13 @@ def _worse(one: VariantRun, base: VariantRun) -> bool:
 
     Each sensor counts: they may have different units, and one may not hide behind another.
     """
-    return any(_worse_at(one, name, error) for name, error in base.withheld.items())
+    return any(_worse_at(one, name, error) for name, error in base.validation.items())
 
 
 def _worse_at(one: VariantRun, name: str, error: float) -> bool:
     """Return whether a run predicts a validation sensor worse than by this error, or not."""
     limit = error * (1.0 + WORSE)
-    return math.isfinite(error) and not one.withheld.get(name, math.nan) <= limit
+    return math.isfinite(error) and not one.validation.get(name, math.nan) <= limit
 
 
 def conclusions(base: VariantRun, others: Sequence[VariantRun]) -> list[str]:
@@ -379,7 +379,7 @@ def _failures(others: Sequence[VariantRun]) -> Iterator[str]:
 
 def _recommendation(base: VariantRun, best: VariantRun) -> str:
     if best is base:
-        which = " that predicts the validation sensors as well" if base.withheld else ""
+        which = " that predicts the validation sensors as well" if base.validation else ""
         return (
             f"Recommended: the case, unchanged. No variant{which} gains more than {GAINED:g} of "
             "log evidence."
@@ -388,8 +388,8 @@ def _recommendation(base: VariantRun, best: VariantRun) -> str:
         f"Recommended: '{best.variant.name}'. Its log evidence is {best.gained(base):.4g} larger "
         f"than that of the case, and its verdict '{best.level}'."
     )
-    if math.isfinite(base.withheld_error):
-        errors = f"{best.withheld_error:.3g} instead of {base.withheld_error:.3g}"
+    if math.isfinite(base.validation_error):
+        errors = f"{best.validation_error:.3g} instead of {base.validation_error:.3g}"
         text += f" Its error at the validation sensors is {errors}."
     else:
         text += " No validation sensor confirms it."
@@ -401,8 +401,8 @@ def _remarks(base: VariantRun, others: Sequence[VariantRun]) -> Iterator[str]:
     for one in others:
         if one.gained(base) > GAINED and _worse(one, base):
             errors = (
-                f"{name} {one.withheld.get(name, math.nan):.3g} instead of {error:.3g}"
-                for name, error in base.withheld.items()
+                f"{name} {one.validation.get(name, math.nan):.3g} instead of {error:.3g}"
+                for name, error in base.validation.items()
                 if _worse_at(one, name, error)
             )
             yield (

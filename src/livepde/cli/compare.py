@@ -199,7 +199,7 @@ def _tables(base: VariantRun, found: Sequence[VariantRun], best: VariantRun) -> 
                 one.level,
                 shown(one.gained(base), "+.1f"),
                 shown(one.misfit, ".2g"),
-                shown(one.withheld_error, ".3g"),
+                shown(one.validation_error, ".3g"),
                 one.unknowns,
                 f"no: {', '.join(apart)}" if apart else "yes",
                 *cells,

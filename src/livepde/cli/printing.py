@@ -56,7 +56,7 @@ def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict
 
     if not dataset.sizes["time"]:
         return {}
-    kinds = [of for of in ("sensor", "withheld") if of in dataset]
+    kinds = [of for of in ("sensor", "validation") if of in dataset]
     names = [str(name) for of in kinds for name in dataset[of].values]
     if journal is None or not names or len(journal) > MOST_CURVES:
         return {"overview": lambda: plots.overview(dataset, title=title)}

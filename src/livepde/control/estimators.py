@@ -332,7 +332,7 @@ class Learned:
     def step(self, t: float, z: Any, inputs: Mapping[str, float]) -> Known:
         identifier, model = self.identifier, self.nominal.model
         self.estimate = estimate = identifier.step(t, z, inputs)  # a bad sample changes nothing
-        if isinstance(z, Mapping):  # with what is withheld, perhaps
+        if isinstance(z, Mapping):  # with validation sensors, perhaps
             z = {name: z[name] for name in model.sensors.names if name in z}
         # The nominal filter runs at every sample, trusted or not, so that a fallback starts from a
         # converged state.

@@ -105,11 +105,11 @@ def summary(seen: RunView) -> str:
     for name, labels in groups(data).items():
         names.append(name if labels == [name] else f"{name} ({len(labels)} values)")
     names += [f"{name} (field)" for name in field_names(data)]
-    sensors, withheld = (data.sizes.get(size, 0) for size in ("sensor", "withheld"))
+    sensors, validation = (data.sizes.get(size, 0) for size in ("sensor", "validation"))
     found = f"Estimates {', '.join(names) or 'the state only'} from {sensors} sensor"
     found += "s" * (sensors != 1)
-    if withheld:
-        found += f", validated with {withheld} more"
+    if validation:
+        found += f", validated with {validation} more"
     return f"{found}."
 
 
@@ -288,7 +288,7 @@ def _event_tables(seen: RunView) -> Iterator[Any]:
 
 def _sensor_table(data: xr.Dataset) -> Any:
     last: dict[str, float] = {}
-    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if variable in data:
             names = [str(name) for name in data[dimension].values]
             last |= dict(zip(names, data[variable].values[-1].tolist(), strict=True))

@@ -78,7 +78,7 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
         return []
     found = [*_measured_panels(data, at), *_unknown_panels(data, at)]
     found += _field_panels(data, at, cut)
-    for variable, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+    for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if variable in data and data.sizes.get(dimension):
             found.append(_residual_panel(data, variable, dimension, at))
     if note(data, "innovation_ratio") is not None:
@@ -112,7 +112,7 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
     for unit in dict.fromkeys(units.values()):
         shown = [name for name in names if units[name] == unit]
         about = "Points: readings. Lines: what the model expected of them one step ahead."
-        if any(name in data["withheld"] for name in shown if "withheld" in data):
+        if any(name in data["validation"] for name in shown if "validation" in data):
             about += " Dashed: validation sensors, which it never uses."
         if len(shown) > MOST_LINES:
             about += f" The first {MOST_LINES} of {len(shown)} sensors."
@@ -129,7 +129,7 @@ def measured(
     data = _bounded(data)
     figure, axis = over_time(data, labelled("", unit).strip().strip("[]"), at)
     t = axis.values(data["time"].values)
-    for error, dimension in (("innovation", "sensor"), ("withheld_error", "withheld")):
+    for error, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if error not in data:
             continue
         names = [str(name) for name in data[dimension].values]
@@ -141,7 +141,7 @@ def measured(
             if name not in sensors:
                 continue
             colour = PALETTE[list(sensors).index(name) % len(PALETTE)]
-            withheld = dimension == "withheld"
+            validation = dimension == "validation"
             about = {"legendgroup": name, "hovertemplate": "%{y:.4g}"}
             figure.add_scatter(
                 x=t,
@@ -152,8 +152,8 @@ def measured(
                 showlegend=False,
                 **about,
             )
-            label = text(f"{name} (validation)" if withheld else name)
-            dash = "dash" if withheld else None
+            label = text(f"{name} (validation)" if validation else name)
+            dash = "dash" if validation else None
             mode = "lines+markers" if len(t) == 1 else "lines"
             line(
                 figure,
@@ -320,7 +320,7 @@ def residuals(
 ) -> go.Figure:
     """Draw errors of sensors over time: each, or of many their range.
 
-    `variable`, `dimension`: "innovation" over "sensor", or "withheld_error" over "withheld".
+    `variable`, `dimension`: "innovation" over "sensor", or "validation_error" over "validation".
     """
     data = _bounded(data)
     figure, axis = over_time(data, unit_label(data, variable), at)

@@ -25,7 +25,10 @@ from livepde.runs.journal import Event
 T = TypeVar("T")
 
 # Errors of sensors -> name of their readings in the dataset of a view, which no unknown has.
-READINGS = {"innovation": "readings of sensors", "withheld_error": "readings of validation sensors"}
+READINGS = {
+    "innovation": "readings of sensors",
+    "validation_error": "readings of validation sensors",
+}
 ROWS = 2000  # estimates that are kept to be drawn
 NOTABLE = 500  # failed steps and jumps that are kept beside them
 FIELDS = 400  # snapshots
@@ -113,7 +116,7 @@ class RunView:
 def with_readings(data: xr.Dataset, readings: Array) -> xr.Dataset:
     """Return a dataset with the readings of its sensors and validation sensors, `READINGS`.
 
-    `readings`: shape (time, sensors), the withheld ones last.
+    `readings`: shape (time, sensors), those for validation last.
     """
     parts = np.split(readings, [data.sizes["sensor"]], axis=1)
     return data.assign(
@@ -224,7 +227,7 @@ class View:
             layout, count = journal.layout, journal.estimated
             events, counts, unwell = journal.events, journal.counts, journal.health
             verdict = journal.verdict
-        names = [*layout.sensors, *(layout.withheld or ())]
+        names = [*layout.sensors, *(layout.validation or ())]
         for number, record in new:
             self._add(number, record)
             values = readings.get(number, {})

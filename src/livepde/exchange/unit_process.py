@@ -88,7 +88,7 @@ class UnitProcess:
     title: str
     model: Model
     inputs: tuple[Port, ...]  # input channels, read at each communication point
-    # Sensor channels whose model values are outputs, including withheld ones
+    # Sensor channels whose model values are outputs, including those for validation
     sensors: tuple[Port, ...]
     # Function that returns the identifier started by a first sample; it may raise `LivepdeError`
     begin: Callable[[Sample], Identifier]
@@ -172,7 +172,7 @@ class UnitProcess:
                 deviations = profiles.get(f"{name}_std", np.full_like(values, math.nan))
                 for pair in zip(values.tolist(), deviations.tolist(), strict=True):
                     found += self._pair(*pair)
-        # A forecast for the present has the model's values of all sensors, withheld ones too.
+        # A forecast for the present has the model's values of all sensors, validation ones too.
         now = identifier.forecast(identifier.t)
         return [*found, *(port.given(float(now[port.name][0])) for port in self.sensors)]
 
@@ -192,13 +192,13 @@ def of_case(case: Case, origin: datetime | None = None) -> UnitProcess:
         columns = " and ".join(channel.sources)
         text = f"Channel of role {channel.role}, as column {columns} of the data."
         ports[name] = Port(name, unit, text, column)
-    withheld = case.roles("validation", "ignored")
+    validation = case.roles("validation", "ignored")
     return UnitProcess(
         case.name,
         case.title,
         case.model,
-        tuple(port for name, port in ports.items() if name not in withheld),
-        tuple(ports[name] for name in (*case.sensors, *withheld)),
+        tuple(port for name, port in ports.items() if name not in validation),
+        tuple(ports[name] for name in (*case.sensors, *validation)),
         lambda first: case.begin(first, origin).identifier,
         case.clock.second,
         frozenset(case.spec.data.missing),
@@ -223,7 +223,9 @@ def of_code(name: str, build: Callable[[], Identifier]) -> UnitProcess:
             f"{name} returned {type(identifier).__name__}; expected () -> livepde.Identifier."
         )
     sensors = _ports(identifier.observed, "Sensor.")
-    unseen = [] if identifier.withheld is None else _ports(identifier.withheld, "Withheld sensor.")
+    unseen = (
+        [] if identifier.validation is None else _ports(identifier.validation, "Validation sensor.")
+    )
     inputs = [Port(c, "", "Input of model or sensors.", Column((c,))) for c in identifier.inputs]
     time_unit = identifier.model.time_unit
     second = conversion("s", time_unit, f"{name}: time_unit").factor if time_unit else 1.0

@@ -39,8 +39,8 @@ class FleetEstimate:
         Names of the members.
     read
         Function that returns the beliefs; see `beliefs`.
-    innovation, withheld_error
-        As for `Estimate`, shapes (members, sensors) and (members, withheld).
+    innovation, validation_error
+        As for `Estimate`, shapes (members, sensors) and (members, validation).
     statuses
         Status of the step of each member; unless ok, its q and u are those of its last good step.
     steps
@@ -62,7 +62,7 @@ class FleetEstimate:
     members: tuple[str, ...]
     read: Callable[[], Beliefs]
     innovation: Array
-    withheld_error: Array
+    validation_error: Array
     statuses: tuple[Status, ...]
     steps: Array
     diagnose: Callable[[], Diagnostics[Array]]
@@ -126,7 +126,7 @@ class FleetEstimate:
             t=self.t,
             belief=self.belief(k),
             innovation=self.innovation[k],
-            withheld_error=self.withheld_error[k],
+            validation_error=self.validation_error[k],
             status=self.statuses[k],
             steps=int(self.steps[k]),
             diagnose=lambda: self.diagnostics.member(k),
@@ -142,7 +142,7 @@ class _Row:
 
     t: float
     innovation: Array
-    withheld_error: Array
+    validation_error: Array
     status: IntArray
     steps: Array
     diagnostics: Mapping[str, Array]
@@ -154,7 +154,7 @@ class _Row:
         return cls(
             t=estimate.t,
             innovation=estimate.innovation,
-            withheld_error=estimate.withheld_error,
+            validation_error=estimate.validation_error,
             status=np.array(codes, dtype=np.int32),
             steps=estimate.steps,
             diagnostics=estimate.diagnostics.named(),
@@ -197,7 +197,7 @@ class FleetResult:
         self.last = estimate
 
     def to_xarray(self) -> xr.Dataset:
-        """Return a dataset with dimensions member, time, sensor and withheld.
+        """Return a dataset with dimensions member, time, sensor and validation.
 
         Scalar unknowns, with `_std` variables beside them, status, steps and diagnostics are over
         (`member`, `time`); innovations over (`member`, `time`, `sensor`).
@@ -211,7 +211,7 @@ class FleetResult:
                 MEMBER: list(self.members),
                 "time": ("time", times, {"units": layout.time_unit}),
                 "sensor": list(layout.sensors),
-                "withheld": list(layout.withheld or ()),
+                "validation": list(layout.validation or ()),
             }
         )
         for label in layout.scalars:
@@ -222,9 +222,9 @@ class FleetResult:
         unit = {"units": layout.sensor_unit}
         innovations = self._series("innovation", len(layout.sensors))
         data["innovation"] = ((*both, "sensor"), innovations, unit)
-        if layout.withheld is not None:
-            errors = self._series("withheld_error", len(layout.withheld))
-            data["withheld_error"] = ((*both, "withheld"), errors, unit)
+        if layout.validation is not None:
+            errors = self._series("validation_error", len(layout.validation))
+            data["validation_error"] = ((*both, "validation"), errors, unit)
         data["status"] = (both, self._series("status"), dict(STATUS_FLAGS))
         steps = self._series("steps")
         data["steps"] = (both, steps.astype(np.int32), {"long_name": "substeps taken"})
@@ -271,7 +271,7 @@ class _MemberRow(_Row):
             t=self.t,
             numbers=self.numbers[k],
             innovation=self.innovation[k],
-            withheld_error=self.withheld_error[k],
+            validation_error=self.validation_error[k],
             status=int(self.status[k]),
             steps=int(self.steps[k]),
             notes={name: value for name, value in diagnostics.items() if np.isfinite(value)},
@@ -310,7 +310,7 @@ class FleetRecords:
         row = _MemberRow.of(estimate, numbers=numbers, profiles=profiles, correlation=correlation)
         self._count += 1
         self._rows.append(row)
-        self.size += row.numbers.size + row.innovation.size + row.withheld_error.size
+        self.size += row.numbers.size + row.innovation.size + row.validation_error.size
         self.size += sum(values.size for values in (profiles or {}).values())
 
     def records(self, k: int) -> Iterator[Record]:

@@ -57,7 +57,7 @@ class Fleet:
     q0, u0, u0_from, u0_errors
         As for `Identifier`, for all members; or a list with one for each, so that the errors of
         one u0 are a tuple.
-    t0, withheld, scheme, dt_max, halvings, assimilate_from, between, input_noise
+    t0, validation, scheme, dt_max, halvings, assimilate_from, between, input_noise
         As for `Identifier`.
 
     Raises
@@ -85,7 +85,7 @@ class Fleet:
         q0: Any = None,
         u0: Any = None,
         t0: float = 0.0,
-        withheld: Observation | None = None,
+        validation: Observation | None = None,
         scheme: Scheme | None = None,
         dt_max: float = np.inf,
         halvings: int = Advance.halvings,
@@ -109,7 +109,7 @@ class Fleet:
             q0=q0s[0],
             u0=u0s[0],
             t0=t0,
-            withheld=withheld,
+            validation=validation,
             scheme=scheme,
             dt_max=dt_max,
             halvings=halvings,
@@ -190,9 +190,9 @@ class Fleet:
         return self._one.observed
 
     @property
-    def withheld(self) -> Observed | None:
+    def validation(self) -> Observed | None:
         """Sensors that are only scored."""
-        return self._one.withheld
+        return self._one.validation
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -260,7 +260,7 @@ class Fleet:
         t = float(t)
         if not np.isfinite(t):
             raise SampleError(f"time t is {t}; give the time of the sample.")
-        measured, noise, withheld, named = self._parsed(z, inputs or {})
+        measured, noise, validation, named = self._parsed(z, inputs or {})
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
@@ -323,7 +323,7 @@ class Fleet:
         # A value that holds until the next reading may not be read again.
         stays = np.array([name in self.problem.control.held.last for name in self.inputs], bool)
         self._known = np.where(good[:, None] | stays, values, self._known)
-        return self._estimate(span, measured, withheld, report, held)
+        return self._estimate(span, measured, validation, report, held)
 
     def _opening(self, inputs: Array) -> Array:
         """Return the inputs at the initial time, from those of a later first sample."""
@@ -361,22 +361,22 @@ class Fleet:
         self,
         span: Span,
         measured: Array,
-        withheld: Array,
+        validation: Array,
         report: MemberReports,
         held: dict[str, Array],
     ) -> FleetEstimate:
-        state, engine, error = self._state, self._engine, withheld
+        state, engine, error = self._state, self._engine, validation
         read: Callable[[], Beliefs] = lambda: engine.beliefs(state)  # noqa: E731
-        if self.withheld is not None:
+        if self.validation is not None:
             beliefs = read()
             read = lambda: beliefs  # noqa: E731
-            error = withheld - self._shown(self.withheld, beliefs.u, beliefs.q, span)
+            error = validation - self._shown(self.validation, beliefs.u, beliefs.q, span)
         return FleetEstimate(
             t=span.t1,
             members=self.members,
             read=read,
             innovation=measured - report.predicted,
-            withheld_error=error,
+            validation_error=error,
             statuses=report.statuses,
             steps=report.steps,
             diagnose=lambda: report.diagnostics,
@@ -457,7 +457,7 @@ class Fleet:
 
     def run(self, stream: Iterable[Sequence[Any]]) -> FleetResult:
         """Take every sample of a stream, (t, z) or (t, z, inputs), and collect the estimates."""
-        result = FleetResult(self.members, layout_of(self.model, self.observed, self.withheld))
+        result = FleetResult(self.members, layout_of(self.model, self.observed, self.validation))
         for sample in stream:
             result.add(self.step(*sample))
         if result.last is not None:
@@ -467,19 +467,19 @@ class Fleet:
     def _parsed(
         self, z: Values, inputs: Mapping[str, ArrayLike]
     ) -> tuple[Array, Array | None, Array, dict[str, Array]]:
-        """Return assimilated values and their noise, withheld values and inputs, all checked."""
+        """Return assimilated values and their noise, validation values and inputs, all checked."""
         parse = self._by_name if isinstance(z, Mapping) else self._by_place
-        measured, noise, withheld, named = parse(z)
+        measured, noise, validation, named = parse(z)
         for name, values in inputs.items():
             if name not in self.inputs:
                 raise SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = self._column(name, values)
-        return measured, None if noise is None else own_noise(noise), withheld, named
+        return measured, None if noise is None else own_noise(noise), validation, named
 
     def _by_name(self, z: Any) -> tuple[Array, Array | None, Array, dict[str, Array]]:
-        hidden = self.withheld.names if self.withheld else ()
+        hidden = self.validation.names if self.validation else ()
         channels, sensors = self._one.channels, (*self.observed.names, *hidden)
         noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
         for name in z:
@@ -513,9 +513,11 @@ class Fleet:
         if np.isinf(array).any():
             for name, column in zip(names, array.T, strict=True):
                 self._refuse_infinite(name, column)
-        # Without names a sample has no withheld values.
-        withheld = np.full((len(self), len(self.withheld.names) if self.withheld else 0), np.nan)
-        return array, noise, withheld, {}
+        # Without names a sample has no values for validation.
+        validation = np.full(
+            (len(self), len(self.validation.names) if self.validation else 0), np.nan
+        )
+        return array, noise, validation, {}
 
     def _column(self, name: str, values: ArrayLike) -> Array:
         """Return a value of a channel for each member."""

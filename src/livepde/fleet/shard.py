@@ -163,7 +163,7 @@ class Shard:
     model, observation, law, members
         As for `Fleet`.
     options
-        Further parameters of `Fleet`: q0, u0, t0, withheld, and so on.
+        Further parameters of `Fleet`: q0, u0, t0, validation, and so on.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ def opened(log: Array, span: Span) -> Array:
     row, sensors = begun[:, -1], span.z1.shape[1]
     row[:] = np.nan
     row[:, 0] = span.t0
-    # Withheld sensors of a fleet may read more channels, which come last.
+    # Validation sensors of a fleet may read more channels, which come last.
     row[:, 1 + 2 * sensors : -1] = span.inputs0[:, : log.shape[2] - 2 - 2 * sensors]
     row[:, -1] = 1.0
     return begun

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 WIDE = 30.0  # ratio of largest to smallest value from which an axis is logarithmic
 RESIDUALS = (  # variable, its dimension, title of its panel
     ("innovation", "sensor", "innovation"),
-    ("withheld_error", "withheld", "error of validation channels"),
+    ("validation_error", "validation", "error of validation channels"),
 )
 SLENDER = 6.0  # length over width from which a map has an axis of its own for each
 
@@ -170,9 +170,9 @@ def measured_and_predicted(
     for n, name in enumerate(shown[:MOST_LINES]):
         i, colour = names.index(name), PALETTE[n % len(PALETTE)]
         ax.plot(at, measured[:, i], ".", color=colour, markersize=3, alpha=0.5)
-        withheld = i >= data.sizes.get("sensor", 0)
+        validation = i >= data.sizes.get("sensor", 0)
         style: dict[str, Any] = {"label": name}
-        if withheld:
+        if validation:
             style = {"label": f"{name} (validation)", "linestyle": "--"}
         ax.plot(at[known], expected[:, i], color=colour, linewidth=1.2, **style)
     time_axis(ax, data)
@@ -208,14 +208,14 @@ def estimates(data: xr.Dataset, name: str | None = None, *, ax: Axes | None = No
     return _scalar_panel(data, name, known[name], panel(ax))
 
 
-def residuals(data: xr.Dataset, *, withheld: bool = False, ax: Axes | None = None) -> Axes:
+def residuals(data: xr.Dataset, *, validation: bool = False, ax: Axes | None = None) -> Axes:
     """Draw measured minus predicted readings of the assimilated sensors.
 
     Parameters
     ----------
     data
         Dataset as returned by `Result.to_xarray()`.
-    withheld
+    validation
         Draw those of the validation sensors instead.
     ax
         Where to draw; default a new figure.
@@ -225,7 +225,7 @@ def residuals(data: xr.Dataset, *, withheld: bool = False, ax: Axes | None = Non
     ConfigurationError
         The run has no validation sensors.
     """
-    variable, dimension, what = RESIDUALS[withheld]
+    variable, dimension, what = RESIDUALS[validation]
     if variable not in data:
         raise ConfigurationError("plots: the run has no validation sensors.")
     return _residual_panel(data, variable, dimension, what, panel(ax))
@@ -334,9 +334,9 @@ class RunPlots:
         """Draw an unknown number over time with its 95 % band."""
         return estimates(self._result.dataset(), name, ax=ax)
 
-    def residuals(self, *, withheld: bool = False, ax: Axes | None = None) -> Axes:
+    def residuals(self, *, validation: bool = False, ax: Axes | None = None) -> Axes:
         """Draw measured minus predicted readings."""
-        return residuals(self._result.dataset(), withheld=withheld, ax=ax)
+        return residuals(self._result.dataset(), validation=validation, ax=ax)
 
     def field(self, name: str, *, std: bool = False, ax: Axes | None = None) -> Axes:
         """Draw an unknown field or the state."""

@@ -127,13 +127,13 @@ def scored_from(data: xr.Dataset) -> int:
 
 def sensor_names(data: xr.Dataset) -> list[str]:
     """Return the names of the assimilated and then of the validation sensors."""
-    return [str(name) for of in ("sensor", "withheld") if of in data for name in data[of].values]
+    return [str(name) for of in ("sensor", "validation") if of in data for name in data[of].values]
 
 
 def sensor_units(data: xr.Dataset, names: Sequence[str]) -> dict[str, str]:
     """Return the unit of each sensor."""
     units = dict.fromkeys(names, str(data["innovation"].attrs.get("units", "")))
-    for dimension in ("sensor", "withheld"):
+    for dimension in ("sensor", "validation"):
         if f"{dimension}_unit" in data.coords:
             own = data[f"{dimension}_unit"].values
             units |= dict(zip(map(str, data[dimension].values), map(str, own), strict=True))
@@ -149,14 +149,14 @@ class SensorPlaces(NamedTuple):
 
 
 def sensor_places(data: xr.Dataset) -> dict[str, SensorPlaces]:
-    """Return the places of sensors on a plane domain, under "sensor" and "withheld"."""
+    """Return the places of sensors on a plane domain, under "sensor" and "validation"."""
     return {
         kind: SensorPlaces(
             [str(name) for name in data[kind].values],
             data[f"{kind}_x"].values,
             data[f"{kind}_y"].values,
         )
-        for kind in ("sensor", "withheld")
+        for kind in ("sensor", "validation")
         if f"{kind}_y" in data.coords
     }
 

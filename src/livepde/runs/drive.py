@@ -132,7 +132,7 @@ def drive(
 def journal_of(identifier: Identifier, path: Path | None = None) -> Journal:
     """Return a new journal for the samples and estimates of an identifier; no path: in memory."""
     who = identifier
-    layout = layout_of(who.model, who.observed, who.withheld, who.ignored)
+    layout = layout_of(who.model, who.observed, who.validation, who.ignored)
     return Journal.create(path, identifier.channels, layout)
 
 

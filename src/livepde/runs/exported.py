@@ -40,13 +40,13 @@ LONG_NAMES = {
     "y": "y of the vertices",
     "z": "z of the vertices",
     "sensor": "assimilated channel",
-    "withheld": "validation channel",
+    "validation": "validation channel",
     "innovation": "measured minus predicted, one step ahead",
-    "withheld_error": "measured minus predicted of validation channels, one step ahead",
+    "validation_error": "measured minus predicted of validation channels, one step ahead",
     "status": "outcome of the step",
     "correlation": "correlation of the last estimates",
 }
-DIFFERENCES = ("innovation", "withheld_error")
+DIFFERENCES = ("innovation", "validation_error")
 CLOCKS = ("time", "snapshot")
 SYMBOLS = {  # of pint -> of UDUNITS, where they differ
     "°C": "degC",

@@ -323,7 +323,7 @@ class Journal:
         An estimate that was kept before a crash is left unchanged.
         """
         number = self._current if number is None else number
-        found = (record.numbers, record.innovation, record.withheld_error)
+        found = (record.numbers, record.innovation, record.validation_error)
         self._insert(
             "estimates",
             number,
@@ -623,7 +623,7 @@ class Journal:
         self, t: float, status: int, steps: int, numbers: bytes, notes: str, content: bytes | None
     ) -> Record:
         layout = self.layout
-        sizes = [len(layout.numbers), len(layout.sensors), len(layout.withheld or ())]
+        sizes = [len(layout.numbers), len(layout.sensors), len(layout.validation or ())]
         values = np.frombuffer(numbers)
         snapshot = None if content is None else Snapshot.from_bytes(content)
         lengths = set() if snapshot is None else {len(x) for x in snapshot.profiles.values()}
@@ -636,7 +636,7 @@ class Journal:
             t=float(t),
             numbers=found,
             innovation=innovation,
-            withheld_error=error,
+            validation_error=error,
             status=code,
             steps=int(steps),
             notes=found_notes,

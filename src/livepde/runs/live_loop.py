@@ -391,7 +391,7 @@ class Live:
         return Result(
             who.model,
             who.observed,
-            who.withheld,
+            who.validation,
             self.fields_every,
             kept,
             layout=kept.layout,

@@ -39,7 +39,7 @@ STATES = {
     "moves": "changes with time",
 }
 """How well the data determine a number, as `determination` returns it -> words."""
-CHANNELS = (("innovation", "sensor", ROLES[0]), ("withheld_error", "withheld", ROLES[1]))
+CHANNELS = (("innovation", "sensor", ROLES[0]), ("validation_error", "validation", ROLES[1]))
 
 
 @dataclass(frozen=True)
@@ -365,7 +365,7 @@ def _channels(data: xr.Dataset) -> Table:
     fitted = [name for name in channels if name in fits]
     units = {
         str(name): str(unit)
-        for dimension in ("sensor", "withheld")
+        for dimension in ("sensor", "validation")
         if f"{dimension}_unit" in data.coords
         for name, unit in zip(data[dimension].values, data[f"{dimension}_unit"].values, strict=True)
     }

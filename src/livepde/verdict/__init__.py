@@ -24,7 +24,7 @@ from livepde.verdict.findings import (
     too_few,
 )
 from livepde.verdict.judge import Judge, ScoredSample
-from livepde.verdict.ledger import WINDOWS, InputLedger, Ledger, WithheldLedger
+from livepde.verdict.ledger import WINDOWS, InputLedger, Ledger, ValidationLedger
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
 __all__ = [
@@ -51,8 +51,8 @@ __all__ = [
     "ScoredSample",
     "Severity",
     "Shifts",
+    "ValidationLedger",
     "Verdict",
-    "WithheldLedger",
     "assess",
     "at_bound",
     "channel_setting",

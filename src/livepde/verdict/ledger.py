@@ -312,7 +312,7 @@ class InputLedger:
 
 
 @dataclass(frozen=True, eq=False)
-class WithheldLedger:
+class ValidationLedger:
     """Sums over the values of each validation sensor, in constant memory."""
 
     # Shape (9, sensors): number of values and of successive pairs; sums of half the squared
@@ -322,11 +322,11 @@ class WithheldLedger:
     last: Array  # last error of each sensor, shape (sensors,); NaN before
 
     @classmethod
-    def start(cls, sensors: int) -> WithheldLedger:
+    def start(cls, sensors: int) -> ValidationLedger:
         """Return the value before any sample."""
         return cls(np.zeros((9, sensors)), np.full(sensors, np.nan))
 
-    def add(self, z: Array, predicted: Array, variance: Array) -> WithheldLedger:
+    def add(self, z: Array, predicted: Array, variance: Array) -> ValidationLedger:
         """Return the value after a sample; z is NaN where missing.
 
         `variance`: of the prediction, without noise, shape (sensors,).
@@ -353,7 +353,7 @@ class WithheldLedger:
             dtype=float,
         )
         last = np.where(seen, error, self.last)
-        return WithheldLedger(self.sums + np.where(seen, rows, 0.0), last)
+        return ValidationLedger(self.sums + np.where(seen, rows, 0.0), last)
 
     def findings(self, names: Sequence[str], ignored: Collection[str] = ()) -> Iterator[Finding]:
         """Return which sensors, but ignored ones, are missed by more than is allowed.
