@@ -98,7 +98,9 @@ def test_the_recipe_for_conda_agrees_with_the_wheel():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     run = recipe.partition("  run:\n")[2].partition("\ntests:")[0]
     found = {line.removeprefix("python-") for line in re.findall(r"- (.*)", run)}
-    expected = {re.sub(r"^([\w-]+)", r"\1 ", line) for line in project["dependencies"]}
+    # One recipe is for all systems, and has what only one of them needs.
+    needed = [line.partition(";")[0] for line in project["dependencies"]]
+    expected = {re.sub(r"^([\w-]+)", r"\1 ", line) for line in needed}
     assert found == expected | {f"python {project['requires-python']}"}
     assert f'version: "{livepde.__version__}"' in recipe
     assert f"livepde = {project['scripts']['livepde']}" in recipe
