@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import socket
 import subprocess
@@ -12,6 +13,8 @@ from patience import PATIENCE
 from ports import kept_port
 
 MOSQUITTO = shutil.which("mosquitto", path="/usr/sbin:/usr/bin:/usr/local/sbin:/usr/local/bin")
+
+AGAIN = 2.0  # s until a signal is sent again
 
 
 class Server:
@@ -41,8 +44,14 @@ class Server:
         raise RuntimeError("mosquitto does not listen")
 
     def stop(self) -> None:
-        self.process.terminate()
-        self.process.wait(PATIENCE)
+        """End the broker; it forgets a signal that comes before its loop has begun."""
+        end = time.monotonic() + PATIENCE
+        while self.process.poll() is None:
+            if time.monotonic() > end:
+                raise RuntimeError("mosquitto does not stop")
+            self.process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(AGAIN)
 
     def close(self) -> None:
         self.stop()
