@@ -120,6 +120,8 @@ def test_what_cannot_be_compared_or_written_is_refused_before_a_run(biased, tmp_
     assert "--force" in bad("compare", biased, "--write", biased)
     other = tmp_path / "better.toml"
     assert "relative to it" in bad("compare", biased, "--write", other)
+    assert "ends in .png" in bad("compare", biased, "--figure", tmp_path / "all.xyz")
+    assert "there is no directory" in bad("compare", biased, "--figure", tmp_path / "no" / "a.png")
     follow = ["--set", "data.follow=true"]
     assert "recorded rows" in bad("compare", biased, *follow)
     shutil.rmtree(biased.parent)

@@ -478,7 +478,7 @@ def complaints(path) -> list[str]:
     runner = pytest.importorskip("compliance_checker.runner")
     suite = runner.CheckSuite()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of its own packages
+        warnings.simplefilter("ignore")  # the checker calls what its dependencies deprecate
         suite.load_all_available_checkers()
         with suite.load_dataset(str(path)) as data:
             ((found, crashed),) = suite.run_all(data, ["cf:1.11"]).values()

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 import livepde as lp
 from benchmarks.honest.linear import diffusion, fine_times
 from livepde.cases import load
+from livepde.cases.variants import Variant, run_variant
 from livepde.cli import app
 from livepde.fleet import Fleet
 from livepde.laws.filter_state import InputHistory, pauses
@@ -89,7 +90,7 @@ def found_in(path: Path) -> list[lp.verdict.Finding]:
     table = load(path).read().raw
     assert table is not None
     times = xr.Dataset(coords={"time": ("time", table.t, {"units": "s"})})
-    return sampling_findings(times, (table.t, table.values))
+    return sampling_findings(times, lambda: (table.t, table.values))
 
 
 # --- what the sampling shows ---------------------------------------------------------------------
@@ -127,6 +128,14 @@ def test_a_live_run_names_a_clock_that_leaps(tmp_path: Path, monkeypatch: Any) -
     assert done.exit_code == 0, done.output
     (report,) = tmp_path.glob("runs/*/report.md")
     assert "(sample 301): time jumps by 70 s" in report.read_text()
+
+
+@pytest.mark.slow
+def test_a_variant_has_the_findings_on_its_times(tmp_path: Path) -> None:
+    """What `run` reports of the clock counts in `compare`, too."""
+    ended = run_variant(case(tmp_path, "small leap"), [], Variant("as stated"), None, False)
+    assert ended.level == "caution"
+    assert "clock" in [finding["what"] for finding in ended.verdict["findings"]]
 
 
 def test_a_unit_of_time_that_changes_is_named(tmp_path: Path) -> None:

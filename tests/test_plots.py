@@ -360,3 +360,13 @@ def test_sensors_of_another_unit_have_a_panel_of_their_own() -> None:
     axes = drawn(plots.curves(data, t, np.zeros((len(t), 2)))).axes
     assert [texts(ax) for ax in axes] == [["s0"], ["s1"]]
     assert [ax.get_ylabel() for ax in axes] == ["[°C]", "[W/m²]"]
+
+
+def test_intervals_stand_below_each_other_and_unknown_ends_are_left_out():
+    ax = plots.intervals({"case": (2.0, 1.0, 3.0), "loss": (2.5, np.nan, np.nan)}, "m^2/s")
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["case", "loss"]
+    ends = [line.get_xdata() for line in ax.lines if len(line.get_xdata()) == 2]
+    assert [1.0, 3.0] in [list(each) for each in ends]
+    assert len([each for each in ends if list(each) != [2.0, 2.0] and each[0] < each[1]]) == 1
+    assert ax.get_xlabel() == "95 % interval [m²/s]"
+    assert ax.yaxis_inverted()  # the first is at the top

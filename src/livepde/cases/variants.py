@@ -20,7 +20,7 @@ from livepde.errors import CaseError
 from livepde.plots.style import modes_told
 from livepde.records import interval_95, scalars, used_errors
 from livepde.result import Result
-from livepde.runs import verdict
+from livepde.runs import sampling_findings, verdict
 from livepde.runs.summary import channel_errors, rmse
 from livepde.samples import Sample
 from livepde.streams import DataTable
@@ -276,7 +276,9 @@ def _ended(variant: Variant, prepared: Prepared, data: xr.Dataset) -> VariantRun
     """Return how a run ended, from its dataset."""
     channels = channel_errors(data)
     labels, fields = scalars(data), prepared.case.model.parameter_space.fields
-    found = with_settings(prepared, verdict(data))
+    raw = prepared.raw
+    sampled = sampling_findings(data, None if raw is None else lambda: (raw.t, raw.values))
+    found = with_settings(prepared, verdict(data).with_findings(sampled))
     errors, estimates = found.errors, {}
     allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
     for label in labels:

@@ -108,7 +108,8 @@ def _sampling(prepared: Prepared, samples: DataTable) -> list[str]:
     unit = {"units": prepared.case.equation.time_unit}
     attrs = {} if prepared.origin is None else {"origin": prepared.origin.isoformat(sep=" ")}
     times = xr.Dataset(coords={"time": ("time", samples.t, unit)}, attrs=attrs)
-    return [finding.sentence for finding in sampling_findings(times, (samples.t, samples.values))]
+    found = sampling_findings(times, lambda: (samples.t, samples.values))
+    return [finding.sentence for finding in found]
 
 
 def _switching(case: Case, samples: DataTable) -> list[str]:

@@ -95,6 +95,8 @@ def compare(
         )
     if write is not None:
         _check_target(write, case, force)
+    if figure is not None:
+        _check_figure(figure)
     try:
         prepared = loaded.prepare(data)
     except CaseError as error:
@@ -115,9 +117,11 @@ def compare(
         notes.append(f"{write} is not written: the case itself is recommended.")
     elif write is not None:
         notes.append(_written(write, case, settings, best.variant.settings))
-    if figure is not None:
+    if figure is not None and base.estimates:
         _draw([base, *found], best, figure)
         notes.append(f"Wrote {figure}.")
+    elif figure is not None:
+        notes.append(f"{figure} is not written: no unknown of the case is a number.")
     present(
         _tables(base, found, best),
         [],
@@ -273,6 +277,17 @@ def _check_target(target: Path, case: Path, force: bool) -> None:
         raise ConfigurationError(
             f"--write {target}: paths in a case are relative to it; name a file in {case.parent}."
         )
+
+
+def _check_figure(target: Path) -> None:
+    """Refuse a figure that cannot be written, before anything runs."""
+    from livepde.plots.style import figure_class
+
+    known = figure_class()().canvas.get_supported_filetypes()
+    if target.suffix.removeprefix(".").lower() not in known:
+        raise ConfigurationError(f"--figure {target}: name a file that ends in .png, .pdf or .svg.")
+    if not target.parent.is_dir():
+        raise ConfigurationError(f"--figure {target}: there is no directory {target.parent}.")
 
 
 def _written(target: Path, case: Path, *settings: Sequence[str]) -> str:

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from livepde.cases import Case, Prepared
     from livepde.cases.live_case import LiveCase
     from livepde.identifier import Identifier
+    from livepde.linalg import Array
     from livepde.result import Estimate
     from livepde.runs import Check, Driven, RunWriter, Table
     from livepde.runs.live_loop import Sink
@@ -305,11 +306,13 @@ def concluded(
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
     driving = loaded.roles("boundary", "input")
 
-    def judged() -> Verdict:
+    def readings() -> tuple[Array, Array]:
         raw, journal = prepared.raw, driven.journal
-        kept = journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
+        return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
+
+    def judged() -> Verdict:
         found = [
-            *sampling_findings(dataset, kept),
+            *sampling_findings(dataset, readings),
             *clock_findings(driven.journal),
             *input_findings(driven.journal, driving),
         ]

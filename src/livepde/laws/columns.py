@@ -276,7 +276,10 @@ class _Trials:
         self.base_readings = columns.samples().readings
 
     def refitted(self, samples: StoredSamples) -> Found | None:
-        """Return the end of a search, which begins anew only if the run has not done so in vain."""
+        """Return the end of a search.
+
+        It does not start from other points if that was no use in the fit of the run.
+        """
         vain = len(samples.spans) if self.columns.state.fit.screened[0] else 0
         return refitted(samples, self.options, last=False, screened=vain)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -126,19 +126,20 @@ def clock_findings(journal: Journal) -> list[Finding]:
 
 
 def sampling_findings(
-    data: xr.Dataset, readings: tuple[Array, Array] | None = None
+    data: xr.Dataset, readings: Callable[[], tuple[Array, Array]] | None = None
 ) -> list[Finding]:
     """Return what the times of a run show: units that changed, clocks that leapt, and pauses.
 
-    `readings`: times and values of the channels, shapes (samples,) and (samples, channels), which
-    tell a clock that leapt from a pause.
+    `readings`: returns times and values of the channels, shapes (samples,) and (samples, channels).
+    It is called if there is a pause. Without it a leap of the clock is called a pause.
     """
     t, found = data["time"].values, list[Finding]()
-    leaps = {}
-    if readings is not None:
-        leaps = {leap.t: leap for leap in clock_leaps(*readings, pauses(readings[0]))}
+    leaps, breaks = {}, pauses(t)
+    if breaks and readings is not None:
+        all_times, values = readings()
+        leaps = {leap.t: leap for leap in clock_leaps(all_times, values, pauses(all_times))}
     anchors = note(data, "residual") is None  # the gradient law has no covariance
-    for k in pauses(t):
+    for k in breaks:
         usual = float(np.median(np.diff(t[:k])))
         length, at = float(t[k] - t[k - 1]), when(data, float(t[k]))
         times = f"{length:.6g} {data['time'].attrs.get('units', '')}".rstrip()
