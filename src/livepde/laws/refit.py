@@ -64,6 +64,7 @@ AGREED, LEFT = 3, 0.5
 # Samples over those of a search that began again in vain, from which another one does: the model is
 # most likely in error. The second at the end of a run.
 ANEW, ANEW_LAST = 4, 2
+STAYS = 1.0  # prior standard deviations within which that end is the same
 LAST, LAST_SPREAD = 8, 1.2  # fits from drawn points, before the search is given up
 GATE_ROUNDS = 4
 WILD = 30.0  # usual deviations beyond which a reading is refused before there is a fit
@@ -146,7 +147,7 @@ class Found:
     # or searches from elsewhere end here as well: then the model is in error, not the search.
     converged: bool
     passes: float  # passes over the samples that it took
-    screened: bool  # True if it began again at screened points, and will not find another end
+    screened: bool  # True if it began again at screened points, and that was no use
 
 
 def refitted(
@@ -163,7 +164,7 @@ def refitted(
     screens = search.suspicious and len(samples.spans) >= (ANEW_LAST if last else ANEW) * screened
     if screens:
         search.screen()
-    elif screened:
+    elif screened and search.stays(samples.reached):
         search.lacking = 0  # fewer samples have shown that there is no other end
     if last and search.lost:
         search.draw()
@@ -253,6 +254,10 @@ class _Search:
     def _about(self, xi: Array) -> Passed | None:
         self.passes += 1.0
         return self.samples.about(xi)
+
+    def stays(self, xi: Array) -> bool:
+        """True if the best trajectory is within a prior standard deviation of another one."""
+        return self.best is not None and bool(np.linalg.norm(self.best.xi - xi) < STAYS)
 
     def _elsewhere(self, xi: Array) -> None:
         """Search from another point, and note whether that ends at the best trajectory."""
