@@ -259,6 +259,10 @@ def cases(
     gallery: Annotated[
         Path | None, typer.Option(help="Folder for a page with tables and figures.")
     ] = None,
+    compared: Annotated[
+        int,
+        typer.Option(help="Variants of livepde compare for each case on measurements.", min=0),
+    ] = 0,
     quick: bool = False,
 ) -> Outcome:
     """Run every case of the project with its variants, and the code that they name.
@@ -275,7 +279,7 @@ def cases(
         gallery.mkdir(parents=True, exist_ok=True)
         pictures = gallery if can_draw(terminal(err=True)) else None
     outcome, runs = benchmark.bench_cases(
-        paths, progress=True, pictures=pictures, variants=not quick
+        paths, progress=True, pictures=pictures, variants=not quick, compared=compared
     )
     if gallery is not None:
         page = benchmark.gallery(runs, gallery)

@@ -7,9 +7,11 @@ step, of which the cost of the law is a multiple.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
@@ -28,6 +30,7 @@ from livepde.errors import CaseError, LivepdeError
 from livepde.laws import Belief, Law, Problem, Report, Status
 from livepde.linalg import Array
 from livepde.progress import watched
+from livepde.records import interval_95, scalars
 from livepde.result import Result
 from livepde.runs import Check, Outcome, Table, measures, verdict
 from livepde.runs.directory import markdown
@@ -38,12 +41,19 @@ from livepde.verdict import MOST
 GALLERY = """\
 # Gallery
 
-Every case on published measurements or fields, with its variants: estimates, their standard
-deviations, published values, and the checks of the case. RMSE is one step ahead and includes the
-learning phase; *prior* is the RMSE of the model with its unknowns at their prior. *Time* is the
-processor time of a sample over the time of a forward step. Figures show the first run of each case.
+Every case on published measurements or fields, with its variants: estimates with both intervals,
+published values, and the checks of the case. *Inside*: whether the published value lies in the
+interval that allows for model errors. RMSE is one step ahead and includes the learning phase;
+*prior* is the RMSE of the model with its unknowns at their prior. *Time* is the processor time of
+a sample over the time of a forward step. Figures show the first run of each case.
+
+**What to expect of measurements.** No model of a field is exact, and a long record shows it. Then
+the verdict is `caution` and not `trusted`: use the interval with model errors. `do not trust` says
+that this interval is too wide to use, or that the fit failed. `livepde compare` then tests the
+likely causes. Its recommendation stands below each case on measurements.
+
 Experiments of the paper and of examples have [their own page](experiments.md). Written by
-`python -m benchmarks cases --gallery docs/gallery`.
+`python -m benchmarks cases --gallery docs/gallery --compared 6`.
 
 """
 
@@ -57,6 +67,23 @@ QUICK = (
     "thermal_response",
 )
 """Cases of all kinds of processes that take seconds each."""
+MEASURED = (
+    "horkheim",
+    "oude_korendijk",
+    "scratch_assay",
+    "sioux",
+    "soil_column",
+    "soil_column_immobile",
+    "soil_layers",
+    "soil_offsets",
+    "soil_uniform",
+    "streambed_035_layers",
+    "streambed_035_uniform",
+    "streambed_047",
+    "thermal_response",
+    "thermal_response_grout",
+)
+"""Cases on measurements with numbers as unknowns: `livepde compare` is shown for them."""
 WORKERS = 2
 WARM_UP = 2  # samples in which matrices are built that are built once
 
@@ -69,6 +96,7 @@ class Job:
     variant: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     figure: Path | None = None
+    compared: int = 0  # variants of `livepde compare`
 
     @property
     def label(self) -> str:
@@ -94,6 +122,10 @@ class Run:
         RMSE with the unknowns frozen at their prior.
     verdict
         At the end: its level, and the findings that are no notes.
+    intervals
+        Label -> ends of the 95 % interval, and of that which allows for errors of the model.
+    compared
+        What `livepde compare --json` prints; empty if it was not called.
     error
         Why there is nothing of this.
     """
@@ -107,6 +139,8 @@ class Run:
     ratio: float = math.nan
     prior: float = math.nan
     verdict: str = ""
+    intervals: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
+    compared: Mapping[str, Any] = field(default_factory=dict)
     error: str = ""
 
 
@@ -141,6 +175,7 @@ def bench_cases(
     progress: bool = False,
     pictures: Path | None = None,
     variants: bool = True,
+    compared: int = 0,
 ) -> tuple[Outcome, list[tuple[Job, Run]]]:
     """Run cases with their variants in processes of their own; code of theirs is run.
 
@@ -154,6 +189,8 @@ def bench_cases(
         Whether to run them, too.
     pictures
         Folder for a figure of each case.
+    compared
+        Variants of `livepde compare` for each case on measurements; 0: it is not called.
 
     Returns
     -------
@@ -164,7 +201,8 @@ def bench_cases(
     """
     # A fresh interpreter for each worker: nothing of this one, such as its threads, is copied.
     with ProcessPoolExecutor(WORKERS, get_context("spawn"), _one_thread) as pool:
-        found, failed = _collect(pool, paths, progress, pictures, variants)
+        order, failed = _jobs(paths, pictures, variants, compared)
+        found = _collect(pool, order, progress)
     runs = [(job, _mean(several)) for job, several in _grouped(found)] + failed
     runs.sort(key=lambda item: [path.name for path in paths].index(item[0].path.name))
     checks = [check for job, run in runs for check in _checks(job, run)]
@@ -176,22 +214,29 @@ def bench_cases(
     return Outcome(_tables(runs), checks, notes), runs
 
 
-def _collect(
-    pool: Executor, paths: Sequence[Path], progress: bool, pictures: Path | None, variants: bool
-) -> tuple[list[tuple[Job, Run]], list[tuple[Job, Run]]]:
-    """Return the runs of all jobs, and cases that cannot be read."""
+def _jobs(
+    paths: Sequence[Path], pictures: Path | None, variants: bool, compared: int
+) -> tuple[list[Job], list[tuple[Job, Run]]]:
+    """Return the jobs of all cases, and cases that cannot be read."""
     order: list[Job] = []
     failed = []
     for path in paths:
         try:
-            order += jobs_of(path, pictures, variants)
+            first, *others = jobs_of(path, pictures, variants)
         except LivepdeError as error:
             failed.append((Job(path), Run(error=str(error))))
+            continue
+        order += [replace(first, compared=compared * (path.stem in MEASURED)), *others]
+    return order, failed
+
+
+def _collect(pool: Executor, order: Sequence[Job], progress: bool) -> list[tuple[Job, Run]]:
+    """Return the runs of all jobs."""
     waiting = {pool.submit(run_job, job): job for job in order}
     done: Iterable[Any] = as_completed(waiting)
     for _ in watched(done, len(order), "runs") if progress else done:
         pass
-    return [(job, _outcome(future)) for future, job in waiting.items()], failed
+    return [(job, _outcome(future)) for future, job in waiting.items()]
 
 
 def _outcome(future: Future[Run]) -> Run:
@@ -243,7 +288,30 @@ def run_job(job: Job) -> Run:
         ratio=ratio,
         prior=measures(prior)["rmse"],
         verdict=_verdict(data),
+        intervals=_both_intervals(data),
+        compared=_compared(job) if job.compared else {},
     )
+
+
+def _both_intervals(data: xr.Dataset) -> dict[str, tuple[float, float, float, float]]:
+    """Return the last intervals of each number; equal ones where the verdict has none."""
+    errors, found = verdict(data).errors, {}
+    allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
+    for label in scalars(data):
+        low, high = (float(end[-1]) for end in interval_95(data, label))
+        found[label] = low, high, low, high
+        if label in allowed:
+            one = allowed[label]
+            found[label] = one.plain_low, one.plain_high, one.low, one.high
+    return found
+
+
+def _compared(job: Job) -> dict[str, Any]:
+    """Return what `livepde compare` prints of a case."""
+    command = [sys.executable, "-m", "livepde", "compare", str(job.path), "--json", "--jobs", "1"]
+    command += ["--most", str(job.compared), "--allow-code"]
+    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+    return dict(json.loads(ended.stdout)) if ended.stdout.startswith("{") else {}
 
 
 def _verdict(data: xr.Dataset) -> str:
@@ -367,11 +435,42 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
         quality.append((job.label, *errors, run.samples, cost, steps, run.verdict))
         for label, (unit, reference) in run.unknowns.items():
             estimate = digits(numbers[label], numbers[f"{label}.std"])
-            error = shown(100 * numbers.get(f"{label}.error", math.nan), ".2g", " %")
-            rows.append((job.label, label, *estimate, unit, shown(reference, ".5g"), error))
-    columns = ("case", "unknown", "estimate", "± std. dev.", "unit", "reference", "error")
+            std, ends = numbers[f"{label}.std"], run.intervals[label]
+            both = (_interval(ends[:2], std), _interval(ends[2:], std))
+            held = "yes" if ends[2] <= reference <= ends[3] else "no"
+            inside = held if math.isfinite(reference) else "–"
+            published = shown(reference, ".5g")
+            rows.append((job.label, label, *estimate, unit, *both, published, inside))
+    columns = ("case", "unknown", "estimate", "± std. dev.", "unit")
+    held_by = ("95 %", "with model errors", "reference", "inside")
     more = ("case", "RMSE", "validation", "prior", "samples", "time", "failed steps", "verdict")
-    return [Table("Estimates", columns, rows), Table("Runs", more, quality)]
+    return [Table("Estimates", (*columns, *held_by), rows), Table("Runs", more, quality)]
+
+
+def _interval(ends: Sequence[float], std: float) -> str:
+    """Return an interval with the digits that a standard deviation leaves."""
+    return " to ".join(digits(end, std)[0] for end in ends)
+
+
+def _recommendation(run: Run) -> list[str]:
+    """Return what `livepde compare` says of a case, as Markdown."""
+    if not run.compared:
+        return []
+    table = run.compared["tables"][0]
+    shown_table = Table("Compared", table["columns"], table["rows"])
+    variants = {one["name"]: one for one in run.compared["variants"]}
+    best = variants[run.compared["recommended"]]
+    lines = [markdown("", [shown_table], notes=run.compared["notes"])]
+    for label, (_, reference) in run.unknowns.items():
+        one = best["estimates"].get(label)
+        if one is None or not math.isfinite(reference) or one["low"] is None:
+            continue
+        where = "inside" if one["low"] <= reference <= one["high"] else "outside"
+        lines.append(
+            f"The published {label} of {reference:.4g} lies {where} the interval of the "
+            f"recommended variant, {one['low']:.4g} to {one['high']:.4g}."
+        )
+    return [line.removeprefix("# \n\n") for line in lines]
 
 
 def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
@@ -386,7 +485,8 @@ def gallery(runs: Sequence[tuple[Job, Run]], folder: Path) -> Path:
         lines = [f"## {run.title or path.stem}", f"`python -m benchmarks cases --only {path.stem}`"]
         if job.figure and job.figure.exists():
             lines.append(f"![{path.stem}]({job.figure.name})")
-        parts.append("\n\n".join([*lines, re.sub("(?m)^## (.*)$", r"**\1**", report)]))
+        text = "\n\n".join([*lines[1:], report, *_recommendation(run)])
+        parts.append("\n\n".join([lines[0], re.sub("(?m)^## (.*)$", r"**\1**", text)]))
     target = folder / "gallery.md"
     command = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=8", "HEAD"]
     commit = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
