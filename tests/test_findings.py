@@ -245,6 +245,13 @@ def stepped(**options: Any) -> list[str]:
     return kinds([given.step(*row) for row in fronts.rows()[:30]][-1].verdict)
 
 
+def begun(t0: float) -> list[str]:
+    """Return the findings on a rod with 30 samples a second apart, and an initial time."""
+    model = lp.models.heat(lp.interval(0.0, 1.0, 10), lp.Normal(0.1, std=0.05))
+    rod = lp.Identifier(model, lp.Points({"a": 0.5}, noise=0.1), lp.SensitivityLaw(), u0=0.0, t0=t0)
+    return kinds([rod.step(1000.0 + k, [0.0]) for k in range(30)][-1].verdict)
+
+
 def filled(*, rests: bool = False, gain: float = 1.0) -> list[str]:
     """Return the findings on the gradient law, with readings of all of a rod at 1 % of noise."""
     drive = (lambda t: 1.0 * (t < 5.0)) if rests else (lambda t: 1.0)
@@ -313,6 +320,7 @@ RUNS = {
     "findings: misfit": Pair(partial(one_column, 0.9), partial(one_column, 0.2)),
     "verdict: fit": Pair(partial(fitted, start=0, passes=1), fitted),
     "verdict: step": Pair(partial(stepped, parts=2), stepped),
+    "verdict: start": Pair(partial(begun, 0.0), partial(begun, 999.0)),
     "verdict: untested": Pair(partial(stepped, mesh=False, parts=1), stepped),
     "verdict: steps": Pair(partial(gradient, 2.0), partial(gradient, 1.0)),
 }

@@ -420,3 +420,23 @@ def test_a_guessed_curvature_of_inputs_is_a_caution_unless_an_interval_holds_it(
     assert Verdict.of([found]).with_errors(errors(0.05, 1.5)).level == "trusted"
     (held,) = discretised(Shifts(2.6, {"step": 2.5, "input": 0.1}))
     assert held.severity == "note"
+
+
+def test_an_initial_time_long_before_the_samples_changes_no_course_in_time():
+    """Forgotten t0: sources that begin within the run must not begin before the first sample."""
+    rng = np.random.default_rng(4)
+    ends = {"left": lp.Channel("T"), "right": 0.0}
+    rod = lp.models.heat(lp.interval(0.0, 1.0, 20), lp.LogNormal(0.1, std=0.05), dirichlet=ends)
+    t = 0.05 * np.arange(120)
+    drive = np.sin(2.1 * t) + 0.3 * np.sin(7.0 * t)
+    late = 0.6 * np.interp(t - 0.4, t, drive)[:, None] + 0.02 * rng.standard_normal((120, 1))
+
+    def upper(t0: float) -> float:
+        sensors = lp.Points({"a": 0.3}, noise=0.02)
+        start = lp.Identifier(rod, sensors, lp.SensitivityLaw(), u0=0.0, t0=t0)
+        rows = ((1e6 + t[k], late[k], {"T": drive[k]}) for k in range(len(t)))
+        errors = start.run(rows).verdict.errors
+        assert errors is not None
+        return errors["alpha"].high
+
+    assert upper(1e6 - 1000.0) == pytest.approx(upper(1e6), rel=0.05)

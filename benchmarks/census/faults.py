@@ -336,7 +336,7 @@ FAULTS: Mapping[str, Fault] = {
     "unit": Fault(
         "a sensor in degrees Fahrenheit",
         _sensor(lambda s, v: 32.0 * s.noise + 1.8 * v),
-        ("gain", "offset", "drift"),
+        ("unit", "gain", "offset", "drift"),
     ),
     "sign": Fault("a sensor with the wrong sign", _sensor(lambda s, v: -v), ("gain",)),
     "lag": Fault("a sensor is 4 samples late", _sensor(lambda s, v: _shifted(v, 4.0)), ("lag",)),
@@ -348,7 +348,7 @@ FAULTS: Mapping[str, Fault] = {
     ),
     "lead": Fault("a sensor is 4 samples early", _sensor(lambda s, v: _shifted(v, -4.0)), ("lag",)),
     "position": Fault("a sensor sits 5 % of the length away", _moved, ("position",)),
-    "swapped": Fault("two sensors are swapped", _swapped, ("position", "gain", "offset", "lag")),
+    "swapped": Fault("two sensors are swapped", _swapped, ("exchange",)),
     "stands": Fault("a sensor stands still", _stands, ("stuck", "offset", "gain"), late=True),
     "noisy": Fault("a sensor is four times as noisy", _errors(lambda s, e: 4.0 * e), traced=False),
     "burst": Fault(
@@ -367,26 +367,26 @@ FAULTS: Mapping[str, Fault] = {
     "channel offset": Fault(
         "a channel reads 6 sigma too much",
         _channel(lambda s, v: v + 6.0 * s.noise),
-        ("boundary", "channel", "source", "flux"),
+        ("boundary", "channel", "source", "flux", "offset"),
         channels=True,
     ),
     "channel scale": Fault(
         "a channel's scale is off by 20 %",
         _channel(lambda s, v: 1.2 * v),
-        ("boundary", "channel"),
+        ("boundary", "channel", "gain"),
         channels=True,
     ),
     "channel lag": Fault(
         "a channel is 4 samples late",
         _channel(lambda s, v: _shifted(v, 4.0)),
-        ("boundary", "channel"),
+        ("boundary", "channel", "lag"),
         channels=True,
     ),
     "channel gaps": Fault("30 % of a channel missing", _channel(_gaps), channels=True),
     "channels swapped": Fault(
         "two channels are swapped",
         _channels_swapped,
-        ("boundary", "channel"),
+        ("boundary", "channel", "exchange"),
         only=("rod", "wall", "profile"),
         channels=True,
     ),

@@ -253,7 +253,7 @@ def _names(verdict: Verdict, kinds: Sequence[str], subject: str) -> bool:
 
     def right(finding: Finding) -> bool:
         return any(
-            cause.kind in kinds and _same(cause.subject, subject)
+            cause.kind in kinds and (cause.kind == "exchange" or _same(cause.subject, subject))
             for cause in finding.causes[:NAMED]
         )
 

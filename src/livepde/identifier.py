@@ -259,7 +259,7 @@ class Identifier(Shown):
         other._gaps = InputLedger(
             ends["held_counts"].astype(np.int64), ends["held"], ends["unstated"]
         )
-        other._steps = StepLedger(ends["steps"].astype(np.int64))
+        other._steps = StepLedger(ends["steps"].astype(np.int64), np.zeros(2))
         names = self.inputs if state is not None else ()
         other._inputs, other._known = (
             Inputs(dict(zip(names, ends[part].tolist(), strict=bool(names)))) for part in INPUTS
@@ -415,7 +415,7 @@ class Identifier(Shown):
         self._samples += 1
         self._origin = origin
         stretched = self.problem.control.stretches(t - self._t)
-        self._steps = self._steps.add(report.status.code, stretched)
+        self._steps = self._steps.add(report.status.code, t - self._t, stretched)
         if report.status.taken:
             if names:
                 self._gaps = self._gaps.add(t - self._t, missing)
@@ -981,6 +981,7 @@ class Identifier(Shown):
             "held_counts": self._gaps.counts,
             "held": self._gaps.held,
             "steps": self._steps.counts,
+            "lengths": self._steps.lengths,
             "origin": self._origin,
             "unstated": self._gaps.unstated,
             **self.fingerprint.leaves,
@@ -1032,7 +1033,7 @@ class Identifier(Shown):
                 held=leaves["held"],
                 unstated=leaves["unstated"],
             )
-            steps = StepLedger(leaves["steps"].astype(np.int64))
+            steps = StepLedger(leaves["steps"].astype(np.int64), leaves["lengths"])
             names = self.inputs if len(leaves["inputs"]) else ()
             inputs, known = (
                 Inputs(dict(zip(names, leaves[part].tolist(), strict=True))) for part in INPUTS

@@ -53,15 +53,19 @@ class _Drifting(Problem):
 
     def path(self, theta: Array) -> Array:
         """Return the flux at the substeps, straight between the samples."""
-        flux = PRIOR + STD * theta[1] + self.increment * np.append(0.0, np.cumsum(theta[2:]))
+        flux = PRIOR + STD * theta[1] + self.increment * self.walk(theta)
         return np.asarray(np.interp(fine_times(self.times), self.times, flux))
+
+    def walk(self, theta: Array) -> Array:
+        """Return the sum of increments at the samples, which a shortened problem has fewer of."""
+        return np.append(0.0, np.cumsum(theta[2 : 2 + self.intervals]))
 
     def draw(self, rng: np.random.Generator) -> tuple[Array, Array]:
         theta = np.zeros(self.coordinates)
         theta[:2] = rng.standard_normal(2)
         # A Brownian path on the substeps; livepde and the batch fit know its law, not the path.
         steps = rng.standard_normal((self.intervals, SUBSTEPS)) / np.sqrt(SUBSTEPS)
-        theta[2:] = steps.sum(axis=1)
+        theta[2 : 2 + self.intervals] = steps.sum(axis=1)
         walk = self.increment * np.append(0.0, np.cumsum(steps))
         return theta, self.shown(self.k(theta), PRIOR + STD * theta[1] + walk)
 

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from livepde.fem import Moment, dot, grad
+from livepde.laws.filter_state import PAUSE
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array
 from livepde.model import Model
@@ -219,7 +220,9 @@ class ErrorColumns:
         steps = max(len(spans), 1)
         work = steps * self.count * model.X.dim
         stride = max(math.ceil(work / MOST_WORK), math.ceil(steps / MOST_STEPS))
-        begin, end = float(spans[0].start), float(spans[-1].t1)
+        begin, first, end = (float(t) for t in (spans[0].start, spans[0].t1, spans[-1].t1))
+        # Courses in time are those of the samples: the first may come long after t0.
+        late = max(begin, first - PAUSE * (end - first) / steps)
         p = self._start()
         found = np.full((len(spans), self.observed.size, self.count), np.nan)
         states: list[Array] = []
@@ -234,7 +237,7 @@ class ErrorColumns:
                 moment = span.end.member(0)
                 now = StatePoint(x.u[0], q, moment, _rates(span))
                 if t > last:
-                    share = (0.5 * (t + last) - begin) / (end - begin)
+                    share = max(0.5 * (t + last) - late, 0.0) / (end - late)
                     p = self._advanced(stage, p, now, t - last, share, free)
                     last = t
                 H, _ = self.observed.jacobian(now.u, model.latent.value(q), moment)

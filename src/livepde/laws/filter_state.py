@@ -53,18 +53,21 @@ class InputHistory:
         if not length.all():
             return self
         pause: Mask = (length > PAUSE * self.pace) & (self.count >= SETTLED)
+        # The first interval, from t0 on, may be of any length.
+        late = (self.count == 1.0) & (self.pace > PAUSE * length)
+        pace = np.where(late, length, self.pace)
         known = self.low.shape[1]  # a fleet's validation sensors may read more channels
         first, last = span.inputs0[:, :known], span.inputs1[:, :known]
         slopes = np.abs(last - first) / length[:, None]
         if np.count_nonzero(pause):
             slopes = np.where(pause[:, None], 0.0, slopes)
             # A pace that changes for good is usual after a few samples.
-            length = np.where(pause, PAUSE * self.pace, length)
+            length = np.where(pause, PAUSE * pace, length)
         return InputHistory(
             low=np.fmin(self.low, last),
             high=np.fmax(self.high, last),
             steepest=np.fmax(self.steepest, slopes),
-            pace=np.maximum(self.pace, length),
+            pace=np.maximum(pace, length),
             count=np.minimum(self.count + 1.0, SETTLED),
             pause=pause,
         )
@@ -80,6 +83,8 @@ def pauses(times: Sequence[float] | Array) -> list[int]:
     """Return the numbers of the samples that end a pause, by the rule of `InputHistory`."""
     found, pace = [], 0.0
     for k, length in enumerate(np.diff(times).tolist()):
+        if k == 1 and pace > PAUSE * length:
+            pace = length
         if k >= SETTLED and length > PAUSE * pace:
             found.append(k + 1)
             length = PAUSE * pace

@@ -9,7 +9,7 @@ import numpy as np
 
 from livepde.laws.columns import Columns, likely_columns
 from livepde.laws.filter import Filter, reported_factors
-from livepde.laws.filter_state import FilterState, ShadowState
+from livepde.laws.filter_state import PAUSE, SETTLED, FilterState, ShadowState
 from livepde.laws.law import Fit, Problem, Status
 from livepde.laws.member_arrays import changed
 from livepde.laws.model_errors import model_errors
@@ -256,29 +256,41 @@ class StepLedger(NamedTuple):
     """
 
     counts: IntArray
+    lengths: Array  # of the first interval, from t0 on, and of all later ones, shape (2,)
 
     @classmethod
     def start(cls) -> StepLedger:
         """Return the value before any sample."""
-        return cls(np.zeros(COUNTS, dtype=np.int64))
+        return cls(np.zeros(COUNTS, dtype=np.int64), np.zeros(2))
 
-    def add(self, code: str, stretched: bool) -> StepLedger:
+    def add(self, code: str, length: float, stretched: bool) -> StepLedger:
         """Return the value after a sample whose step ended with a status."""
-        counts = self.counts.copy()
+        counts, lengths = self.counts.copy(), self.lengths.copy()
+        lengths[int(counts[:-1].sum() > 0)] += length
         counts[PLACES[code]] += 1
         counts[-1] += stretched
-        return StepLedger(counts)
+        return StepLedger(counts, lengths)
+
+    @property
+    def _late(self) -> float:
+        """Length of the first interval in later ones, which are some; else 0."""
+        first, later = self.lengths.tolist()
+        count = int(self.counts[:-1].sum()) - 1
+        return first * count / later if count >= SETTLED else 0.0
 
     @property
     def irregular(self) -> bool:
-        """Whether any step was not ok, or had substeps longer than `dt_max`."""
+        """Whether any step was not ok, had too long substeps, or the first sample came late."""
         counts = self.counts.tolist()
-        return bool(sum(counts) > counts[PLACES["ok"]])
+        return bool(sum(counts) > counts[PLACES["ok"]]) or self._late > PAUSE
 
     def findings(self) -> Iterator[Finding]:
-        """Return a finding for each way in which steps have failed, and one on long intervals."""
+        """Return a finding for each way in which steps have failed, and on long intervals."""
         *counts, stretched = self.counts.tolist()
         yield from step_findings(dict(zip(STATUS_CODES, counts, strict=True)))
+        if self._late > PAUSE:
+            text, remedy = FINDINGS["start, late"].filled(count=self._late)
+            yield Finding("start", "note", text, "t0", self._late, remedy=remedy)
         if stretched:
             text, remedy = FINDINGS["steps, long"].filled(count=stretched, most=MOST_SUBSTEPS)
             yield Finding("steps", "note", text, "dt_max", float(stretched), remedy=remedy)

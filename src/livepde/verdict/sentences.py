@@ -221,6 +221,11 @@ FINDINGS: dict[str, Sentence] = {
     "not_converged": Sentence("{count} of {samples} steps failed: the solver did not converge."),
     "not_finite": Sentence("{count} of {samples} steps failed: the result is not finite."),
     "singular": Sentence("{count} of {samples} steps failed: a matrix is singular."),
+    "start, late": Sentence(
+        "The first sample comes {count:.4g} usual intervals after t0, the time of the initial "
+        "state.",
+        "If u0 is the state shortly before the first sample, give that time as `t0`.",
+    ),
     "steps, long": Sentence(
         "{count} intervals between samples need more than {most} substeps of `dt_max`, so their "
         "substeps were longer.",
