@@ -438,7 +438,9 @@ def publishers_of(case: CaseContent, passwords: Mapping[str, str]) -> list[Sink]
     spec = case.spec.output.mqtt
     if spec is None:
         return []
-    return [MqttSink(_broker(case, spec, "output.mqtt", passwords), spec.topic)]
+    broker, discovery = _broker(case, spec, "output.mqtt", passwords), spec.discovery is not None
+    title = case.spec.title or case.name
+    return [MqttSink(broker, spec.topic, discovery=discovery, title=title)]
 
 
 def source_text(case: CaseContent) -> str:

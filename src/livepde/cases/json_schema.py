@@ -74,7 +74,11 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "rows": "Topics whose messages are rows, as JSON objects.",
         "columns": "Topic -> column whose numbers its messages are.",
     },
-    "PublishSpec": {**BROKER, "topic": "Topic to which estimates are published."},
+    "PublishSpec": {
+        **BROKER,
+        "topic": "Topic to which estimates are published.",
+        "discovery": "Whether Home Assistant finds the estimates by itself.",
+    },
     "OpcuaSpec": {
         "url": "Address of the server, opc.tcp://HOST:PORT.",
         "columns": "Node -> column whose numbers it has.",

@@ -502,6 +502,7 @@ class PublishSpec(BrokerSpec):
     """Where estimates are published."""
 
     topic: Name
+    discovery: Literal["homeassistant"] | None = None
 
 
 class OutputSpec(Spec):
