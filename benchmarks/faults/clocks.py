@@ -23,7 +23,16 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.plants import Feeder, GrowingFile, Mosquitto, Nodes, Plant, Topic, wait
+from benchmarks.faults.plants import (
+    PATIENCE,
+    Feeder,
+    GrowingFile,
+    Mosquitto,
+    Nodes,
+    Plant,
+    Topic,
+    wait,
+)
 from benchmarks.faults.rod import STEP, Row, case_text, rod_rows
 from benchmarks.faults.run import Run
 from livepde.records import interval_95
@@ -204,11 +213,11 @@ def _seen(folder: Path, plant: Plant, fault: Fault, rows: Sequence[Row]) -> _See
             during = _awaited(run, False)
         plant.supply(count)
         samples = len({t for t, _ in right})
-        so_far, until = 0, time.monotonic() + SOON
+        so_far, until = 0, time.monotonic() + PATIENCE
         while run.alive() and so_far < samples and time.monotonic() < until:
             time.sleep(0.05)
             if run.estimated() > so_far:
-                so_far, until = run.estimated(), time.monotonic() + SOON
+                so_far, until = run.estimated(), time.monotonic() + PATIENCE
         after = _awaited(run, fault.end is not None)
         run.end(0)
     data = open_run(run.out).dataset
