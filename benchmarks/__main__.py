@@ -453,8 +453,8 @@ def faults(
     only: Annotated[
         list[str] | None,
         several(
-            "One of file, stdin, mqtt, progress, restart, disk, malformed, messages, journals, "
-            "files, clocks, visitors, cases."
+            "One of file, stdin, mqtt, progress, sigterm, restart, disk, malformed, messages, "
+            "journals, files, clocks, visitors, cases."
         ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,

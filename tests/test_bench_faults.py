@@ -144,6 +144,15 @@ def test_runs_that_are_killed_every_few_seconds_make_progress(monkeypatch):
 
 
 @pytest.mark.study
+@pytest.mark.process
+def test_runs_stop_soon(monkeypatch):
+    monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
+    outcome = faults.faults(only=["sigterm"], kills=2)
+    assert not failed(outcome)
+    assert outcome.tables[0].rows[0][:2] == (2, 2)
+
+
+@pytest.mark.study
 def test_slow_visitors_keep_nobody_out(monkeypatch):
     monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
     monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test
@@ -205,6 +214,16 @@ def test_damage_is_seen(other, lost, doubled, different):
     seen.compare(other, found(record(0.0), record(1.0)))
     assert (seen.lost, seen.doubled, seen.different) == (lost, doubled, different)
     assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
+
+
+def test_a_last_fit_that_was_skipped_is_no_damage():
+    """If both runs report the same, the last estimate counts."""
+    other = found(record(0.0), record(1.0, 2.0))
+    seen = damage.Damage()
+    seen.compare(replace(other, events=Counter(unfinished=1)), found(record(0.0), record(1.0)))
+    assert seen.different == 0
+    seen.compare(other, found(record(0.0), record(1.0)))
+    assert seen.different == 1
 
 
 @pytest.mark.slow

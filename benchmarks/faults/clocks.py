@@ -112,7 +112,7 @@ def _back_again(rows: Sequence[Row]) -> list[Row]:
 FAULTS: Mapping[str, Fault] = {
     "none": Fault(list),
     # There is no sample yet, so that the run waits.
-    "the first row 10 years ahead": Fault(lambda rows: [*_moved(rows[:1], 3650 * DAY), *rows]),
+    "the first row 10 years ahead": Fault(lambda rows: [*_moved(rows[2:3], 3650 * DAY), *rows]),
     "one row 29 days ahead": Fault(_inserted(29 * DAY), AT + 1),
     "one row 10 years ahead": Fault(_inserted(3650 * DAY), AT + 1),
     "one reading of T_3 90 steps ahead": Fault(_inserted(1.5 * HOUR, 1, ["T_3"]), AT + 1),
