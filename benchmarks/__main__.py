@@ -457,8 +457,8 @@ def faults(
     only: Annotated[
         list[str] | None,
         several(
-            "One of file, stdin, mqtt, progress, restart, disk, malformed, messages, journals, "
-            "files, clocks, visitors, cases."
+            "One of file, stdin, mqtt, progress, sigterm, restart, disk, malformed, messages, "
+            "journals, files, clocks, visitors, cases."
         ),
     ] = None,
     workers: Annotated[int, typer.Option(min=1, help="Runs that are killed at a time.")] = 1,
@@ -508,19 +508,21 @@ def census(
 
 
 @program.command(
-    quick="Fewer steps, of which a tenth as many are retained: a leak or a slowdown that shows in "
-    "a million steps only is not seen."
+    quick="One month, of which a tenth as many samples are retained: a leak or a slowdown that "
+    "shows in many months only is not seen."
 )
 def soak(
-    steps: Annotated[int, Count(1_000_000, 20_000, "How many steps.")], quick: bool = False
+    months: Annotated[int, Count(24, 1, "How many months, with a row each minute.")],
+    quick: bool = False,
 ) -> Outcome:
-    """Run for very long: memory, time of a step and the journal's size must not grow.
+    """Run for months with a fault of each kind a week: memory and time of a step must not grow.
 
-    Example:  python -m benchmarks soak --steps 100000 --json
+    Example:  python -m benchmarks soak --months 2 --json
     """
+    from benchmarks.soak import MONTH
     from benchmarks.soak import soak as benchmark
 
-    return benchmark(steps, share=0.1 if quick else 1.0, progress=True)
+    return benchmark(months * MONTH, share=0.1 if quick else 1.0, progress=True)
 
 
 @program.command(quick="The first samples only.")

@@ -30,6 +30,12 @@ from livepde.cases.data import passwords_of
             'file = "rows.csv"',
             'mqtt = {{ topic = "a", port = {port}, password_env = "{name}" }}\n',
         ),
+        (
+            "output.opcua",
+            'file = "rows.csv"',
+            'opcua = {{ url = "opc.tcp://127.0.0.1:{port}", columns = {{ a = "alpha" }}, '
+            'password_env = "{name}" }}\n',
+        ),
     ],
 )
 def test_a_case_sends_no_variable_that_the_user_has_not_allowed(
@@ -44,7 +50,7 @@ def test_a_case_sends_no_variable_that_the_user_has_not_allowed(
         path = Path(case(data.format(port=port, name=name)))
         path.write_text(path.read_text() + output.format(port=port, name=name))
         command = ("run", "case.toml", "--realtime", "--speed", "inf", "--out", "run")
-        command = command if key == "output.mqtt" else command[:2]
+        command = command if key.startswith("output") else command[:2]
         said = bad(*command)
         assert f"case.toml: {key}.password_env: the environment variable {name} would be" in said
         assert f"add --allow-env {name}" in said
@@ -54,6 +60,6 @@ def test_a_case_sends_no_variable_that_the_user_has_not_allowed(
         assert not Path("run").exists()
         loaded = cases.load("case.toml")
         assert passwords_of(loaded, True, [name]) == {key: "a secret"}
-        assert passwords_of(loaded, False, [name] if key == "output.mqtt" else []) == (
-            {key: "a secret"} if key == "output.mqtt" else {}
+        assert passwords_of(loaded, False, [name] if key.startswith("output") else []) == (
+            {key: "a secret"} if key.startswith("output") else {}
         )

@@ -16,7 +16,7 @@ from commands import bench
 
 import livepde as lp
 from benchmarks import faults, soak
-from benchmarks.faults import breaks, broken, damage, disk, hostile, plants, rod
+from benchmarks.faults import breaks, broken, clocks, damage, disk, hostile, plants, rod
 from benchmarks.journal import journal
 from benchmarks.overhead import overhead
 from livepde import cases
@@ -92,11 +92,42 @@ def test_damaged_journals_are_told():
     assert plain == flips - told
 
 
-@pytest.mark.study
-def test_clocks_go_wrong_and_are_told():
+FEW = ("none", "one row 10 years ahead", "set back by an hour")
+
+
+@pytest.mark.broker
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "transport", ["file", "standard input", pytest.param("MQTT", marks=MQTT), "OPC UA"]
+)
+def test_clocks_go_wrong_and_are_told(monkeypatch, transport):
+    pytest.importorskip({"MQTT": "paho.mqtt", "OPC UA": "asyncua"}.get(transport, "json"))
+    monkeypatch.setattr(clocks, "TRANSPORTS", (transport,))
+    monkeypatch.setattr(clocks, "FAULTS", {name: clocks.FAULTS[name] for name in FEW})
     outcome = faults.faults(only=["clocks"])
     assert not failed(outcome)
-    assert outcome.tables[0].rows[0] == ("none", 500, 0, "–")
+    assert [row[2:4] for row in outcome.tables[0].rows] == [(0, 0)] * len(FEW)
+
+
+def test_clock_faults_that_do_harm_are_seen():
+    rows = rod.rod_rows(clocks.COUNT)
+    fault = clocks.FAULTS["one row 10 years ahead"]
+    right = clocks._right(fault, rows)
+    well = {"ok": True, "ailment": ""}
+    doubt = {"ok": False, "ailment": "clock"}
+    estimates = {60.0 * k: (2e-5, 1e-7) for k in range(clocks.COUNT)}
+    seen = clocks._Seen(right, {}, doubt, well, "trusted", estimates)
+    told = clocks._Told()
+    told.add("none", seen, fault, rows)
+    assert all(check.ok for check in told.checks())
+    lost = {key: value for key, value in right.items() if key != (600.0, "left")}
+    moved = {t: (2.1e-5, half) for t, (_, half) in estimates.items()}
+    told.add(
+        "harm", clocks._Seen(lost | {(1e9, "T_3"): 20.0}, {}, well, doubt, "", moved), fault, rows
+    )
+    never = clocks.FAULTS["back by 3.5 steps every 30 rows"]
+    told.add("trusted", replace(seen, after=doubt, values=clocks._right(never, rows)), never, rows)
+    assert [check.value for check in told.checks()] == [1, 1, pytest.approx(10.0), 1, 1, 1]
 
 
 @pytest.mark.study
@@ -110,6 +141,15 @@ def test_runs_that_are_killed_every_few_seconds_make_progress(monkeypatch):
     monkeypatch.setattr("benchmarks.faults.progress.STEPS", {"50 ms": (40, 60)})
     monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
     assert not failed(faults.faults(only=["progress"]))
+
+
+@pytest.mark.study
+@pytest.mark.process
+def test_runs_stop_soon(monkeypatch):
+    monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
+    outcome = faults.faults(only=["sigterm"], kills=2)
+    assert not failed(outcome)
+    assert outcome.tables[0].rows[0][:2] == (2, 2)
 
 
 @pytest.mark.study
@@ -176,6 +216,16 @@ def test_damage_is_seen(other, lost, doubled, different):
     assert all(check.ok for check in seen.checks("x")) == (lost + doubled + different == 0)
 
 
+def test_a_last_fit_that_was_skipped_is_no_damage():
+    """If both runs report the same, the last estimate counts."""
+    other = found(record(0.0), record(1.0, 2.0))
+    seen = damage.Damage()
+    seen.compare(replace(other, events=Counter(unfinished=1)), found(record(0.0), record(1.0)))
+    assert seen.different == 0
+    seen.compare(other, found(record(0.0), record(1.0)))
+    assert seen.different == 1
+
+
 @pytest.mark.slow
 def test_a_row_that_is_not_counted_is_seen(tmp_path, monkeypatch):
     (tmp_path / "case.toml").write_text(rod.case_text())
@@ -199,12 +249,23 @@ def test_soak_in_small(monkeypatch):
     monkeypatch.setattr(soak, "SensitivityLaw", law)
     monkeypatch.setattr(soak, "WARM", 200)
     monkeypatch.setattr(soak, "BLOCK", 100)
+    # All faults in 700 rows, each of a few rows.
+    few = {
+        name: (60 + 40 * k, min(count, 8), change)
+        for k, (name, (_, count, change)) in enumerate(soak.FAULTS.items())
+    }
+    monkeypatch.setattr(soak, "FAULTS", few)
     outcome = soak.soak(700)
+    told = {(kind, channel): number for kind, channel, number in outcome.tables[1].rows}
+    assert told["repeated", ""] >= 60
+    assert told["leap", ""] == 1 + 8 + 8
+    assert told["malformed", ""] == told["malformed", "a"] == 5
+    assert told["missing", "b"] == told["missing", "left"] == 8
     checks = {check.name.split(":")[0]: check for check in outcome.checks}
     assert checks["memory"].ok
     assert checks["steps that failed"].ok
     assert checks["estimates that a reader does not find"].ok
-    assert checks["relative error of k at the end"].ok
+    assert checks["samples lost or doubled"].ok
     with pytest.raises(lp.errors.RunError, match="at least 400"):
         soak.soak(100)
 
@@ -220,7 +281,7 @@ def test_soak_sees_what_grows():
         for k in steps
     ]
     meter.failed = 1
-    assert len(failed(soak._outcome(meter, 30_000, 1, 0.1))) == 7
+    assert len(failed(soak._outcome(meter, 30_000, 1, 0.1, 1))) == 8
 
 
 @pytest.mark.study

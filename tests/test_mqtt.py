@@ -13,6 +13,7 @@ import time
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from broker import MOSQUITTO, Server
@@ -23,7 +24,7 @@ import livepde as lp
 from livepde.runs.feeds import Gathered
 from livepde.streams.clock import Clock
 from livepde.streams.intake import Intake, Policy
-from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap
+from livepde.streams.mqtt import Broker, MqttSink, MqttSource, _check_overlap, home_assistant
 from livepde.streams.sources import Rows
 
 pytest.importorskip("paho.mqtt")
@@ -172,6 +173,55 @@ def test_estimates_are_published(server, tmp_path):
     k = found[-1].parameters["k"]
     assert objects[-1]["unknowns"] == {"k": {"value": k[0], "std": k[1]}}
     assert [row["k"] for row in came if "k" in row][-1] == k[0]
+
+
+def retained(server: Server, topics: str, count: int) -> dict:
+    """Return the retained messages of topics."""
+    told: queue.Queue = queue.Queue()
+    broker = Broker("127.0.0.1", server.port, "assistant")
+    client = broker.client()
+    client.on_connect = lambda client, *_: client.subscribe(topics)
+    client.on_message = lambda client, _, message: told.put(message)
+    broker.connect(client)
+    messages = [told.get(timeout=PATIENCE) for _ in range(count)]
+    client.disconnect()
+    client.loop_stop()
+    assert told.empty()
+    assert all(message.retain for message in messages)
+    return {message.topic: json.loads(message.payload) for message in messages}
+
+
+def test_home_assistant_finds_the_numbers_of_a_run(server, tmp_path):
+    found = estimates(tmp_path, 3)
+    publisher = sink(server, discovery=True, title="The rod")
+    for estimate in found:
+        publisher.put(estimate)
+    publisher.close()
+    told = retained(server, "homeassistant/#", 2)
+    k = told["homeassistant/sensor/rod_out_k/config"]
+    assert k["name"] == "k"
+    assert k["device"]["name"] == "The rod"
+    assert "unit_of_measurement" not in k  # the unknown has none
+    verdict = told["homeassistant/sensor/rod_out_verdict/config"]
+    assert verdict["device"] == k["device"]
+    assert verdict["state_topic"] == "rod/out"
+    assert verdict["unique_id"] != k["unique_id"]
+    # The topics that are named have the numbers that the templates read.
+    value = retained(server, k["state_topic"], 1)[k["state_topic"]]["value"]
+    assert k["value_template"] == "{{ value_json.value }}"
+    assert value == found[-1].parameters["k"][0]
+    assert "verdict" in found[-1].to_dict()
+    assert (k["availability_topic"], k["payload_available"]) == ("rod/out/status", "running")
+
+
+def test_units_and_names_that_are_no_topics():
+    unit = SimpleNamespace(unit="W/(m K)")
+    space = SimpleNamespace(unknown_of=lambda label: unit)
+    estimate = SimpleNamespace(space=space, parameters={"k #1/2": (1.0, 0.1)})
+    (topic, k), _ = home_assistant(estimate, "a/b", "A")
+    assert topic == "homeassistant/sensor/a_b_k__1_2/config"
+    assert k["unit_of_measurement"] == "W/(m K)"
+    assert k["state_topic"] == "a/b/unknowns/k _1_2"
 
 
 def test_estimates_wait_for_the_broker_and_the_oldest_give_way(server, tmp_path, caplog):

@@ -6,15 +6,20 @@ import asyncio
 import logging
 import threading
 import time
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
-from live_rod import live
+from live_rod import live, rows
 from patience import PATIENCE
 from ports import kept_port
 
 import livepde as lp
-from livepde.streams.opcua import OpcuaSource
+from benchmarks.faults.rod import case_text as rod_case
+from livepde.cases import load
+from livepde.cases.data import publishers_of
+from livepde.streams.opcua import OpcuaServer, OpcuaSink, OpcuaSource
 from livepde.streams.sources import Row, Rows, drained
 
 pytestmark = pytest.mark.broker
@@ -26,7 +31,8 @@ COLUMNS = {"ns=2;s=a": "a", "ns=2;s=b": "b", "ns=2;s=left": "left"}
 class Server:
     """A server with three values, in a thread of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, certificate: Path | None = None, key: Path | None = None) -> None:
+        self.files = certificate, key
         self.kept, port = kept_port()
         self.url = f"opc.tcp://127.0.0.1:{port}/plant"
         self.loop = asyncio.new_event_loop()
@@ -55,12 +61,21 @@ class Server:
         self.server = Asyncua(user_manager=Guard())
         await self.server.init()
         self.server.set_endpoint(self.url)
-        self.server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        kinds = ua.SecurityPolicyType
+        self.server.set_security_policy([kinds.NoSecurity])
+        if self.files != (None, None):
+            self.server.set_security_policy([kinds.Basic256Sha256_SignAndEncrypt])
+            await self.server.load_certificate(self.files[0])
+            await self.server.load_private_key(self.files[1])
         space = await self.server.register_namespace("plant")
         self.nodes = {}
         for name in ("a", "b", "left"):
             node = ua.NodeId(name, space)
             self.nodes[name] = await self.server.nodes.objects.add_variable(node, name, 0.0)
+        for name, value in (("alpha", 0.0), ("alpha_std", 0.0), ("verdict", ""), ("count", 0)):
+            node = ua.NodeId(name, space)
+            self.nodes[name] = await self.server.nodes.objects.add_variable(node, name, value)
+            await self.nodes[name].set_writable()
         await self.server.start()
 
     def write(self, name: str, value, *, moment=None, status=0, dated=True) -> None:
@@ -73,6 +88,9 @@ class Server:
             ServerTimestamp=None if dated else datetime.now(UTC),
         )
         self._do(self.nodes[name].write_value(found))
+
+    def read(self, name: str):
+        return self._do(self.nodes[name].read_value())
 
     def stop(self) -> None:
         if self.running:
@@ -113,7 +131,7 @@ def server(plant):
     """The server of all tests, as it was at first: to make one takes seconds."""
     if not plant.running:
         plant.start()
-    for name in plant.nodes:
+    for name in ("a", "b", "left"):
         plant.write(name, 0.0)
     return plant
 
@@ -130,7 +148,7 @@ def listen(source, wanted) -> list:
 
 
 def source(server, **options) -> OpcuaSource:
-    return OpcuaSource(server.url, COLUMNS, "t", interval=0.05, **options)
+    return OpcuaSource(OpcuaServer(server.url, **options), COLUMNS, "t", interval=0.05)
 
 
 def test_changes_are_rows_with_the_time_of_their_source(server):
@@ -261,17 +279,157 @@ def test_a_run_takes_them(server, tmp_path):
 
 def test_what_cannot_be_reached_is_one_sentence(server):
     with pytest.raises(lp.errors.DataError, match="node 'ns=2;s=none': BadNodeIdUnknown"):
-        OpcuaSource(server.url, {"ns=2;s=none": "x", "ns=2;s=a": "a"}, "t")
+        OpcuaSource(OpcuaServer(server.url), {"ns=2;s=none": "x", "ns=2;s=a": "a"}, "t")
     with pytest.raises(lp.errors.DataError, match="not a node"):
-        OpcuaSource(server.url, {"not a node": "x"}, "t")
+        OpcuaSource(OpcuaServer(server.url), {"not a node": "x"}, "t")
     source(server, username="operator", password="right").close()
     with pytest.raises(lp.errors.DataError, match="BadUserAccessDenied") as refused:
         source(server, username="operator", password="wrong")
     assert "wrong" not in str(refused.value)
     with pytest.raises(lp.errors.DataError, match="use `username` instead"):
-        OpcuaSource("opc.tcp://me:secret@localhost:4840", COLUMNS, "t")
+        OpcuaSource(OpcuaServer("opc.tcp://me:secret@localhost:4840"), COLUMNS, "t")
     with pytest.raises(lp.errors.DataError, match="interval must be"):
-        OpcuaSource(server.url, COLUMNS, "t", interval=0.0)
+        OpcuaSource(OpcuaServer(server.url), COLUMNS, "t", interval=0.0)
     server.stop()
     with pytest.raises(lp.errors.DataError, match=r"opc.tcp://127.0.0.1.*failed"):
         source(server)
+
+
+# --- estimates that are written back -------------------------------------------------------------
+
+WRITTEN = {"ns=2;s=alpha": "k", "ns=2;s=alpha_std": "k_std", "ns=2;s=verdict": "verdict"}
+
+
+def written(server, wanted) -> None:
+    until = time.monotonic() + PATIENCE
+    while not wanted() and time.monotonic() < until:
+        time.sleep(0.05)
+    assert wanted()
+
+
+def test_estimates_are_written_to_nodes(server, tmp_path):
+    sink = OpcuaSink(OpcuaServer(server.url), WRITTEN)
+    run = live(tmp_path, Rows(rows(12)), sinks=[sink])
+    run.run()
+    last = [record.numbers for record in run.journal][-1]
+    sink.close()  # writes the newest one
+    value, std = sink_numbers = server.read("alpha"), server.read("alpha_std")
+    assert sink_numbers != (0.0, 0.0)
+    assert value in last
+    assert std > 0.0
+    assert server.read("verdict") == "not judged"
+    run.journal.close()
+
+
+def test_estimates_are_written_after_the_server_was_away(server, tmp_path):
+    kept = []
+    run = live(tmp_path, Rows(rows(3)), sinks=[SimpleNamespace(put=kept.append)])
+    run.run()
+    run.journal.close()
+    sink = OpcuaSink(OpcuaServer(server.url), WRITTEN)
+    server.stop()
+    sink.put(kept[0])
+    sink.put(kept[-1])
+    server.start()
+    written(server, lambda: server.read("alpha") == kept[-1].parameters["k"][0])
+    sink.close()
+    assert not sink._thread.is_alive()
+
+
+def test_what_cannot_be_written_is_one_sentence(server, tmp_path):
+    for node, name, why in (
+        ("ns=2;s=none", "k", "node 'ns=2;s=none': .*BadNodeIdUnknown"),
+        ("ns=2;s=a", "k", "node 'ns=2;s=a': expected a number .* may write"),  # read only
+        ("ns=2;s=count", "k", "expected a number"),
+        ("ns=2;s=alpha", "verdict", "expected a text"),
+    ):
+        with pytest.raises(lp.errors.DataError, match=why):
+            OpcuaSink(OpcuaServer(server.url), {node: name})
+    sink = OpcuaSink(OpcuaServer(server.url), {"ns=2;s=alpha": "beta"})
+    run = live(tmp_path, Rows(rows(3)), sinks=[sink])
+    run.run()
+    sink.close()
+    (event,) = [event for event in run.journal.events if event.kind == "sink"]
+    assert "got 'beta' to write; there are verdict, k, k_std" in event.message
+    assert len(run.journal) == 3
+    run.journal.close()
+
+
+# --- encrypted messages --------------------------------------------------------------------------
+
+
+def certificate(folder: Path, name: str, uri: str) -> tuple[Path, Path]:
+    """Write a certificate that signs itself, and its key."""
+    from cryptography import x509
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import rsa
+    from cryptography.x509.oid import NameOID
+
+    key = rsa.generate_private_key(65537, 2048)
+    who = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    names = [x509.UniformResourceIdentifier(uri) if uri else x509.DNSName("localhost")]
+    now = datetime.now(UTC)
+    made = (
+        x509.CertificateBuilder()
+        .subject_name(who)
+        .issuer_name(who)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + timedelta(days=1))
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .sign(key, hashes.SHA256())
+    )
+    cert, secret = folder / f"{name}.pem", folder / f"{name}-key.pem"
+    cert.write_bytes(made.public_bytes(serialization.Encoding.PEM))
+    secret.write_bytes(
+        key.private_bytes(
+            serialization.Encoding.PEM,
+            serialization.PrivateFormat.PKCS8,
+            serialization.NoEncryption(),
+        )
+    )
+    return cert, secret
+
+
+def test_certificates_are_next_to_the_case(tmp_path, monkeypatch):
+    path, security = tmp_path / "case.toml", "Basic256Sha256,Sign,a.pem,b.pem"
+    nodes = 'url = "opc.tcp://plant:4840", columns = { "ns=2;s=alpha" = "alpha" }, username = "me"'
+    path.write_text(f'{rod_case()}opcua = {{ {nodes}, security = "{security}" }}\n')
+    monkeypatch.setattr("livepde.streams.opcua.OpcuaSink", lambda *given: given)
+    ((server, columns),) = publishers_of(load(path), {"output.opcua": "secret"})
+    assert columns == {"ns=2;s=alpha": "alpha"}
+    files = f"{tmp_path / 'a.pem'},{tmp_path / 'b.pem'}"
+    expected = f"Basic256Sha256,Sign,{files}"
+    assert server == OpcuaServer("opc.tcp://plant:4840", "me", "secret", expected)
+    assert "secret" not in repr(server)
+    for wrong in ("Basic128Rsa15,Sign,a,b", "Basic256Sha256,None,a,b", "Basic256Sha256,Sign,a"):
+        path.write_text(f'{rod_case()}opcua = {{ {nodes}, security = "{wrong}" }}\n')
+        with pytest.raises(lp.errors.CaseError, match=r"output.opcua.security"):
+            load(path)
+
+
+@pytest.mark.slow
+def test_messages_are_encrypted_and_the_server_is_known_by_its_certificate(tmp_path):
+    theirs = certificate(tmp_path, "plant", "urn:freeopcua:python:server")
+    ours = certificate(tmp_path, "run", "urn:livepde:run")
+    other = certificate(tmp_path, "other", "urn:other")
+    nameless = certificate(tmp_path, "nameless", "")
+    encrypted = Server(*theirs)
+    try:
+        with pytest.raises(lp.errors.DataError):
+            source(encrypted)  # the server has no other policy
+        policy = "Basic256Sha256,SignAndEncrypt"
+        text = ",".join([policy, *map(str, (*ours, theirs[0]))])
+        heard = source(encrypted, security=text)
+        encrypted.write("a", 1.5)
+        listen(heard, lambda row: row.values.get("a") == 1.5)
+        heard.close()
+        with pytest.raises(lp.errors.DataError):  # a server of another certificate
+            source(encrypted, security=",".join([policy, *map(str, (*ours, other[0]))]))
+        with pytest.raises(lp.errors.DataError, match="names no application"):
+            source(encrypted, security=",".join([policy, *map(str, nameless)]))
+        with pytest.raises(lp.errors.DataError, match="No such file"):
+            source(encrypted, security=f"{policy},{tmp_path / 'none.pem'},{ours[1]}")
+    finally:
+        encrypted.close()

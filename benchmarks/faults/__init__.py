@@ -28,7 +28,7 @@ from benchmarks.faults.hostile import hostile_cases
 from benchmarks.faults.kills import KILLED
 from benchmarks.faults.outages import outages
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.progress import frequent_kills
+from benchmarks.faults.progress import frequent_kills, prompt_stops
 from benchmarks.faults.visitors import slow_visitors
 from livepde.runs import Check, Outcome, Table
 
@@ -39,6 +39,7 @@ KILLS, SAMPLES, MALFORMED, FLIPS = 600, 2000, 100_000, 200
 PARTS: Mapping[str, Callable[[Plan], Outcome]] = {
     **KILLED,
     "progress": frequent_kills,
+    "sigterm": prompt_stops,
     "restart": outages,
     "disk": failing_disks,
     "malformed": broken_rows,

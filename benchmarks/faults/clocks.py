@@ -1,102 +1,323 @@
-"""Clocks that leap or go back, and rows that come again, in live runs of the rod."""
+"""Clocks that leap or go back, and rows that come again, in live runs over every transport.
+
+The real command runs the rod. Its rows come from a file, standard input, a broker and an OPC UA
+server. After the first wrong rows the plant waits for `/health`, and again at the end.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
 from datetime import datetime, timedelta
+from itertools import zip_longest
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from benchmarks.faults.plan import Plan
+from benchmarks.faults.plants import (
+    PATIENCE,
+    Feeder,
+    GrowingFile,
+    Mosquitto,
+    Nodes,
+    Plant,
+    Topic,
+    wait,
+)
 from benchmarks.faults.rod import STEP, Row, case_text, rod_rows
-from livepde.cases import load
-from livepde.cases.live_case import LiveCase
-from livepde.runs import Check, Outcome, Table
-from livepde.streams.sources import Rows
+from benchmarks.faults.run import Run
+from livepde.records import interval_95
+from livepde.runs import JOURNAL, Check, Journal, Outcome, Table
+from livepde.runs import open as open_run
+
+COUNT, AT = 500, 200  # rows, and the one with which most faults begin
+AFTER = 50  # right samples after a fault, after which the estimates are compared
+NEAR = 1.2  # half-widths of their 95 % interval by which they may differ
+SOON = 20.0  # seconds for health to change
+DAY, HOUR = timedelta(days=1), timedelta(hours=1)
+CHANNELS = ("left", "T_3", "T_6")
+
+Change: TypeAlias = Callable[[Sequence[Row]], list[Row]]
+Values: TypeAlias = Mapping[tuple[float, str], float]  # (time, channel) -> value
 
 
-def _moved(rows: Sequence[Row], by: timedelta) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class Fault:
+    """A fault of clocks.
+
+    Attributes
+    ----------
+    change
+        Turns the right rows into the rows that come.
+    look
+        Number of rows after which `/health` must be false; None if no row waits or is late.
+    end
+        Row from which on all rows are right; None if the fault does not end.
+    moved
+        Whether rows have other times, instead of wrong rows between them.
+    doubted
+        Whether the run has to end with "do not trust".
+    """
+
+    change: Change
+    look: int | None = None
+    end: int | None = AT
+    moved: bool = False
+    doubted: bool = False
+
+
+def _moved(rows: Sequence[Row], by: timedelta) -> list[Row]:
     return [{**row, "time": str(datetime.fromisoformat(row["time"]) + by)} for row in rows]
 
 
-def _with(rows: Sequence[Row], wrong: Sequence[Row], at: int) -> list[Row]:
-    return [*rows[:at], *wrong, *rows[at:]]
+def _inserted(by: timedelta, count: int = 1, names: Sequence[str] = CHANNELS) -> Change:
+    """Return a change that inserts rows with values of earlier ones, at times ahead."""
+
+    def change(rows: Sequence[Row]) -> list[Row]:
+        # A server does not send a value that stays the same, so these are not those of row AT.
+        wrong = _moved(rows[AT - count - 1 : AT - 1], by)
+        few = [{name: row[name] for name in ("time", *names)} for row in wrong]
+        return [*rows[:AT], *few, *rows[AT:]]
+
+    return change
 
 
-def _used(rows: Sequence[Row]) -> list[float]:
-    """Return the times that are later than all before them, in seconds since the first."""
-    times = np.array([datetime.fromisoformat(row["time"]).timestamp() for row in rows])
-    newest = np.maximum.accumulate(times)
-    kept = np.append(True, np.diff(newest) > 0)
-    found: list[float] = (times - times[0])[kept].tolist()
+def _set(by: timedelta, stop: int | None = None) -> Change:
+    """Return a change that moves all rows from AT on, up to another one."""
+    return lambda rows: [
+        *rows[:AT], *_moved(rows[AT:stop], by), *(rows[stop:] if stop is not None else ()),
+    ]  # fmt: skip
+
+
+def _every_25th(rows: Sequence[Row]) -> list[Row]:
+    wrong = [_moved(rows[k - 2 : k - 1], HOUR) if k % 25 == 24 else [] for k in range(450)]
+    pairs = zip_longest(wrong, rows, fillvalue=())
+    return [one for ahead, row in pairs for one in (*ahead, row)]
+
+
+def _back_again(rows: Sequence[Row]) -> list[Row]:
+    lags = [timedelta(seconds=3.5 * STEP * (k // 30)) for k in range(len(rows))]
+    return [_moved([row], -lag)[0] for row, lag in zip(rows, lags, strict=True)]
+
+
+FAULTS: Mapping[str, Fault] = {
+    "none": Fault(list),
+    # There is no sample yet, so that the run waits.
+    "the first row 10 years ahead": Fault(lambda rows: [*_moved(rows[2:3], 3650 * DAY), *rows]),
+    "one row 29 days ahead": Fault(_inserted(29 * DAY), AT + 1),
+    "one row 10 years ahead": Fault(_inserted(3650 * DAY), AT + 1),
+    "one reading of T_3 90 steps ahead": Fault(_inserted(1.5 * HOUR, 1, ["T_3"]), AT + 1),
+    "two rows 10 years ahead": Fault(_inserted(3650 * DAY, 2), AT + 2),
+    "eight rows 3 hours ahead": Fault(_inserted(3 * HOUR, 8), AT + 8),
+    "every 25th row an hour ahead": Fault(_every_25th, 25, 450),
+    # Rows of the past that are counted, and change nothing.
+    "one row of 1970": Fault(_inserted(-20454 * DAY)),
+    "100 rows again": Fault(lambda rows: [*rows[: AT + 100], *rows[AT:]], None, AT + 100),
+    "set back by an hour": Fault(_set(-HOUR), AT + 5, AT + 60, True),
+    "set back by a day": Fault(_set(-DAY), AT + 5, None, True),
+    "set ahead by an hour": Fault(_set(HOUR), AT + 5, AT, True),
+    "set ahead by 10 years": Fault(_set(3650 * DAY), AT + 5, AT, True),
+    "an hour ahead for 100 rows": Fault(_set(HOUR, AT + 100), AT + 5, AT + 160, True),
+    "back by 3.5 steps every 30 rows": Fault(_back_again, 65, None, True, True),
+}
+
+
+def _seconds(rows: Sequence[Row]) -> list[float]:
+    """Return the times of rows since that of the first."""
+    times = [datetime.fromisoformat(row["time"]) for row in rows]
+    return [(one - times[0]).total_seconds() for one in times]
+
+
+def _right(fault: Fault, rows: Sequence[Row]) -> Values:
+    """Return the values of those rows that are later than all before them."""
+    came = fault.change(rows) if fault.moved else rows
+    found: dict[tuple[float, str], float] = {}
+    newest = -1.0
+    for t, row in zip(_seconds(came), came, strict=True):
+        if t > newest:
+            found |= {(t, name): float(row[name]) for name in CHANNELS}
+            newest = t
     return found
 
 
-DAY, HOUR = timedelta(days=1), timedelta(hours=1)
+@dataclass(frozen=True)
+class _Seen:
+    """What became of a run: its values, health while the fault lasts and after it, estimates."""
 
-# Name -> how the right rows become those that come. Those that are inserted are never used.
-INSERTED: Mapping[str, Any] = {
-    "none": lambda rows: list(rows),
-    "the first row 10 years ahead": lambda rows: _with(rows, _moved(rows[:1], 3650 * DAY), 0),
-    "one row 29 days ahead": lambda rows: _with(rows, _moved(rows[200:201], 29 * DAY), 200),
-    "one row 10 years ahead": lambda rows: _with(rows, _moved(rows[200:201], 3650 * DAY), 200),
-    "two rows 10 years ahead": lambda rows: _with(rows, _moved(rows[200:202], 3650 * DAY), 200),
-    "eight rows 3 hours ahead": lambda rows: _with(rows, _moved(rows[200:208], 3 * HOUR), 200),
-    "every 25th row an hour ahead": lambda rows: [
-        one for k, row in enumerate(rows) for one in (*_moved([row], HOUR)[: k % 25 == 24], row)
-    ],
-    "one row of 1970": lambda rows: _with(rows, [{**rows[0], "time": "1970-01-01"}], 200),
-    "100 rows again": lambda rows: _with(rows, rows[200:300], 300),
-}
-# The same for clocks that are wrong for long: a time is used if it is later than all before it.
-MOVED: Mapping[str, Any] = {
-    "set back by an hour": lambda rows: [*rows[:200], *_moved(rows[200:], -HOUR)],
-    "set back by a day": lambda rows: [*rows[:200], *_moved(rows[200:], -DAY)],
-    "set ahead by an hour": lambda rows: [*rows[:200], *_moved(rows[200:], HOUR)],
-    "back by 3.5 steps every 30 rows": lambda rows: [
-        _moved([row], -timedelta(seconds=3.5 * STEP * (k // 30)))[0] for k, row in enumerate(rows)
-    ],
-    "an hour ahead for 100 rows": lambda rows: [
-        *rows[:200], *_moved(rows[200:300], HOUR), *rows[300:],
-    ],
-}  # fmt: skip
-CLOCKS = {**INSERTED, **MOVED}
-# Rows are late until the end, or the clock is never steady: the run is not well.
-LASTING = ("set back by a day", "back by 3.5 steps every 30 rows")
+    values: Values
+    counts: Mapping[str, int]
+    during: Mapping[str, Any]
+    after: Mapping[str, Any]
+    verdict: str
+    estimates: Mapping[float, tuple[float, float]]  # time -> alpha, and half of its interval
+
+    def moved_from(self, other: _Seen, fault: Fault, rows: Sequence[Row]) -> tuple[float, float]:
+        """Compare alpha with that of a run without the fault.
+
+        Return the difference in half-widths of its interval, and how much wider that is.
+        """
+        if fault.end is None:
+            return np.nan, np.nan
+        k = fault.end + AFTER - 1
+        t = _seconds(fault.change(rows) if fault.moved else rows)[k]
+        alpha, half = self.estimates.get(t, (np.inf, 1.0))
+        expected, usual = other.estimates[k * STEP]
+        return abs(alpha - expected) / half, half / usual
+
+
+def _health(run: Run) -> Mapping[str, Any]:
+    """Return the content of `/health`, empty before the run has a server."""
+    found = re.search(r"health and metrics at (\S+)", (run.folder / "log.txt").read_text())
+    if found is None:
+        return {}
+    try:
+        with urllib.request.urlopen(f"{found[1]}/health", timeout=SOON) as answer:
+            content = answer.read()
+    except urllib.error.HTTPError as error:
+        content = error.read()
+    health: Mapping[str, Any] = json.loads(content)
+    return health
+
+
+def _awaited(run: Run, ok: bool) -> Mapping[str, Any]:
+    """Wait until the health is so, and return what it is in the end."""
+    until = time.monotonic() + SOON
+    while (found := _health(run))["ok"] != ok and time.monotonic() < until:
+        time.sleep(0.05)
+    return found
+
+
+def _seen(folder: Path, plant: Plant, fault: Fault, rows: Sequence[Row]) -> _Seen:
+    count, right = len(fault.change(rows)), _right(fault, rows)
+    options = ["--listen", "0"]
+    with closing(Run(folder, plant.source, plant.launch, options=options)) as run:
+        text = case_text(plant.source, silence=600.0, leap="30 d")
+        if isinstance(plant, Nodes):  # the values of a row come one by one, in any order
+            text = text.replace('"degC" }', '"degC", wait = "20 min" }')
+        (folder / "case.toml").write_text(text)
+        (folder / "log.txt").touch()
+        run.start()
+        wait(lambda: run.alive() and bool(_health(run)), "a run does not begin")
+        during: Mapping[str, Any] = {}
+        if fault.look is not None:
+            plant.supply(fault.look)
+            during = _awaited(run, False)
+        plant.supply(count)
+        samples = len({t for t, _ in right})
+        so_far, until = 0, time.monotonic() + PATIENCE
+        while run.alive() and so_far < samples and time.monotonic() < until:
+            time.sleep(0.05)
+            if run.estimated() > so_far:
+                so_far, until = run.estimated(), time.monotonic() + PATIENCE
+        after = _awaited(run, fault.end is not None)
+        run.end(0)
+    data = open_run(run.out).dataset
+    low, high = interval_95(data, "alpha")
+    times = [round(t, 6) for t in data["time"].values.tolist()]
+    pairs = zip(data["alpha"].values.tolist(), (0.5 * (high - low)).tolist(), strict=True)
+    with Journal.open(run.out / JOURNAL) as journal:
+        values = {
+            (one.t, name): value
+            for one in journal.taken()
+            for name, value in one.values.items()
+            if not np.isnan(value)
+        }
+        counts: dict[str, int] = {}
+        for (kind, _), number in journal.counts.items():
+            counts[kind] = counts.get(kind, 0) + number
+    verdict = json.loads(data.attrs["verdict"])["level"]
+    return _Seen(values, counts, during, after, verdict, dict(zip(times, pairs, strict=True)))
+
+
+TRANSPORTS = ("file", "standard input", "MQTT", "OPC UA")
+
+
+@contextmanager
+def _plants(name: str, folder: Path) -> Iterator[Callable[[Path, Sequence[Row]], Plant]]:
+    """Yield what makes a plant of a transport for a run in a folder."""
+    with ExitStack() as stack:
+        if name == "MQTT":
+            broker = stack.enter_context(closing(Mosquitto(folder)))
+
+        def plant(here: Path, rows: Sequence[Row]) -> Plant:
+            if name == "file":
+                return GrowingFile(here, rows, whole=True)
+            if name == "standard input":
+                return stack.enter_context(closing(Feeder(here, rows, 0)))
+            if name == "MQTT":
+                return stack.enter_context(closing(Topic(broker, rows, here.name)))
+            return stack.enter_context(closing(Nodes(rows)))
+
+        yield plant
 
 
 def clock_faults(plan: Plan) -> Outcome:
     """Let the clocks of the rod go wrong, and compare the samples with those that are right."""
-    rows = rod_rows(500)
-    found, most, silent, ill = [], 0, [], []
-    with TemporaryDirectory() as name:
-        path = Path(name) / "case.toml"
-        path.write_text(case_text().replace('leap = "1 d"', 'leap = "30 d"'))
-        for fault, change in CLOCKS.items():
-            with LiveCase(load(path), Rows(change(rows))) as wiring:
-                live = wiring.live()
-                if live is None:
-                    raise RuntimeError("the run did not begin")
-                live.run()
-                taken, counts = [record.t for record in live.journal], live.journal.counts
-                # What a clock that is wrong did to the data may well make the estimates doubtful.
-                well = live.health["ok"] or live.health["why"].startswith("the verdict")
-            wrong = len(set(taken) ^ set(_used(rows if fault in INSERTED else change(rows))))
-            most = max(most, wrong)
-            if fault != "none" and not counts and "ahead by" not in fault:
-                silent.append(fault)
-            if well == (fault in LASTING):
-                ill.append(fault)
-            told = ", ".join(f"{kind} {number}" for (kind, _), number in sorted(counts.items()))
-            found.append((fault, len(taken), wrong, told or "–"))
-    return Outcome(
-        tables=[Table(f"Clocks of {len(rows)} rows", ("fault", "taken", "wrong", "told"), found)],
-        checks=[
-            Check("clock faults: samples too many or too few", most, 0, "<="),
-            Check("clock faults that are not told", len(silent), 0, "<="),
-            Check("clock faults after which the health is wrong", len(ill), 0, "<="),
-        ],
+    rows, found, told = rod_rows(COUNT), [], _Told()
+    cases = [(name, fault) for name in TRANSPORTS for fault in FAULTS]
+    numbers = iter(plan.watched(len(cases), "clocks"))
+    for name in TRANSPORTS:
+        with TemporaryDirectory() as folder, _plants(name, Path(folder)) as plants:
+            for k, (about, fault) in enumerate(FAULTS.items()):
+                next(numbers)
+                here = Path(folder) / f"run-{k}"
+                here.mkdir()
+                seen = _seen(here, plants(here, fault.change(rows)), fault, rows)
+                found.append((name, about, *told.add(f"{about}, {name}", seen, fault, rows)))
+    head = (
+        *("transport", "fault", "lost", "wrong", "half-widths", "wider by"),
+        *("health during", "after", "verdict", "told"),
     )
+    return Outcome(tables=[Table(f"Clocks of {len(rows)} rows", head, found)], checks=told.checks())
+
+
+class _Told:
+    """What all runs lost, and where health was wrong."""
+
+    def __init__(self) -> None:
+        self.lost = self.wrong = 0
+        self.moved = 0.0
+        self.silent: list[str] = []
+        self.ill: list[str] = []
+        self.trusted: list[str] = []
+        self._plain: _Seen | None = None
+
+    def add(self, about: str, seen: _Seen, fault: Fault, rows: Sequence[Row]) -> tuple[Any, ...]:
+        """Add a run, and return its row of the table."""
+        right = _right(fault, rows)
+        lost = len(right.keys() - seen.values.keys())
+        wrong = sum(right.get(key) != value for key, value in seen.values.items())
+        self._plain = self._plain or seen
+        moved, wider = seen.moved_from(self._plain, fault, rows)
+        self.lost, self.wrong = self.lost + lost, self.wrong + wrong
+        self.moved = float(np.fmax(self.moved, moved))
+        if fault.look is not None and (seen.during["ok"] or seen.during["ailment"] != "clock"):
+            self.silent.append(about)
+        if seen.after["ok"] != (fault.end is not None):
+            self.ill.append(about)
+        if fault.doubted and seen.verdict != "do not trust":
+            self.trusted.append(about)
+        counts = ", ".join(f"{kind} {number}" for kind, number in sorted(seen.counts.items()))
+        during = seen.during.get("ailment", "–")
+        after = "ok" if seen.after["ok"] else seen.after["ailment"]
+        return lost, wrong, moved, wider, during, after, seen.verdict, counts or "–"
+
+    def checks(self) -> list[Check]:
+        """Return the checks of all runs."""
+        return [
+            Check("clock faults: right values lost", self.lost, 0, "<="),
+            Check("clock faults: values at times that were never measured", self.wrong, 0, "<="),
+            Check(f"clock faults: half-widths {AFTER} samples later", self.moved, NEAR, "<="),
+            Check("clock faults with /health true during them", len(self.silent), 0, "<="),
+            Check("clock faults after which /health is wrong", len(self.ill), 0, "<="),
+            Check("clocks that are never steady, and are trusted", len(self.trusted), 0, "<="),
+        ]

@@ -1,16 +1,20 @@
-"""What brings rows to a run: a file that grows, standard input, topics of a broker."""
+"""What brings rows to a run: a growing file, standard input, topics of a broker, a server."""
 
 from __future__ import annotations
 
+import asyncio
 import json
+import logging
 import os
 import shutil
 import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -48,20 +52,23 @@ def launched(
 
 
 class GrowingFile(Plant):
-    """A file that grows, not always by whole lines."""
+    """A file that grows; unless `whole`, not always by whole lines."""
 
     source = 'file = "rows.csv"\nfollow = true'
 
-    def __init__(self, folder: Path, rows: Sequence[Row], seed: int) -> None:
+    def __init__(
+        self, folder: Path, rows: Sequence[Row], seed: int = 0, whole: bool = False
+    ) -> None:
         self.path = folder / "rows.csv"
         self._rng = np.random.default_rng(seed)
-        self._lines = [",".join(map(str, row.values())) + "\n" for row in rows]
+        self._whole = whole
+        self._lines = [",".join(str(row.get(name, "")) for name in rows[0]) + "\n" for row in rows]
         self._text = ",".join(rows[0]) + "\n"
         self._count = 0
         self._written = 0
 
     def supply(self, count: int) -> None:
-        whole = len(self._lines) <= count
+        whole = self._whole or len(self._lines) <= count
         self._text += "".join(self._lines[self._count : count])
         self._count = max(count, self._count)
         cut = 0 if whole else int(self._rng.integers(0, 40))
@@ -180,6 +187,80 @@ class Topic(Plant):
     def close(self) -> None:
         self._client.disconnect()
         self._client.loop_stop()
+
+
+class Nodes(Plant):
+    """Variables of an OPC UA server, one for each channel, with the times of the rows.
+
+    Parameters
+    ----------
+    rows
+        The first one names all channels.
+    """
+
+    PERIOD = 0.05  # seconds between two messages of the server
+    AT_ONCE = 5  # rows that are written between two messages, fewer than the server queues
+
+    def __init__(self, rows: Sequence[Row]) -> None:
+        logging.getLogger("asyncua").setLevel(logging.CRITICAL)
+        self._rows, self._count = rows, 0
+        self._names = [name for name in rows[0] if name != "time"]
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self._url = f"opc.tcp://127.0.0.1:{probe.getsockname()[1]}/plant"
+        columns = ", ".join(f'"ns=2;s={name}" = "{name}"' for name in self._names)
+        self.source = (
+            f'[data.opcua]\nurl = "{self._url}"\ninterval = "{self.PERIOD} s"\n'
+            f"columns = {{ {columns} }}"
+        )
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        self._do(self._start())
+
+    def supply(self, count: int) -> None:
+        self._do(self._write(self._rows[self._count : count]))
+        self._count = max(count, self._count)
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._do(self._server.stop())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def _do(self, work: Coroutine[Any, Any, None]) -> None:
+        asyncio.run_coroutine_threadsafe(work, self._loop).result(PATIENCE)
+
+    async def _start(self) -> None:
+        from asyncua.server.server import Server
+
+        ua: Any = import_module("asyncua.ua")
+        self._server = Server()
+        await self._server.init()
+        self._server.set_endpoint(self._url)
+        self._server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+        space = await self._server.register_namespace("plant")
+        objects, nothing = self._server.nodes.objects, ua.StatusCodes.BadWaitingForInitialData
+        self._nodes = {}
+        for name in self._names:
+            node = await objects.add_variable(ua.NodeId(name, space), name, 0.0)
+            await node.write_value(ua.DataValue(StatusCode=ua.StatusCode(nothing)))
+            self._nodes[name] = node
+        await self._server.start()
+
+    async def _write(self, rows: Sequence[Row]) -> None:
+        ua: Any = import_module("asyncua.ua")
+        for number, row in enumerate(rows, start=1):
+            moment = datetime.fromisoformat(row["time"]).replace(tzinfo=UTC)
+            for name in row.keys() & self._nodes.keys():
+                value = ua.DataValue(ua.Variant(float(row[name])), SourceTimestamp=moment)
+                await self._nodes[name].write_value(value)
+            if number % self.AT_ONCE == 0 or number == len(rows):
+                await self._sent()
+
+    async def _sent(self) -> None:
+        """Wait until the server has sent all values."""
+        subscriptions = self._server.iserver.subscription_service.subscriptions
+        while any(one._triggered_datachanges for one in subscriptions.values()):
+            await asyncio.sleep(0.2 * self.PERIOD)
 
 
 class Mosquitto:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from benchmarks.faults.damage import Damage, Found
 from benchmarks.faults.plan import Plan
@@ -19,6 +22,7 @@ LIFE = 8.0  # seconds after which a run is killed
 # Name -> substeps of a step, and samples of a run.
 STEPS = {"50 ms": (40, 400), "2 s": (1600, 16)}
 MOST = 40  # lives of a run
+STOPS = 100  # signals at random moments of long steps
 LATE = 2.5  # seconds from SIGTERM to the exit: a second of grace, and the report
 
 
@@ -28,10 +32,11 @@ def frequent_kills(plan: Plan) -> Outcome:
     for name, (substeps, samples) in STEPS.items():
         text = f'refit = false\n[steps]\ndt_max = "{STEP / substeps} s"\n'
         with TemporaryDirectory() as folder:
-            expected, _, _ = _lives(Path(folder), samples, text, 1e9, signal.SIGKILL)
+            expected, _, _ = _lives(Path(folder), samples, text, lambda: 1e9, signal.SIGKILL)
         for how in (signal.SIGKILL, signal.SIGTERM):
             with TemporaryDirectory() as folder:
-                found, gains, slow = _lives(Path(folder), samples, text, LIFE, how)
+                found, gains, exits = _lives(Path(folder), samples, text, lambda: LIFE, how)
+            slow = max(exits, default=0.0)
             damage.compare(found, expected)
             # The first life may end before its first step has.
             idle += sum(gain == 0 for gain in gains[1:])
@@ -48,19 +53,45 @@ def frequent_kills(plan: Plan) -> Outcome:
     )
 
 
+def prompt_stops(plan: Plan) -> Outcome:
+    """Stop a run with steps of two seconds by SIGTERM, at moments drawn at random."""
+    rng, count = np.random.default_rng(plan.seed), min(plan.kills, STOPS)
+    numbers = iter(plan.watched(count, "SIGTERM"))
+
+    def life() -> float:
+        next(numbers)
+        return float(rng.uniform(3.0, LIFE))
+
+    substeps, _ = STEPS["2 s"]
+    text = f'refit = false\n[steps]\ndt_max = "{STEP / substeps} s"\n'
+    with TemporaryDirectory() as folder:
+        rows = 4 * count + 10
+        _, gains, exits = _lives(Path(folder), rows, text, life, signal.SIGTERM, count)
+    soon = sum(one <= LATE for one in exits)
+    row = (len(exits), soon, float(np.median(exits)), max(exits), sum(gains))
+    head = ("SIGTERM", f"within {LATE:g} s", "median seconds", "most", "samples")
+    check = Check(f"SIGTERM: exits later than {LATE:g} s", len(exits) - soon, 0, "<=")
+    return Outcome(tables=[Table("Stops at random moments", head, [row])], checks=[check])
+
+
 def _lives(
-    folder: Path, samples: int, text: str, life: float, how: signal.Signals
-) -> tuple[Found, list[int], float]:
-    """Return what a run leaves behind, its new samples in each life, and its slowest exit."""
-    plant, gains, slow = GrowingFile(folder, rod_rows(samples + 1), 0), list[int](), 0.0
+    folder: Path,
+    samples: int,
+    text: str,
+    life: Callable[[], float],
+    how: signal.Signals,
+    most: int = MOST,
+) -> tuple[Found, list[int], list[float]]:
+    """Return what a run leaves behind, its new samples in each life, and the seconds of exits."""
+    plant, gains, exits = GrowingFile(folder, rod_rows(samples + 1), 0), list[int](), list[float]()
     plant.supply(samples)  # the last row may be without its end
     with closing(Run(folder, plant.source)) as run:
         case = folder / "case.toml"
         case.write_text(case.read_text().replace("[output]", text + "[output]"))
-        while len(gains) < MOST:
+        while len(gains) < most:
             before = run.estimated()
             run.start()
-            until = time.monotonic() + life
+            until = time.monotonic() + life()
             while time.monotonic() < until and run.alive() and run.estimated() < samples - 1:
                 time.sleep(0.02)
             gains.append(run.estimated() - before)
@@ -69,8 +100,10 @@ def _lives(
             begun = time.monotonic()
             run.signal(how)
             run.process.wait()
-            slow = max(slow, time.monotonic() - begun)
+            exits.append(time.monotonic() - begun)
+        if len(gains) == most and run.estimated() < samples - 1:
+            return Found.of(folder / "run"), gains, exits
         # The last sample shows that the last life hears signals.
         plant.supply(samples + 1)
         run.end(samples + 1)
-    return Found.of(folder / "run"), gains, slow
+    return Found.of(folder / "run"), gains, exits

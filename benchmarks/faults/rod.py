@@ -30,7 +30,7 @@ time = "time"
 
 [intake]
 silence = "{silence} s"
-leap = "1 d"
+leap = "{leap}"
 
 [unknowns.alpha]
 prior = "3e-5 m^2/s"
@@ -54,9 +54,9 @@ fields_every = 20
 """
 
 
-def case_text(source: str = "") -> str:
+def case_text(source: str = "", silence: float = SILENCE, leap: str = "1 d") -> str:
     """Return the case of the rod, with the lines that name a source."""
-    return _CASE.format(source=source, silence=SILENCE)
+    return _CASE.format(source=source, silence=silence, leap=leap)
 
 
 def rod_rows(count: int) -> list[dict[str, Any]]:

@@ -11,13 +11,13 @@ from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 from zoneinfo import ZoneInfo
 
 import numpy as np
 
 from livepde.cases.case_content import CaseContent, check_options, load_code, own_code
-from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec
+from livepde.cases.schema import SENSORS, BrokerSpec, CaseSpec, DataSpec, FileSpec, NodesSpec
 from livepde.dates import since_1970
 from livepde.runs.live_loop import Backlog, Retention, Sink
 from livepde.streams import (
@@ -37,6 +37,9 @@ from livepde.streams.oddities import wild_first_rows
 from livepde.streams.sources import Follow, Lines, RowSource
 from livepde.streams.table import JSON_LINES, no_file
 from livepde.units import conversion
+
+if TYPE_CHECKING:
+    from livepde.streams.opcua import OpcuaServer
 
 DATE = re.compile(r"\s*\d{4}-\d{2}-\d{2}")
 VARIABLE = "${LIVEPDE_DATA}"
@@ -407,14 +410,9 @@ def _own_source(case: CaseContent, position: str, passwords: Mapping[str, str]) 
     if spec.opcua is not None:
         from livepde.streams.opcua import OpcuaSource
 
-        return OpcuaSource(
-            spec.opcua.url,
-            spec.opcua.columns,
-            spec.times[0],
-            interval=case.positive(spec.opcua.interval, "s", "data.opcua.interval"),
-            username=spec.opcua.username,
-            password=passwords.get("data.opcua"),
-        )
+        server = _server(case, spec.opcua, "data.opcua", passwords)
+        interval = case.positive(spec.opcua.interval, "s", "data.opcua.interval")
+        return OpcuaSource(server, spec.opcua.columns, spec.times[0], interval)
     return _file_source(case, data_file(case), position)
 
 
@@ -435,10 +433,17 @@ def _file_source(case: CaseContent, path: Path, position: str) -> Follow:
 
 def publishers_of(case: CaseContent, passwords: Mapping[str, str]) -> list[Sink]:
     """Return the sinks that a case names."""
-    spec = case.spec.output.mqtt
-    if spec is None:
-        return []
-    return [MqttSink(_broker(case, spec, "output.mqtt", passwords), spec.topic)]
+    sinks: list[Sink] = []
+    if (spec := case.spec.output.mqtt) is not None:
+        broker = _broker(case, spec, "output.mqtt", passwords)
+        title = case.spec.title or case.name
+        discovery = spec.discovery is not None
+        sinks.append(MqttSink(broker, spec.topic, discovery=discovery, title=title))
+    if (nodes := case.spec.output.opcua) is not None:
+        from livepde.streams.opcua import OpcuaSink
+
+        sinks.append(OpcuaSink(_server(case, nodes, "output.opcua", passwords), nodes.columns))
+    return sinks
 
 
 def source_text(case: CaseContent) -> str:
@@ -467,6 +472,17 @@ def _broker(case: CaseContent, spec: BrokerSpec, key: str, passwords: Mapping[st
     )
 
 
+def _server(
+    case: CaseContent, spec: NodesSpec, key: str, passwords: Mapping[str, str]
+) -> OpcuaServer:
+    from livepde.streams.opcua import OpcuaServer
+
+    policy, mode, *files = (spec.security or ",").split(",")
+    paths = [str(case.path.parent / file) for file in files]
+    security = ",".join([policy, mode, *paths]) if spec.security else ""
+    return OpcuaServer(spec.url, spec.username, passwords.get(key), security)
+
+
 def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
     """Return the passwords of a case by the key of their connection, before any is opened.
 
@@ -479,7 +495,8 @@ def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[s
     """
     spec, allowed = case.spec, set(allowed)
     sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}
-    connections = {**sources, "output.mqtt": spec.output.mqtt}
+    sinks = {"output.mqtt": spec.output.mqtt, "output.opcua": spec.output.opcua}
+    connections = {**sources, **sinks}
     named = {key: one.password_env for key, one in connections.items() if one is not None}
     return {key: _password(case, name, key, allowed) for key, name in named.items() if name}
 

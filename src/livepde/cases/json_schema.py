@@ -23,6 +23,13 @@ BROKER = {
     "ca_file": "File of the certificates that are trusted; without it those of the system.",
     "session": "How long the broker keeps messages for a run that is stopped; a time.",
 }
+NODES = {
+    "url": "Address of the server, opc.tcp://HOST:PORT.",
+    "username": BROKER["username"].replace("broker", "server"),
+    "password_env": BROKER["password_env"],
+    "security": "Encryption: POLICY,MODE,CERTIFICATE,KEY[,CERTIFICATE OF THE SERVER], such as "
+    "Basic256Sha256,SignAndEncrypt,cert.pem,key.pem.",
+}
 PRIOR = {
     "prior": "Best guess before seeing data, in the unit of the unknown, or with a unit.",
     "std": "Standard deviation of the prior, in the unit of the unknown, or with a unit.",
@@ -74,13 +81,19 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "rows": "Topics whose messages are rows, as JSON objects.",
         "columns": "Topic -> column whose numbers its messages are.",
     },
-    "PublishSpec": {**BROKER, "topic": "Topic to which estimates are published."},
+    "PublishSpec": {
+        **BROKER,
+        "topic": "Topic to which estimates are published.",
+        "discovery": "Whether Home Assistant finds the estimates by itself.",
+    },
     "OpcuaSpec": {
-        "url": "Address of the server, opc.tcp://HOST:PORT.",
+        **NODES,
         "columns": "Node -> column whose numbers it has.",
         "interval": "Interval at which the server samples its nodes; a time.",
-        "username": BROKER["username"].replace("broker", "server"),
-        "password_env": BROKER["password_env"],
+    },
+    "NodesSpec": {
+        **NODES,
+        "columns": "Node -> what is written to it: NAME or NAME_std of an unknown, or verdict.",
     },
     "FileSpec": {
         "file": "CSV file, relative to the case.",
@@ -222,6 +235,7 @@ MEANINGS: Mapping[str, Mapping[str, str]] = {
         "smoothed": "Whether a finished run ends with estimates given all samples.",
         "surface_resistances": "[inside, outside] of a wall, for its U-value; m^2 K/W.",
         "mqtt": "Broker to which a live run publishes its estimates.",
+        "opcua": "OPC UA server to which a live run writes its estimates.",
     },
     "VariantSpec": {
         "name": "Name of the variant.",

@@ -130,14 +130,26 @@ class MqttSpec(BrokerSpec):
         return self
 
 
-class OpcuaSpec(Spec):
-    """Nodes of an OPC UA server."""
+# Policy, mode, certificate and key, and perhaps the certificate of the server.
+SECURITY = (
+    "^(Basic256Sha256|Aes128Sha256RsaOaep|Aes256Sha256RsaPss),(Sign|SignAndEncrypt)(,[^,:]+){2,3}$"
+)
+
+
+class NodesSpec(Spec):
+    """Nodes of an OPC UA server, and how to reach it."""
 
     url: Name
     columns: dict[Name, Name] = Field(min_length=1)
-    interval: Quantity = "1 s"
     username: Name | None = None
     password_env: Name | None = None
+    security: Annotated[str, Field(pattern=SECURITY)] | None = None
+
+
+class OpcuaSpec(NodesSpec):
+    """Nodes of an OPC UA server."""
+
+    interval: Quantity = "1 s"
 
 
 class FileSpec(Spec):
@@ -502,6 +514,7 @@ class PublishSpec(BrokerSpec):
     """Where estimates are published."""
 
     topic: Name
+    discovery: Literal["homeassistant"] | None = None
 
 
 class OutputSpec(Spec):
@@ -513,6 +526,7 @@ class OutputSpec(Spec):
     smoothed: StrictBool = False
     surface_resistances: tuple[Quantity, Quantity] | None = None
     mqtt: PublishSpec | None = None
+    opcua: NodesSpec | None = None
 
     @model_validator(mode="after")
     def _thins_the_past(self) -> OutputSpec:

@@ -306,8 +306,7 @@ class Intake:
                 f"the clock of {', '.join(unsteady)} goes back again and again, so the time "
                 f"between samples is unknown; {remedy}, and synchronise it gradually"
             )
-        # One row far ahead is counted when it is refuted; several are a matter of health.
-        if self._begun and len({one.t for one in self._ahead}) > 1:
+        if self._begun and self._ahead:
             return (
                 f"rows from t = {self._ahead[0].t:g} on are far ahead of t = {self._newest:g}, and "
                 f"wait until later rows confirm them; {remedy}"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import logging
 import queue
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import combinations, zip_longest
@@ -395,6 +396,44 @@ class MqttSource(_Peer, RowSource):
         self._leave()
 
 
+def _topic_of(topic: str, label: str) -> str:
+    """Return the topic of an unknown."""
+    return f"{topic}/unknowns/{label.translate(str.maketrans('+#/', '___'))}"
+
+
+def home_assistant(
+    estimate: Estimate, topic: str, title: str
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the topics and messages by which Home Assistant finds the numbers of a run.
+
+    Each unknown is a sensor, and the level of the verdict another one, of one device.
+    """
+    node = re.sub(r"[^A-Za-z0-9_-]", "_", topic)
+    shared = {
+        "availability_topic": f"{topic}/status",
+        "payload_available": "running",
+        "payload_not_available": "offline",
+        "device": {"identifiers": [node], "name": title, "manufacturer": "livepde"},
+    }
+
+    def sensor(name: str, **parts: Any) -> tuple[str, dict[str, Any]]:
+        unique = f"{node}_{re.sub(r'[^A-Za-z0-9_-]', '_', name)}"
+        content = {"name": name, "unique_id": unique, **parts, **shared}
+        return f"homeassistant/sensor/{unique}/config", content
+
+    for label in estimate.parameters:
+        unit = estimate.space.unknown_of(label).unit
+        yield sensor(
+            label,
+            state_topic=_topic_of(topic, label),
+            value_template="{{ value_json.value }}",
+            json_attributes_topic=_topic_of(topic, label),
+            state_class="measurement",
+            **({"unit_of_measurement": unit} if unit else {}),
+        )
+    yield sensor("verdict", state_topic=topic, value_template="{{ value_json.verdict }}")
+
+
 class MqttSink(_Peer):
     """Publishes estimates: one JSON object for each sample, and each number to its own topic.
 
@@ -406,6 +445,10 @@ class MqttSink(_Peer):
     broker, topic
         Where to: TOPIC has the objects; TOPIC/unknowns/LABEL the unknowns; TOPIC/status "running",
         or "offline" when the run has ended or cannot be reached. All but the first are retained.
+    discovery
+        Whether Home Assistant is told of a sensor for each unknown, and one for the verdict.
+    title
+        Name of the run, as Home Assistant shows it.
     keep
         Estimates that may wait for the broker.
 
@@ -415,12 +458,22 @@ class MqttSink(_Peer):
         Estimates that were not sent because newer ones came while the broker was away.
     """
 
-    def __init__(self, broker: Broker, topic: str, keep: int = 1000) -> None:
+    def __init__(
+        self,
+        broker: Broker,
+        topic: str,
+        *,
+        discovery: bool = False,
+        title: str = "",
+        keep: int = 1000,
+    ) -> None:
         super().__init__(broker, "-out")
         self._topic = topic.rstrip("/")
         if not self._topic or any(sign in self._topic for sign in "+#\0"):
             raise DataError(f"MQTT: got the topic '{topic}' to publish to; it has no '+' and '#'.")
         self.dropped = 0
+        self._discovery = discovery
+        self._title = title or self._topic
         self._waiting: deque[Estimate] = deque(maxlen=keep)
         self._changed = threading.Condition()
         self._announce = False
@@ -453,6 +506,7 @@ class MqttSink(_Peer):
             self._changed.notify()
 
     def _send(self) -> None:
+        shown = True  # to Home Assistant
         while not self._given_up.is_set():
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._announce or self._closing)
@@ -460,25 +514,28 @@ class MqttSink(_Peer):
                 estimate = self._waiting.popleft() if self._waiting else None
                 last = self._closing and not self._waiting
             if announce:
-                self._publish("status", "running")
+                shown = not self._discovery
+                self._publish(f"{self._topic}/status", "running")
             if estimate is not None:
+                found = () if shown else home_assistant(estimate, self._topic, self._title)
+                for topic, content in found:
+                    self._publish(topic, json.dumps(content))
+                shown = True
                 self._publish_estimate(estimate)
             if last:
-                self._publish("status", "offline")
+                self._publish(f"{self._topic}/status", "offline")
                 return
 
     def _publish_estimate(self, estimate: Estimate) -> None:
         row = estimate.to_dict()
-        self._publish("", json.dumps(row), retain=False)
+        self._publish(self._topic, json.dumps(row), retain=False)
         for label, known in row["unknowns"].items():
-            level = label.translate(str.maketrans("+#/", "___"))
-            self._publish(f"unknowns/{level}", json.dumps(known))
+            self._publish(_topic_of(self._topic, label), json.dumps(known))
 
-    def _publish(self, below: str, content: str, *, retain: bool = True) -> None:
+    def _publish(self, topic: str, content: str, *, retain: bool = True) -> None:
         while not self._free.acquire(timeout=0.1):
             if self._given_up.is_set():
                 return
-        topic = f"{self._topic}/{below}" if below else self._topic
         self._client.publish(topic, content, qos=1, retain=retain)
 
     def _on_publish(

@@ -1,4 +1,4 @@
-"""Rows from the server of a control system (OPC UA, by asyncua)."""
+"""Rows from a control system, and estimates back to it (OPC UA, by asyncua)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as OutOfTime
 from contextlib import suppress
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 from livepde.errors import DataError, optional
+from livepde.result import Estimate
 from livepde.streams.sources import Row, RowSource, drained
 
-__all__ = ["OpcuaSource"]
+__all__ = ["OpcuaServer", "OpcuaSink", "OpcuaSource"]
 
 PATIENCE = 5.0  # seconds for each answer
 LOOK = 1.0  # seconds between two looks at whether the server is there
@@ -27,7 +30,130 @@ QUEUED = 10  # values of a node that the server keeps between two messages
 log = logging.getLogger("livepde.opcua")
 
 
-class OpcuaSource(RowSource):
+@dataclass(frozen=True)
+class OpcuaServer:
+    """How to reach a server.
+
+    Parameters
+    ----------
+    url
+        Address of the server: opc.tcp://HOST:PORT/...
+    username, password
+        Login, if the server requires one; the password is never written anywhere.
+    security
+        "Policy,Mode,certificate,key" with files (PEM or DER), and perhaps the certificate of the
+        server, which is then the only one that is trusted. Empty: messages are not encrypted.
+    """
+
+    url: str
+    username: str | None = None
+    password: str | None = field(default=None, repr=False)
+    security: str = ""
+
+    async def client(self) -> Any:
+        """Return a client that is not connected yet."""
+        from asyncua.client.client import Client
+
+        client: Any = Client(self.url, timeout=PATIENCE)
+        if self.security:
+            # A server compares the name of a client with the one in its certificate.
+            client.application_uri = _application_of(Path(self.security.split(",")[2]))
+            await client.set_security_string(self.security)
+        if self.username is not None:
+            client.set_user(self.username)
+            client.set_password(self.password or "")
+        return client
+
+
+def _application_of(path: Path) -> str:
+    """Return the name of the application for which a certificate was made."""
+    from cryptography import x509
+
+    content = path.read_bytes()
+    load = x509.load_der_x509_certificate
+    if content.startswith(b"-----BEGIN"):
+        load = x509.load_pem_x509_certificate
+    certificate = load(content)
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        return names.get_values_for_type(x509.UniformResourceIdentifier)[0]
+    except (x509.ExtensionNotFound, IndexError):
+        raise DataError(f"the certificate {path} names no application (URI)") from None
+
+
+class _Connection:
+    """A connection to a server, in its own thread, that reconnects until it is closed."""
+
+    def __init__(self, server: OpcuaServer) -> None:
+        with optional("opcua", "OPC UA needs asyncua", DataError):
+            import asyncua  # noqa: F401
+        if "@" in server.url:
+            raise DataError("OPC UA: the url contains a password: use `username` instead.")
+        self._server = server
+        self._wait = LOOK
+        self._loop = asyncio.new_event_loop()
+        self._stop = asyncio.Event()
+        self._started: Future[None] = Future()
+        self._thread = threading.Thread(target=self._work, name="livepde-opcua", daemon=True)
+        self._thread.start()
+        try:
+            self._started.result(3 * PATIENCE)
+        except (DataError, OutOfTime) as error:
+            self.close()
+            text = f"OPC UA: {server.url}: {str(error) or 'no answer'}."
+            raise DataError(text) from error
+
+    def _work(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            runner.run(self._stay())
+
+    async def _stay(self) -> None:
+        """Serve, and reconnect when the connection is lost."""
+        from asyncua.ua.uaerrors import UaError
+
+        while not self._stop.is_set():
+            try:
+                async with await self._server.client() as client:
+                    await self._serve(client)
+                return
+            except (DataError, UaError, OSError, ValueError) as error:
+                reason = str(error) or type(error).__name__
+            if not self._started.done():
+                self._started.set_exception(DataError(reason))
+                return
+            log.warning("connection to the server at %s lost: %s", self._server.url, reason)
+            if await self._stopped(self._wait):
+                return
+            self._wait = min(2.0 * self._wait, LONGEST_WAIT)
+
+    async def _serve(self, client: Any) -> None:
+        """Use a connection until it is lost, or the peer is closed."""
+        raise NotImplementedError
+
+    def _connected(self) -> None:
+        """Note that the server accepts what is asked of it."""
+        if self._started.done():
+            log.info("reconnected to the server at %s", self._server.url)
+        else:
+            self._started.set_result(None)
+        self._wait = LOOK
+
+    async def _stopped(self, wait: float) -> bool:
+        """Wait, and return whether to stop."""
+        try:
+            await asyncio.wait_for(self._stop.wait(), wait)
+        except TimeoutError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Disconnect from the server."""
+        with suppress(RuntimeError):  # the loop has closed by itself: nothing is left to stop
+            self._loop.call_soon_threadsafe(self._stop.set)
+        self._thread.join(PATIENCE)
+
+
+class OpcuaSource(_Connection, RowSource):
     """Rows from nodes of a server, one for each change of a value.
 
     A row has the time at which the server's source saw the change, as a date. A value whose status
@@ -36,16 +162,14 @@ class OpcuaSource(RowSource):
 
     Parameters
     ----------
-    url
-        Address of the server: opc.tcp://HOST:PORT/...
+    server
+        How to reach the server.
     columns
         Node -> column, as {"ns=2;s=T_05": "T_05"}.
     time
         Name of the time column.
     interval
         Sampling interval of the server, in seconds.
-    username, password
-        Login, if the server requires one; the password is never written anywhere.
 
     Attributes
     ----------
@@ -61,101 +185,35 @@ class OpcuaSource(RowSource):
     """
 
     def __init__(
-        self,
-        url: str,
-        columns: Mapping[str, str],
-        time: str,
-        interval: float = 1.0,
-        username: str | None = None,
-        password: str | None = None,
+        self, server: OpcuaServer, columns: Mapping[str, str], time: str, interval: float = 1.0
     ) -> None:
-        with optional("opcua", "OPC UA needs asyncua", DataError):
-            import asyncua  # noqa: F401
-        if "@" in url:
-            raise DataError("OPC UA: the url contains a password: use `username` instead.")
         if not interval > 0.0:
             raise DataError(f"OPC UA: interval must be a time > 0; got {interval}.")
         self.dropped = self.undated = 0
-        self._url = url
         self._columns = dict(columns)
         self._time = time
         self._interval = interval
-        self._user = (username, password)
         self._rows: queue.Queue[Row] = queue.Queue(HELD)
         self._seen: dict[str, datetime | None] = {}
-        self._wait = LOOK
-        self._loop = asyncio.new_event_loop()
-        self._stop = asyncio.Event()
-        self._started: Future[None] = Future()
-        self._thread = threading.Thread(target=self._work, name="livepde-opcua", daemon=True)
-        self._thread.start()
-        try:
-            self._started.result(3 * PATIENCE)
-        except (DataError, OutOfTime) as error:
-            self.close()
-            raise DataError(f"OPC UA: {url}: {str(error) or 'no answer'}.") from error
+        super().__init__(server)
 
-    # --- the thread of the connection ------------------------------------------------------------
-
-    def _work(self) -> None:
-        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
-            runner.run(self._stay())
-
-    async def _stay(self) -> None:
-        """Listen, and reconnect when the connection is lost."""
-        from asyncua.ua.uaerrors import UaError
-
-        while not self._stop.is_set():
-            try:
-                await self._listen()
-                return
-            except (DataError, UaError, OSError, ValueError) as error:
-                reason = str(error) or type(error).__name__
-            if not self._started.done():
-                self._started.set_exception(DataError(reason))
-                return
-            log.warning("connection to the server at %s lost: %s", self._url, reason)
-            if await self._stopped(self._wait):
-                return
-            self._wait = min(2.0 * self._wait, LONGEST_WAIT)
-
-    async def _listen(self) -> None:
-        from asyncua.client.client import Client
-
-        client = Client(self._url, timeout=PATIENCE)
-        username, password = self._user
-        if username is not None:
-            client.set_user(username)
-            client.set_password(password or "")
-        async with client:
-            changes = _Changes(self)
-            nodes = {name: client.get_node(name) for name in self._columns}
-            changes.columns = {nodes[name].nodeid: self._columns[name] for name in nodes}
-            period = 1000.0 * self._interval
-            subscription: Any = await client.create_subscription(period, changes)
-            answers = await subscription.subscribe_data_change(
-                list(nodes.values()), queuesize=QUEUED, sampling_interval=period
-            )
-            for name, answer in zip(nodes, answers, strict=True):
-                if not isinstance(answer, int):
-                    raise DataError(f"node '{name}': {answer.name}")
-            if self._started.done():
-                log.info("reconnected to the server at %s", self._url)
-            else:
-                self._started.set_result(None)
-            self._wait = LOOK
-            while not await self._stopped(LOOK):
-                await client.check_connection()
-                if changes.ended:
-                    raise DataError(f"the server ended the subscription ({changes.ended})")
-
-    async def _stopped(self, wait: float) -> bool:
-        """Wait, and return whether to stop."""
-        try:
-            await asyncio.wait_for(self._stop.wait(), wait)
-        except TimeoutError:
-            return False
-        return True
+    async def _serve(self, client: Any) -> None:
+        changes = _Changes(self)
+        nodes = {name: client.get_node(name) for name in self._columns}
+        changes.columns = {nodes[name].nodeid: self._columns[name] for name in nodes}
+        period = 1000.0 * self._interval
+        subscription = await client.create_subscription(period, changes)
+        answers = await subscription.subscribe_data_change(
+            list(nodes.values()), queuesize=QUEUED, sampling_interval=period
+        )
+        for name, answer in zip(nodes, answers, strict=True):
+            if not isinstance(answer, int):
+                raise DataError(f"node '{name}': {answer.name}")
+        self._connected()
+        while not await self._stopped(LOOK):
+            await client.check_connection()
+            if changes.ended:
+                raise DataError(f"the server ended the subscription ({changes.ended})")
 
     def _take(self, column: str, found: Any) -> None:
         """Take a value with its time and status; after a reconnect it may be a known one."""
@@ -181,8 +239,6 @@ class OpcuaSource(RowSource):
         except queue.Full:
             self.dropped += 1
 
-    # --- what a source is ------------------------------------------------------------------------
-
     @property
     def done(self) -> bool:
         """False: the data of a server never end."""
@@ -204,14 +260,8 @@ class OpcuaSource(RowSource):
         broken = not self._thread.is_alive()  # asked first: its last rows come before the error
         rows = drained(self._rows, wait)
         if broken and not rows:
-            raise DataError(f"OPC UA: {self._url}: the connection failed, see the log.")
+            raise DataError(f"OPC UA: {self._server.url}: the connection failed, see the log.")
         return rows
-
-    def close(self) -> None:
-        """Disconnect from the server."""
-        with suppress(RuntimeError):  # the loop has closed by itself: nothing is left to stop
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join(PATIENCE)
 
 
 class _Changes:
@@ -227,3 +277,74 @@ class _Changes:
 
     def status_change_notification(self, status: Any) -> None:
         self.ended = status.Status.name
+
+
+class OpcuaSink(_Connection):
+    """Writes estimates to nodes of a server, at most once a second, always the newest ones.
+
+    Parameters
+    ----------
+    server
+        How to reach the server.
+    columns
+        Node -> an unknown, such as alpha; its standard deviation, alpha_std; or verdict.
+
+    Raises
+    ------
+    DataError
+        There is no server, it refuses the name, or a node cannot be written.
+    """
+
+    def __init__(self, server: OpcuaServer, columns: Mapping[str, str]) -> None:
+        self._columns = dict(columns)
+        self._newest: dict[str, float | str | None] = {}
+        super().__init__(server)
+
+    def put(self, estimate: Estimate) -> None:
+        """Write an estimate as soon as the server is there.
+
+        Raises `DataError`: it has no number of a name.
+        """
+        row = estimate.to_dict()
+        values = {"verdict": row["verdict"]}
+        for label, known in row["unknowns"].items():
+            values |= {label: known["value"], f"{label}_std": known["std"]}
+        for name in self._columns.values():
+            if name not in values:
+                raise DataError(f"OPC UA: got '{name}' to write; there are {', '.join(values)}.")
+        self._newest = values
+
+    async def _serve(self, client: Any) -> None:
+        from asyncua.ua import DataValue, Variant
+
+        nodes = [await _writable(client, node, name) for node, name in self._columns.items()]
+        self._connected()
+        stopped = False
+        while not stopped:
+            stopped = await self._stopped(LOOK)  # the last values are written before the end
+            await client.check_connection()
+            values = self._newest
+            for node, kind, name in nodes:
+                if (value := values.get(name)) is not None:
+                    await node.write_value(DataValue(Variant(value, kind)))
+            if self._newest is values:
+                self._newest = {}
+
+
+async def _writable(client: Any, name: str, column: str) -> tuple[Any, Any, str]:
+    """Return a node, its type and what is written to it."""
+    from asyncua.ua import AccessLevel, VariantType
+    from asyncua.ua.uaerrors import UaError
+
+    try:
+        node = client.get_node(name)
+        kind = await node.read_data_type_as_variant_type()
+        writable = AccessLevel.CurrentWrite in await node.get_user_access_level()
+    except (UaError, ValueError) as error:
+        raise DataError(f"node '{name}': {error}") from error
+    text = column == "verdict"
+    kinds = {VariantType.String} if text else {VariantType.Float, VariantType.Double}
+    if not (writable and kind in kinds):
+        expected = "a text (String)" if text else "a number (Float or Double)"
+        raise DataError(f"node '{name}': expected {expected} that this user may write")
+    return node, kind, column
