@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
@@ -42,9 +43,11 @@ RIVAL = 0.8
 STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
 LONGEST = 0.2  # of the samples, by which a column may be late
 PLAIN = 0.02  # range of a column over its size below which it is constant
-WHOLE = 0.95  # of the misfit
 SETTLED = 0.02  # relative change of a size that is none
-CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelier
+# Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
+# with fewer numbers is likelier.
+CLOSE, SLIGHT = 0.05, 0.2
+TEMPERATURES = ("degC", "degF", "K")
 
 
 class Unit(NamedTuple):
@@ -70,13 +73,6 @@ UNITS: tuple[Unit, ...] = (
         for power in (1.0 / times, times)
     ),
 )
-
-
-class Explained(NamedTuple):
-    """What errors of columns explain: causes, the likeliest first, and misfit over noise."""
-
-    causes: list[Cause]
-    misfit: float
 
 
 @dataclass(frozen=True)
@@ -110,6 +106,8 @@ class Columns:
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
         """Return the columns of one member, or why they cannot be looked at."""
         why, options = work.unstored(state), work.refit
+        if work.tried and state.trial.shape[1]:  # noise of inputs is that of the readings here
+            why, state = "", work.tried_samples(state)
         if why or options is None:
             return why
         problem = work.filter.problem
@@ -172,7 +170,20 @@ class Columns:
         else:
             values = self._later(names[0], values[:, 0], error.size)[:, None]
         log[0][:, at] = values
-        return StoredSamples.of(self.work, changed(begun, log=log))
+        begun = changed(begun, log=log, start=self._start(log, names))
+        return StoredSamples.of(self.work, begun)
+
+    def _start(self, log: Array, names: Sequence[str]) -> FilterState:
+        """Return the start with other columns: an initial state that is made of readings moves."""
+        start, made = self.state.start, self.work.filter.problem.initial_readings
+        if not self.state.opening[0]:
+            return start
+        for name in set(names) & set(made):
+            old, new = (rows[0][:, self.places[name]] for rows in (self.state.log, log))
+            there = np.isfinite(old) & np.isfinite(new)
+            shift = (new - old)[there][:1].sum()
+            start = changed(start, u=start.u + shift * made[name].weight)
+        return start
 
     def _later(self, name: str, values: Array, by: float) -> Array:
         """Return the values of a column that come later by a time; NaN stays where it is."""
@@ -198,6 +209,11 @@ class Columns:
         """Return the values of a column that are there."""
         values: Array = self.state.log[0, :, self.places[name]]
         return values[np.isfinite(values)]
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a sensor; empty for inputs, where it is not known."""
+        observed = self.work.filter.problem.observed
+        return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
 
     @property
     def interval(self) -> float:
@@ -238,33 +254,36 @@ class _Fit:
 
 
 @nonfinite_allowed()  # such an error explains nothing
-def likely_columns(columns: Columns) -> Explained:
-    """Return the errors of columns that explain most of the misfit, the likeliest first."""
+def likely_columns(columns: Columns, least: float) -> list[Cause]:
+    """Return the errors of columns that explain most of the misfit, the likeliest first.
+
+    None where the misfit is less than `least` times the noise.
+    """
     samples, search = columns.samples(), _Trials(columns)
     found = search.refitted(samples)
     if found is None:
-        return Explained([], 0.0)
-    base, prior = _Fit.about(found.best), samples.about(0.0 * found.best.xi)
+        return []
+    base = _Fit.about(found.best)
     noise = _noise(found.best.residuals)
     misfit = 2.0 * base.cost - noise
-    if not misfit > 0.0:
-        return Explained([], 0.0)
+    if not misfit > least * noise:
+        return []
     # Where a column is grossly wrong the best fit is no place to ask what is.
+    prior = samples.about(0.0 * found.best.xi)
     places = [base] if prior is None else [base, _Fit.about(prior)]
     promising = [item for at in places for item in search.promising(at, base.cost)]
     tried = sorted(promising, key=lambda item: -item[0])
     kept: list[tuple[float, Error]] = []
+    close = min(CLOSE, SLIGHT * noise / misfit)
     for error in _varied(tried):
-        if any(share >= WHOLE and other.numbers <= error.numbers for share, other in kept):
+        if any(share >= 1.0 - close and one.numbers <= error.numbers for share, one in kept):
             continue  # nothing is left to explain
         end = search.fitted(error)
         if end is not None:
             share = 1.0 - (2.0 * end[0] - noise) / misfit
             kept.append((share, end[1]))
-    # Within a small part of the misfit the error with fewer numbers is likelier.
-    kept.sort(key=lambda item: -(item[0] - CLOSE * item[1].numbers))
-    causes = [_cause(columns, error, share) for share, error in kept if share > 0.0]
-    return Explained(causes, misfit / max(noise, 1e-300))
+    kept.sort(key=lambda item: close * item[1].numbers - item[0])
+    return [_cause(columns, error, share) for share, error in kept if share > 0.0]
 
 
 class _Trials:
@@ -328,7 +347,10 @@ class _Trials:
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
-        for number, (_, _, factor, constant, _) in enumerate(UNITS):
+        expected = self.columns.unit(name)
+        for number, (_, of, factor, constant, _) in enumerate(UNITS):
+            if of != expected and expected in TEMPERATURES:
+                continue
             # values - offset, then divided by 1 + gain: to first order in the change of the column.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
@@ -425,14 +447,13 @@ def _noise(residuals: Array) -> float:
 def _cause(columns: Columns, error: Error, share: float) -> Cause:
     first, size = error.names[0], error.size
     problem = columns.work.filter.problem
-    units = dict(zip(problem.observed.names, problem.observed.units, strict=True))
     values: dict[str, object] = {"name": first, "other": error.names[-1]}
     kind, unit_of, side = error.kind, UNITS[error.unit], size > 0
     factor = unit_of.factor if kind == "unit" else 1.0 / (1.0 + size)
     match kind:
         case "offset":
-            unit = units.get(first, "") if first not in columns.inputs else ""
-            values |= {"amount": amount_of(abs(size), unit), "side": "high" if side else "low"}
+            amount = amount_of(abs(size), columns.unit(first))
+            values |= {"amount": amount, "side": "high" if side else "low"}
         case "gain":
             values |= {"share": f"{100.0 * abs(size):.2g} %", "side": "large" if side else "small"}
         case "lag":
