@@ -90,6 +90,12 @@ class Error:
         """How many numbers of it are free."""
         return int(self.kind in ("offset", "gain", "lag"))
 
+    @property
+    def correction(self) -> tuple[float, float]:
+        """Factor and constant with which the values of a gain, or in a unit, are right."""
+        unit = UNITS[self.unit]
+        return (1.0 / (1.0 + self.size), 0.0) if self.numbers else (unit.factor, unit.constant)
+
 
 @dataclass(frozen=True, eq=False)
 class Columns:
@@ -129,6 +135,8 @@ class Columns:
         if rows < FEWEST_ROWS:
             return f"fewer than {FEWEST_ROWS} samples are stored"
         log = log[:, :rows].copy()
+        own = log[0][:, 1 + len(names) : first]
+        own[:] = np.where(np.isnan(own), work.filter.noise, own)
         open_gate = replace(work.options, gate=Gate())
         zero = np.zeros(1, dtype=np.int64)
         begun = changed(state, log=log, window=zero)
@@ -157,18 +165,17 @@ class Columns:
         if error.kind == "exchange":
             values = values[:, ::-1]
             if not set(names) & set(self.inputs):  # the noise of a reading goes with it
-                sensors = len(self.work.filter.problem.observed.names)
-                noise = [place + sensors for place in at]
+                noise = [place + len(self.work.filter.noise) for place in at]
                 log[0][:, noise] = log[0][:, noise[::-1]]
         elif error.kind == "offset":
             values = values - error.size
-        elif error.kind == "gain":
-            values = values / (1.0 + error.size)
-        elif error.kind == "unit":
-            unit = UNITS[error.unit]
-            values = unit.factor * values + unit.constant
-        else:
+        elif error.kind == "lag":
             values = self._later(names[0], values[:, 0], error.size)[:, None]
+        else:
+            factor, constant = error.correction
+            values = factor * values + constant
+            if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
+                log[0][:, at[0] + len(self.work.filter.noise)] *= factor
         log[0][:, at] = values
         begun = changed(begun, log=log, start=self._start(log, names))
         return StoredSamples.of(self.work, begun)
@@ -292,7 +299,7 @@ class _Trials:
     def __init__(self, columns: Columns) -> None:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
-        self.base_readings = columns.samples().readings
+        self.base = columns.samples()
 
     def refitted(self, samples: StoredSamples) -> Found | None:
         """Return the end of a search.
@@ -327,7 +334,8 @@ class _Trials:
             # Correcting by theta changes the residuals by theta g: so the column is off by theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if "offset" in slopes and ("gain" in slopes or constant):
-            yield from self._units(base, name, slopes)
+            units = self._units if name in columns.inputs else self._sensor_units
+            yield from units(base, name, slopes)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
         columns = self.columns
@@ -347,10 +355,7 @@ class _Trials:
         values = self.columns.column(name)
         middle = float(values.mean())
         there = np.isfinite(base.one.residuals)
-        expected = self.columns.unit(name)
-        for number, (_, of, factor, constant, _) in enumerate(UNITS):
-            if of != expected and expected in TEMPERATURES:
-                continue
+        for number, (_, _, factor, constant, _) in enumerate(UNITS):
             # values - offset, then divided by 1 + gain: to first order in the change of the column.
             change = (factor * middle + constant) - middle
             g = -change * slopes["offset"]
@@ -364,6 +369,21 @@ class _Trials:
             cost = 0.5 * float(r @ r + xi @ xi - slope @ base.inverse @ slope)
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
+    def _sensor_units(self, base: _Fit, name: str, _: object) -> Iterator[tuple[float, Error]]:
+        """Iterate over the same of a sensor: the trajectory is the same."""
+        expected = self.columns.unit(name)
+        for number, unit in enumerate(UNITS):
+            if unit.expected == expected or expected not in TEMPERATURES:
+                error = Error("unit", (name,), unit=number)
+                yield base.cost - _Fit.about(self._seen(base, error)).cost, error
+
+    def _seen(self, base: _Fit, error: Error) -> Passed:
+        """Return the same trajectory as other sensors show it, with the noise of their columns."""
+        new, one = self.columns.samples(error), base.one
+        ratio = self.base.noise / new.noise
+        residuals = new.readings - (self.base.readings - one.residuals) * ratio
+        return replace(one, residuals=residuals, slopes=one.slopes * ratio[:, :, None])
+
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
         columns = self.columns
         for pair in combinations(columns.places, 2):
@@ -374,9 +394,8 @@ class _Trials:
             if first.min() > second.max() or second.min() > first.max():
                 continue
             error = Error("exchange", pair)
-            change = self._change(base, error) if self._only_sensors(error) else None
-            if change is not None:  # the trajectory is the same
-                one: Passed | None = replace(base.one, residuals=base.one.residuals + change)
+            if self._only_sensors(error):
+                one: Passed | None = self._seen(base, error)
             else:
                 one = columns.samples(error).about(base.one.xi)
             if one is not None:
@@ -384,10 +403,23 @@ class _Trials:
 
     def _change(self, base: _Fit, error: Error) -> Array | None:
         """Return by how much the correction of a column changes the residuals."""
-        if self._only_sensors(error):  # it is that of the readings
-            return self.columns.samples(error).readings - self.base_readings
+        if self._only_sensors(error):
+            if error.kind == "lag":
+                return self._lagged(self.base, base.one, error.names[0], error.size)
+            return self._seen(base, error).residuals - base.one.residuals
         r = self.columns.samples(error).residuals(base.one.xi)
         return None if r is None else r - base.one.residuals
+
+    def _lagged(self, samples: StoredSamples, one: Passed, name: str, by: float) -> Array:
+        """Return by how much residuals change if predictions of a sensor come later by a time.
+
+        Shifted readings would change by their noise, too, which hides a slow signal.
+        """
+        predicted, place = samples.readings - one.residuals, self.columns.places[name] - 1
+        t, h = np.array([span.t1 for span in samples.spans]), predicted[:, place]
+        there, change = np.isfinite(h), np.zeros_like(predicted)
+        change[:, place] = h - np.interp(t - by, t[there], h[there])
+        return change
 
     def _only_sensors(self, error: Error) -> bool:
         return not set(error.names) & set(self.columns.inputs)
@@ -413,11 +445,14 @@ class _Trials:
         columns, values = self.columns, self.columns.column(error.names[0])
         step = {"offset": STEP * max(float(np.ptp(values)), 1e-12), "gain": STEP}
         h = step.get(error.kind, columns.interval)
-        more = replace(error, size=error.size + h)
-        r = columns.samples(more).residuals(fit.one.xi)
-        if r is None:
-            return None
-        _, theta = fit.freed((r - fit.one.residuals) / h)
+        if error.kind == "lag" and self._only_sensors(error):
+            change = self._lagged(columns.samples(error), fit.one, error.names[0], h)
+        else:
+            more = columns.samples(replace(error, size=error.size + h)).residuals(fit.one.xi)
+            if more is None:
+                return None
+            change = more - fit.one.residuals
+        _, theta = fit.freed(change / h)
         return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
 
 
@@ -449,7 +484,7 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
     problem = columns.work.filter.problem
     values: dict[str, object] = {"name": first, "other": error.names[-1]}
     kind, unit_of, side = error.kind, UNITS[error.unit], size > 0
-    factor = unit_of.factor if kind == "unit" else 1.0 / (1.0 + size)
+    factor, _ = error.correction
     match kind:
         case "offset":
             amount = amount_of(abs(size), columns.unit(first))
