@@ -13,9 +13,9 @@ import math
 import runpy
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,8 +30,11 @@ from benchmarks.honest.linear import Linear, diffusion, fine_times
 from benchmarks.honest.problems.borehole import Borehole
 from benchmarks.jobs import each
 from livepde.cases import load
+from livepde.cases.case import Case, Prepared
 from livepde.diagnostics.check_report import Check, Table
+from livepde.laws import Problem
 from livepde.readout import Marginal
+from livepde.result import Estimate
 from livepde.runs import Outcome
 
 Array = NDArray[Any]
@@ -41,6 +44,10 @@ WRITTEN = 0  # seed of the tables in the examples
 SHARE = 0.9  # of the vertices of a field whose interval has to hold
 TRUSTED = "trusted"  # among the scores of a run
 HELD = 0.9  # of the seeds: 18 of 20
+WIDTH, WIDEST = "width of ", 1.3  # times that of a batch fit with the exact inputs
+NUDGE = 1e-3  # relative change of an unknown, for derivatives of the readings
+Factors: TypeAlias = Mapping[str, float]  # unknown -> factor on its drawn value
+AS_DRAWN: Factors = {}
 
 # The furnace wall.
 THICK, CAPACITY = 0.1, 3.7e6
@@ -107,7 +114,9 @@ def furnace(seed: int) -> tuple[list[str], Array, dict[str, float]]:
     return header, table, {"k": float(k), "J": float(flux[-1])}
 
 
-def wall(seed: int, days: float = 3.0) -> tuple[list[str], Array, dict[str, float]]:
+def wall(
+    seed: int, days: float = 3.0, *, by: Factors = AS_DRAWN
+) -> tuple[list[str], Array, dict[str, float]]:
     """Return the table of a wall that begins in a curved profile, and its truths."""
     rng = np.random.default_rng([seed, 5])
     k, capacity = (
@@ -125,6 +134,7 @@ def wall(seed: int, days: float = 3.0) -> tuple[list[str], Array, dict[str, floa
     flux = 16.0 * k / WALL * (1.0 + 0.25 * np.tanh(3.0 * np.sin(2 * np.pi * fine / 86400.0)))
     for phase, period in zip(phases[2:], (20000.0, 33000.0, 60000.0), strict=True):
         flux += 2.0 * np.sin(2 * np.pi * fine / period + phase)
+    k, capacity = k * by.get("k", 1.0), capacity * by.get("C", 1.0)
     cells = 200
     width = WALL / cells
     between = np.full(cells, k / width)
@@ -189,10 +199,11 @@ def aquifer(T: float, S: float, times: Array, rate: Array) -> Array:
     return held(system, times, rate[:, None])
 
 
-def pumping(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+def pumping(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
     """Return the table of a pumping test with three rates and a recovery, and its truths."""
     rng = np.random.default_rng([seed, 5])
     T, S = 4e-3 * np.exp(0.4 * rng.standard_normal()), 3e-4 * np.exp(0.4 * rng.standard_normal())
+    T, S = T * by.get("k", 1.0), S * by.get("Ss", 1.0)
     minutes = np.arange(0.0, 901.0)
     rates = np.array([0.0, *np.round(np.sort(rng.uniform(5.0, 18.0, 3)), 1), 0.0])  # L/s
     rate = rates[np.searchsorted([10.0, 160.0, 340.0, 540.0], minutes, side="right")]
@@ -211,10 +222,11 @@ def breakthrough(v: float, D: float, hours: Array) -> Array:
     return np.where(hours > 0.0, found, 0.0)
 
 
-def column(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+def column(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
     """Return the table of a tracer pulse through a column, and its truths."""
     rng = np.random.default_rng([seed, 6])
     v, D = 27.0 * np.exp(0.2 * rng.standard_normal()), 16.0 * np.exp(0.4 * rng.standard_normal())
+    v, D = v * by.get("v", 1.0), D * by.get("D", 1.0)
     minutes = np.arange(0.0, 181.0, 4.0)
     stop = 4.0 * rng.integers(15, 26)  # where the pulse ends
     c = breakthrough(v, D, minutes / 60.0) - breakthrough(v, D, (minutes - stop) / 60.0)
@@ -223,13 +235,14 @@ def column(seed: int) -> tuple[list[str], Array, dict[str, float]]:
     return ["time_min", "c_in", "c"], table, {"v": float(v), "D": float(D)}
 
 
-def heater(seed: int) -> tuple[list[str], Array, dict[str, float]]:
+def heater(seed: int, *, by: Factors = AS_DRAWN) -> tuple[list[str], Array, dict[str, float]]:
     """Return the table of a wall whose heater a controller switches, and its truths.
 
     The heater has a value at its changes only, between the readings of the thermometers.
     """
     rng = np.random.default_rng([seed, 7])
     k, h = 0.8 * np.exp(0.3 * rng.standard_normal()), 10.0 * np.exp(0.3 * rng.standard_normal())
+    k, h = k * by.get("k", 1.0), h * by.get("h", 1.0)
     read = np.arange(0.0, 8 * 3600.0 + 1.0, 60.0)
     stretches = rng.uniform(300.0, 2400.0, 200)
     changes = np.round(np.append(0.0, np.cumsum(stretches)), 1)
@@ -295,10 +308,13 @@ def moved(K: float, D: float, flow: Any, supply: Any, until: float) -> tuple[Arr
     return np.array(times), np.array(shown)
 
 
-def pipe(seed: int, minutes: int = 300) -> tuple[list[str], Array, dict[str, float]]:
+def pipe(
+    seed: int, minutes: int = 300, *, by: Factors = AS_DRAWN
+) -> tuple[list[str], Array, dict[str, float]]:
     """Return the table of a pipe whose supply changes between set points, and its truths."""
     rng = np.random.default_rng([seed, 8])
     K, D = 1.0 * np.exp(0.3 * rng.standard_normal()), 0.1 * np.exp(0.4 * rng.standard_normal())
+    K, D = K * by.get("K", 1.0), D * by.get("D", 1.0)
     fine = np.arange(0.0, 60.0 * minutes + 121.0)
     changes = np.cumsum(rng.uniform(1200.0, 3600.0, minutes))
     points = rng.uniform(65.0, 85.0, minutes + 1)
@@ -400,6 +416,8 @@ def _places() -> Array:
     return np.array(found)
 
 
+# Those whose unknowns are numbers, so that a batch fit is known.
+BATCH = {"pumping": pumping, "column": column, "heater": heater, "wall": wall, "pipe": pipe}
 TABLES = {
     "furnace": furnace,
     "borehole": borehole,
@@ -447,12 +465,18 @@ def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = F
     for (walk, _), found in each(_scores, todo, "truths", progress=progress):
         for name, score in found.items():
             scores.setdefault((walk, name), []).append(score)
-    rows, checks = [], []
+    rows, widths, checks = [], [], []
     for (walk, name), values in scores.items():
         if name == TRUSTED:
             least = min(HELD, (len(values) - 1) / len(values))
             title = f"{walk}: share of runs that are trusted"
             checks.append(Check(title, float(np.mean(values)), least, ">="))
+            continue
+        if name.startswith(WIDTH):
+            width = float(np.median(values))
+            widths.append((walk, name.removeprefix(WIDTH), len(values), width))
+            title = f"{walk}, {name.removeprefix(WIDTH)}: width over that of a batch fit"
+            checks.append(Check(title, width, WIDEST, "<="))
             continue
         holds = [value >= (SHARE if name == "alpha" else 1.0) for value in values]
         rows.append((walk, name, len(values), sum(holds), float(np.mean(values))))
@@ -466,9 +490,11 @@ def first_hour(walks: tuple[str, ...] = WALKS, *, seeds: int, progress: bool = F
         "95 % intervals at the end of the run. Of the field alpha, the interval of a truth holds "
         f"where it does at {SHARE:.0%} of the vertices or more."
     )
-    return Outcome(
-        tables=[Table("Truths in their 95 % interval", columns, rows)], checks=checks, notes=[note]
-    )
+    tables = [Table("Truths in their 95 % interval", columns, rows)]
+    if widths:
+        title = "Width of the interval over that of a batch fit with the exact inputs"
+        tables.append(Table(title, ("walk", "unknown", "truths", "median width"), widths))
+    return Outcome(tables=tables, checks=checks, notes=[note])
 
 
 def _scores(walk: str, seed: int) -> dict[str, float]:
@@ -479,13 +505,58 @@ def _scores(walk: str, seed: int) -> dict[str, float]:
         truths = write(folder, walk, seed)
         if walk == "plate":
             return _plate_scores(Path(place), folder / "plate.py", seed)
-        prepared = load(folder / f"{walk}.toml", allow_code=True).prepare()
+        case = load(folder / f"{walk}.toml", allow_code=True)
+        prepared = case.prepare()
         result = prepared.identifier.run(prepared.stream)
         last = result.last
         if last is None:
             raise RuntimeError(f"{walk}: there is no sample")
         held = {name: float(_holds(last[name], truth)) for name, truth in truths.items()}
-        return {**held, TRUSTED: float(result.verdict.level == "trusted")}
+        widths = _widths(walk, seed, case, prepared, last) if walk in BATCH else {}
+        return {**held, **widths, TRUSTED: float(result.verdict.level == "trusted")}
+
+
+def exact(walk: str, seed: int, problem: Problem, columns: Factors) -> dict[str, float]:
+    """Return the relative standard deviation of each unknown by a batch fit with exact inputs.
+
+    The readings of the truth are linear in the logarithms of the unknowns, by central differences:
+    the noise is the same on both sides, and cancels.
+
+    Parameters
+    ----------
+    columns
+        Column of each sensor -> its noise.
+    """
+    table, latent = BATCH[walk], problem.model.latent
+    header, _, truths = table(seed)
+    places = [header.index(name) for name in columns]
+    rows = []
+    for name in truths:
+        ends = [table(seed, by={name: 1.0 + sign * NUDGE})[1][:, places] for sign in (1.0, -1.0)]
+        change = (ends[0] - ends[1]) / (2.0 * NUDGE) / np.array([*columns.values()])
+        rows.append(change[np.isfinite(change)])
+    J = np.array(rows)
+    # All unknowns have a normal prior of their logarithm.
+    prior = [latent.deviations[latent.parts[name].part.start] for name in truths]
+    covariance = np.linalg.inv(J @ J.T + np.diag(1.0 / np.square(prior)))
+    return dict(zip(truths, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+
+
+def _widths(
+    walk: str, seed: int, case: Case, prepared: Prepared, last: Estimate
+) -> dict[str, float]:
+    """Return the width of each interval over that of the batch fit."""
+    problem, channels = prepared.identifier.problem, case.spec.channels
+    names, noise = problem.observed.names, problem.observed.noise
+    if noise is None:
+        raise RuntimeError(f"{walk}: the noise is not stated")
+    each = zip(names, noise.tolist(), strict=True)
+    columns = {str(channels[sensor].column): std for sensor, std in each}
+    found = {}
+    for name, std in exact(walk, seed, problem, columns).items():
+        low, high = last[name].interval()
+        found[WIDTH + name] = math.log(high / low) / (2.0 * 1.96 * std)
+    return found
 
 
 def _plate_scores(clone: Path, program: Path, seed: int) -> dict[str, float]:

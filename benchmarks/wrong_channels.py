@@ -27,8 +27,9 @@ NAMED = 0.8  # of the runs
 SCALE = 1.15
 WITHOUT = """
 Left out are faults that other numbers explain as well: a scale of the rate of a pumping test, of
-the heat into a borehole or of a flux plate multiplies the unknowns. In a column with one probe
-either channel may be named, since only their ratio is known.
+the heat into a borehole or of a flux plate multiplies the unknowns. In a column with one probe, and
+in a pumping test with two wells, either channel may be named: only their ratio is known, as a
+factor on all readings is one on T and S.
 """
 
 
@@ -56,8 +57,8 @@ class Fault(NamedTuple):
 
 FAULTS = (
     Fault("pumping", ("OW1",), "late", 10.0),
-    Fault("pumping", ("OW1",), "scaled"),
-    Fault("pumping", ("OW2",), "scaled"),
+    Fault("pumping", ("OW1", "OW2"), "scaled"),
+    Fault("pumping", ("OW2", "OW1"), "scaled"),
     Fault("pumping", ("Q",), "late", 15.0),
     Fault("pumping", ("OW1", "OW2"), "exchanged"),
     Fault("column", ("c", "c_in"), "scaled"),

@@ -83,7 +83,9 @@ FAULTS: dict[str, tuple[Any, str, str]] = {
 }
 
 
-def run(columns: dict[str, Any], between: Any = None, **options: Any) -> lp.Result:
+def run(
+    columns: dict[str, Any], between: Any = None, parts: Any = None, **options: Any
+) -> lp.Result:
     mesh = lp.interval(0.0, LENGTH, 40)
     ends = {"left": lp.Channel("TC1"), "right": lp.Channel("TC5")}
     model = lp.Model(
@@ -93,7 +95,9 @@ def run(columns: dict[str, Any], between: Any = None, **options: Any) -> lp.Resu
     )
     sensors = lp.Points(PLACES, noise=NOISE)
     law = lp.SensitivityLaw(**options)
-    identifier = lp.Identifier(model, sensors, law, u0=20.0, between=between)
+    identifier = lp.Identifier(
+        model, sensors, law, **{"u0": 20.0, "between": between, **(parts or {})}
+    )
     names = ("TC1", "TC5")
     samples = [
         (float(t), {name: columns[name][k] for name in PLACES}, {n: columns[n][k] for n in names})
@@ -122,6 +126,25 @@ def test_the_wrong_column_is_named_first(fault: str):
     # Fit and effect come first.
     assert first.text[1:] in verdict.sentences[1]  # the first letter may be a capital
     assert len({(cause.kind, cause.subject) for cause in misfit.causes}) == len(misfit.causes)
+
+
+@pytest.mark.slow
+def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it():
+    """Inputs with noise have no refit: their first samples are kept, to try columns on them."""
+    _, columns = bar(1)
+    wrong = scaled(columns, "TC5", 1.8, 32.0)
+    first = {name: float(wrong[name][0]) for name in ("TC1", "TC5")}
+    weights = {"TC1": lambda x: 1.0 - x[0] / LENGTH, "TC5": lambda x: x[0] / LENGTH}
+    parts = {
+        "u0": lambda x: sum(weights[name](x) * value for name, value in first.items()),
+        "u0_from": weights,
+        "input_noise": {"TC1": 0.05, "TC5": 0.05},
+    }
+    verdict = run(wrong, parts=parts).last.verdict
+    cause = next(f for f in verdict.findings if f.what == "misfit").causes[0]
+    assert "TC5 may be in degF" in cause.text
+    assert cause.share > 0.99
+    assert verdict.level == "do not trust"
 
 
 def test_columns_that_are_right_are_not_looked_at(monkeypatch: pytest.MonkeyPatch):

@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
@@ -42,9 +43,11 @@ RIVAL = 0.8
 STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
 LONGEST = 0.2  # of the samples, by which a column may be late
 PLAIN = 0.02  # range of a column over its size below which it is constant
-WHOLE = 0.95  # of the misfit
 SETTLED = 0.02  # relative change of a size that is none
-CLOSE = 0.05  # of the misfit: within it the error with fewer numbers is likelier
+# Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
+# with fewer numbers is likelier.
+CLOSE, SLIGHT = 0.05, 0.2
+TEMPERATURES = ("degC", "degF", "K")
 
 
 class Unit(NamedTuple):
@@ -72,13 +75,6 @@ UNITS: tuple[Unit, ...] = (
 )
 
 
-class Explained(NamedTuple):
-    """What errors of columns explain: causes, the likeliest first, and misfit over noise."""
-
-    causes: list[Cause]
-    misfit: float
-
-
 @dataclass(frozen=True)
 class Error:
     """An error of a column, or of two."""
@@ -93,6 +89,12 @@ class Error:
     def numbers(self) -> int:
         """How many numbers of it are free."""
         return int(self.kind in ("offset", "gain", "lag"))
+
+    @property
+    def correction(self) -> tuple[float, float]:
+        """Factor and constant with which the values of a gain, or in a unit, are right."""
+        unit = UNITS[self.unit]
+        return (1.0 / (1.0 + self.size), 0.0) if self.numbers else (unit.factor, unit.constant)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,8 @@ class Columns:
     def of(cls, work: SensitivityWork, state: SensitivityState) -> Columns | str:
         """Return the columns of one member, or why they cannot be looked at."""
         why, options = work.unstored(state), work.refit
+        if work.tried and state.trial.shape[1]:  # noise of inputs is that of the readings here
+            why, state = "", work.tried_samples(state)
         if why or options is None:
             return why
         problem = work.filter.problem
@@ -131,6 +135,8 @@ class Columns:
         if rows < FEWEST_ROWS:
             return f"fewer than {FEWEST_ROWS} samples are stored"
         log = log[:, :rows].copy()
+        own = log[0][:, 1 + len(names) : first]
+        own[:] = np.where(np.isnan(own), work.filter.noise, own)
         open_gate = replace(work.options, gate=Gate())
         zero = np.zeros(1, dtype=np.int64)
         begun = changed(state, log=log, window=zero)
@@ -159,20 +165,32 @@ class Columns:
         if error.kind == "exchange":
             values = values[:, ::-1]
             if not set(names) & set(self.inputs):  # the noise of a reading goes with it
-                sensors = len(self.work.filter.problem.observed.names)
-                noise = [place + sensors for place in at]
+                noise = [place + len(self.work.filter.noise) for place in at]
                 log[0][:, noise] = log[0][:, noise[::-1]]
         elif error.kind == "offset":
             values = values - error.size
-        elif error.kind == "gain":
-            values = values / (1.0 + error.size)
-        elif error.kind == "unit":
-            unit = UNITS[error.unit]
-            values = unit.factor * values + unit.constant
-        else:
+        elif error.kind == "lag":
             values = self._later(names[0], values[:, 0], error.size)[:, None]
+        else:
+            factor, constant = error.correction
+            values = factor * values + constant
+            if names[0] not in self.inputs:  # else readings that shrink to nothing would fit best
+                log[0][:, at[0] + len(self.work.filter.noise)] *= factor
         log[0][:, at] = values
-        return StoredSamples.of(self.work, changed(begun, log=log))
+        begun = changed(begun, log=log, start=self._start(log, names))
+        return StoredSamples.of(self.work, begun)
+
+    def _start(self, log: Array, names: Sequence[str]) -> FilterState:
+        """Return the start with other columns: an initial state that is made of readings moves."""
+        start, made = self.state.start, self.work.filter.problem.initial_readings
+        if not self.state.opening[0]:
+            return start
+        for name in set(names) & set(made):
+            old, new = (rows[0][:, self.places[name]] for rows in (self.state.log, log))
+            there = np.isfinite(old) & np.isfinite(new)
+            shift = (new - old)[there][:1].sum()
+            start = changed(start, u=start.u + shift * made[name].weight)
+        return start
 
     def _later(self, name: str, values: Array, by: float) -> Array:
         """Return the values of a column that come later by a time; NaN stays where it is."""
@@ -198,6 +216,11 @@ class Columns:
         """Return the values of a column that are there."""
         values: Array = self.state.log[0, :, self.places[name]]
         return values[np.isfinite(values)]
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a sensor; empty for inputs, where it is not known."""
+        observed = self.work.filter.problem.observed
+        return dict(zip(observed.names, observed.units, strict=True)).get(name, "")
 
     @property
     def interval(self) -> float:
@@ -238,33 +261,36 @@ class _Fit:
 
 
 @nonfinite_allowed()  # such an error explains nothing
-def likely_columns(columns: Columns) -> Explained:
-    """Return the errors of columns that explain most of the misfit, the likeliest first."""
+def likely_columns(columns: Columns, least: float) -> list[Cause]:
+    """Return the errors of columns that explain most of the misfit, the likeliest first.
+
+    None where the misfit is less than `least` times the noise.
+    """
     samples, search = columns.samples(), _Trials(columns)
     found = search.refitted(samples)
     if found is None:
-        return Explained([], 0.0)
-    base, prior = _Fit.about(found.best), samples.about(0.0 * found.best.xi)
+        return []
+    base = _Fit.about(found.best)
     noise = _noise(found.best.residuals)
     misfit = 2.0 * base.cost - noise
-    if not misfit > 0.0:
-        return Explained([], 0.0)
+    if not misfit > least * noise:
+        return []
     # Where a column is grossly wrong the best fit is no place to ask what is.
+    prior = samples.about(0.0 * found.best.xi)
     places = [base] if prior is None else [base, _Fit.about(prior)]
     promising = [item for at in places for item in search.promising(at, base.cost)]
     tried = sorted(promising, key=lambda item: -item[0])
     kept: list[tuple[float, Error]] = []
+    close = min(CLOSE, SLIGHT * noise / misfit)
     for error in _varied(tried):
-        if any(share >= WHOLE and other.numbers <= error.numbers for share, other in kept):
+        if any(share >= 1.0 - close and one.numbers <= error.numbers for share, one in kept):
             continue  # nothing is left to explain
         end = search.fitted(error)
         if end is not None:
             share = 1.0 - (2.0 * end[0] - noise) / misfit
             kept.append((share, end[1]))
-    # Within a small part of the misfit the error with fewer numbers is likelier.
-    kept.sort(key=lambda item: -(item[0] - CLOSE * item[1].numbers))
-    causes = [_cause(columns, error, share) for share, error in kept if share > 0.0]
-    return Explained(causes, misfit / max(noise, 1e-300))
+    kept.sort(key=lambda item: close * item[1].numbers - item[0])
+    return [_cause(columns, error, share) for share, error in kept if share > 0.0]
 
 
 class _Trials:
@@ -273,7 +299,7 @@ class _Trials:
     def __init__(self, columns: Columns) -> None:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
-        self.base_readings = columns.samples().readings
+        self.base = columns.samples()
 
     def refitted(self, samples: StoredSamples) -> Found | None:
         """Return the end of a search.
@@ -308,7 +334,8 @@ class _Trials:
             # Correcting by theta changes the residuals by theta g: so the column is off by theta.
             yield gained, Error(kind, (name,), self._bounded(kind, name, theta))
         if "offset" in slopes and ("gain" in slopes or constant):
-            yield from self._units(base, name, slopes)
+            units = self._units if name in columns.inputs else self._sensor_units
+            yield from units(base, name, slopes)
 
     def _bounded(self, kind: str, name: str, theta: float) -> float:
         columns = self.columns
@@ -342,6 +369,21 @@ class _Trials:
             cost = 0.5 * float(r @ r + xi @ xi - slope @ base.inverse @ slope)
             yield base.cost - cost, Error("unit", (name,), unit=number)
 
+    def _sensor_units(self, base: _Fit, name: str, _: object) -> Iterator[tuple[float, Error]]:
+        """Iterate over the same of a sensor: the trajectory is the same."""
+        expected = self.columns.unit(name)
+        for number, unit in enumerate(UNITS):
+            if unit.expected == expected or expected not in TEMPERATURES:
+                error = Error("unit", (name,), unit=number)
+                yield base.cost - _Fit.about(self._seen(base, error)).cost, error
+
+    def _seen(self, base: _Fit, error: Error) -> Passed:
+        """Return the same trajectory as other sensors show it, with the noise of their columns."""
+        new, one = self.columns.samples(error), base.one
+        ratio = self.base.noise / new.noise
+        residuals = new.readings - (self.base.readings - one.residuals) * ratio
+        return replace(one, residuals=residuals, slopes=one.slopes * ratio[:, :, None])
+
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
         columns = self.columns
         for pair in combinations(columns.places, 2):
@@ -352,9 +394,8 @@ class _Trials:
             if first.min() > second.max() or second.min() > first.max():
                 continue
             error = Error("exchange", pair)
-            change = self._change(base, error) if self._only_sensors(error) else None
-            if change is not None:  # the trajectory is the same
-                one: Passed | None = replace(base.one, residuals=base.one.residuals + change)
+            if self._only_sensors(error):
+                one: Passed | None = self._seen(base, error)
             else:
                 one = columns.samples(error).about(base.one.xi)
             if one is not None:
@@ -362,10 +403,23 @@ class _Trials:
 
     def _change(self, base: _Fit, error: Error) -> Array | None:
         """Return by how much the correction of a column changes the residuals."""
-        if self._only_sensors(error):  # it is that of the readings
-            return self.columns.samples(error).readings - self.base_readings
+        if self._only_sensors(error):
+            if error.kind == "lag":
+                return self._lagged(self.base, base.one, error.names[0], error.size)
+            return self._seen(base, error).residuals - base.one.residuals
         r = self.columns.samples(error).residuals(base.one.xi)
         return None if r is None else r - base.one.residuals
+
+    def _lagged(self, samples: StoredSamples, one: Passed, name: str, by: float) -> Array:
+        """Return by how much residuals change if predictions of a sensor come later by a time.
+
+        Shifted readings would change by their noise, too, which hides a slow signal.
+        """
+        predicted, place = samples.readings - one.residuals, self.columns.places[name] - 1
+        t, h = np.array([span.t1 for span in samples.spans]), predicted[:, place]
+        there, change = np.isfinite(h), np.zeros_like(predicted)
+        change[:, place] = h - np.interp(t - by, t[there], h[there])
+        return change
 
     def _only_sensors(self, error: Error) -> bool:
         return not set(error.names) & set(self.columns.inputs)
@@ -391,11 +445,14 @@ class _Trials:
         columns, values = self.columns, self.columns.column(error.names[0])
         step = {"offset": STEP * max(float(np.ptp(values)), 1e-12), "gain": STEP}
         h = step.get(error.kind, columns.interval)
-        more = replace(error, size=error.size + h)
-        r = columns.samples(more).residuals(fit.one.xi)
-        if r is None:
-            return None
-        _, theta = fit.freed((r - fit.one.residuals) / h)
+        if error.kind == "lag" and self._only_sensors(error):
+            change = self._lagged(columns.samples(error), fit.one, error.names[0], h)
+        else:
+            more = columns.samples(replace(error, size=error.size + h)).residuals(fit.one.xi)
+            if more is None:
+                return None
+            change = more - fit.one.residuals
+        _, theta = fit.freed(change / h)
         return replace(error, size=self._bounded(error.kind, error.names[0], error.size + theta))
 
 
@@ -425,14 +482,13 @@ def _noise(residuals: Array) -> float:
 def _cause(columns: Columns, error: Error, share: float) -> Cause:
     first, size = error.names[0], error.size
     problem = columns.work.filter.problem
-    units = dict(zip(problem.observed.names, problem.observed.units, strict=True))
     values: dict[str, object] = {"name": first, "other": error.names[-1]}
     kind, unit_of, side = error.kind, UNITS[error.unit], size > 0
-    factor = unit_of.factor if kind == "unit" else 1.0 / (1.0 + size)
+    factor, _ = error.correction
     match kind:
         case "offset":
-            unit = units.get(first, "") if first not in columns.inputs else ""
-            values |= {"amount": amount_of(abs(size), unit), "side": "high" if side else "low"}
+            amount = amount_of(abs(size), columns.unit(first))
+            values |= {"amount": amount, "side": "high" if side else "low"}
         case "gain":
             values |= {"share": f"{100.0 * abs(size):.2g} %", "side": "large" if side else "small"}
         case "lag":

@@ -26,7 +26,7 @@ from livepde.laws.history import added, empty_log, opened, skipped
 from livepde.laws.innovations import Innovations
 from livepde.laws.iterated_smoother import AGREED, Window, distance, next_reference, placed
 from livepde.laws.law import Belief, Deferred, Fit, FixedInterval, Law, Problem, Report, finite
-from livepde.laws.member_arrays import changed, put_each, take, where
+from livepde.laws.member_arrays import changed, put_each, take, where, zeros
 from livepde.laws.member_sensors import MemberSensors
 from livepde.laws.noise_rows import PAUSE_ROWS, input_rank, with_initial_rows
 from livepde.laws.one_member import step_alone
@@ -306,6 +306,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
             since_older=zero,
             since_newer=zero,
             log=empty_log(1, sensors, len(problem.channels)),
+            trial=empty_log(1, sensors, len(problem.channels)),
+            trial_start=x if work.tried else zeros(x),
             watch=(self.jumps or Jumps()).start(sensors),
             scale=Scale.start(sensors),
         )
@@ -564,5 +566,6 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
 
 
 def _started(work: SensitivityWork, state: SensitivityState, x: FilterState) -> SensitivityState:
-    start = work.kept_start(x)
-    return changed(state, start=start, fit=FitState.none(start), now=x, older=x, newer=x)
+    start, trial = work.kept_start(x), x if work.tried else zeros(x)
+    fit = FitState.none(start)
+    return changed(state, start=start, trial_start=trial, fit=fit, now=x, older=x, newer=x)

@@ -79,6 +79,20 @@ class SensitivityWork:
         """True if the stored samples determine constant unknowns alone, so that they are fitted."""
         return not (self.fades or self.filter.moves or self.filter.problem.input_noise)
 
+    def tried_samples(self, state: SensitivityState) -> SensitivityState:
+        """Return one member with its samples for trials of columns as those to be fitted."""
+        start = state.trial_start
+        first = np.array([not start.ledger.seen[0]])
+        return changed(
+            state,
+            start=start,
+            log=state.trial,
+            window=np.zeros(1, dtype=np.int64),
+            opening=first,
+            initial=first & (self.filter.problem.model.form_initial is not None),
+            fit=FitState.none(start),
+        )
+
     def unstored(self, state: SensitivityState) -> str:
         """Return why the stored samples of a member cannot be fitted; empty if they can."""
         if self.refit is None:
@@ -93,6 +107,13 @@ class SensitivityWork:
         if self.refit is None:
             return 0
         return self.refit.window if self.fits else min(self.refit.start, SMOOTHED)
+
+    @cached_property
+    def tried(self) -> int:
+        """Samples that are kept for trials of columns where constant unknowns are not fitted."""
+        kept = self.refit is not None and self.window and self.filter.judge is not None
+        constant = self.filter.problem.input_noise and not (self.fades or self.filter.moves)
+        return self.refit.window if self.refit and kept and constant else 0
 
     @cached_property
     def back(self) -> int:
@@ -125,6 +146,9 @@ class SensitivityState:
     since_newer: IntArray
     # Samples since the earliest of them, see `livepde.laws.history`.
     log: Array = field(metadata={"grows": 1})
+    # Samples for trials of columns, see `SensitivityWork.tried`, and the filter before them.
+    trial: Array = field(metadata={"grows": 1})
+    trial_start: FilterState
     watch: Watch  # innovations of the last samples, for `Jumps`
     scale: Scale  # ranges of the readings of each sensor so far, for `Guards`
 
@@ -289,6 +313,8 @@ def stored(
             parts |= {"fork": Fork.none(now), "due": state.assimilated}
         log = kept
     parts["log"] = log
+    if work.tried and len(state) == 1:
+        parts |= _trial(work, state, now, span)
     if work.window:
         parts["assimilated"] = state.assimilated + (taken & span.present)
     # After a pause the state is another one, too.
@@ -309,6 +335,19 @@ def stored(
                 "since_newer": np.where(due, last, state.since_newer),
             }
     return changed(state, now=now, **parts)
+
+
+def _trial(
+    work: SensitivityWork, state: SensitivityState, now: FilterState, span: Span
+) -> dict[str, Any]:
+    """Return the fields of the samples for trials of columns of one member, after one more."""
+    before = state.trial if state.trial.shape[1] else state.log
+    if before.shape[1] and not before[0, -1, 0] < span.t1:  # it is taken again
+        return {}
+    trial = added(before, span, np.ones(1, dtype=bool), now.parts)
+    if not (now.driven.pause[0] or trial.shape[1] > work.tried):
+        return {"trial": trial}
+    return {"trial": trimmed(trial, trial.shape[1] - 1), "trial_start": now}
 
 
 def _differ(log: Array, other: Array, row: int) -> bool:

@@ -162,10 +162,9 @@ def with_columns(verdict: Verdict, columns: Columns | str) -> Verdict:
         return verdict
     if isinstance(columns, str):
         return verdict.with_untested(f"errors of single columns: {columns}")
-    causes, misfit = likely_columns(columns)
     # Slow noise is a misfit, too, of which a column may explain a part by chance.
     known = any(finding.what == "misfit" for finding in verdict.findings)
-    return verdict.with_causes(causes) if known or misfit >= LARGE else verdict
+    return verdict.with_causes(likely_columns(columns, 0.0 if known else LARGE))
 
 
 def with_errors(verdict: Verdict, work: SensitivityWork, state: SensitivityState) -> Verdict:
