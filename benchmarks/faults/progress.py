@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.faults.damage import Damage, Found
 from benchmarks.faults.plan import Plan
-from benchmarks.faults.plants import GrowingFile
+from benchmarks.faults.plants import GrowingFile, wait
 from benchmarks.faults.rod import STEP, rod_rows
 from benchmarks.faults.run import Run
 from livepde.runs import Check, Outcome, Table
@@ -58,14 +58,19 @@ def prompt_stops(plan: Plan) -> Outcome:
     rng, count = np.random.default_rng(plan.seed), min(plan.kills, STOPS)
     numbers = iter(plan.watched(count, "SIGTERM"))
 
-    def life() -> float:
-        next(numbers)
-        return float(rng.uniform(3.0, LIFE))
-
     substeps, _ = STEPS["2 s"]
     text = f'refit = false\n[steps]\ndt_max = "{STEP / substeps} s"\n'
     with TemporaryDirectory() as folder:
-        rows = 4 * count + 10
+        log = Path(folder) / "log.txt"
+
+        def life() -> float:
+            """Wait until the run has begun, and return a number of seconds."""
+            next(numbers)
+            size = log.stat().st_size
+            wait(lambda: log.stat().st_size > size, "a run does not begin")
+            return float(rng.uniform(0.0, 0.5 * LIFE))
+
+        rows = 10 * count + 10
         _, gains, exits = _lives(Path(folder), rows, text, life, signal.SIGTERM, count)
     soon = sum(one <= LATE for one in exits)
     row = (len(exits), soon, float(np.median(exits)), max(exits), sum(gains))
@@ -91,7 +96,8 @@ def _lives(
         while len(gains) < most:
             before = run.estimated()
             run.start()
-            until = time.monotonic() + life()
+            span = life()
+            until = time.monotonic() + span
             while time.monotonic() < until and run.alive() and run.estimated() < samples - 1:
                 time.sleep(0.02)
             gains.append(run.estimated() - before)
