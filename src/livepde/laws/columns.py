@@ -300,14 +300,17 @@ class _Trials:
         self.columns = columns
         self.options = replace(columns.options, passes=min(columns.options.passes, PASSES))
         self.base = columns.samples()
+        self.vain = len(self.base.spans) if columns.state.fit.screened[0] else 0
 
     def refitted(self, samples: StoredSamples) -> Found | None:
         """Return the end of a search.
 
-        It does not start from other points if that was no use in the fit of the run.
+        It does not start from other points if that was no use in the fit of the run, or before.
         """
-        vain = len(samples.spans) if self.columns.state.fit.screened[0] else 0
-        return refitted(samples, self.options, last=False, screened=vain)
+        found = refitted(samples, self.options, last=False, screened=self.vain)
+        if found is not None and found.screened:
+            self.vain = len(samples.spans)
+        return found
 
     def promising(self, at: _Fit, cost: float) -> Iterator[tuple[float, Error]]:
         """Iterate over errors, and by how much they lower a cost by the model about a fit."""
