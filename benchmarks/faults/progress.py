@@ -70,7 +70,7 @@ def prompt_stops(plan: Plan) -> Outcome:
             wait(lambda: log.stat().st_size > size, "a run does not begin")
             return float(rng.uniform(0.0, 0.5 * LIFE))
 
-        rows = 10 * count + 10
+        rows = 20 * count + 10
         _, gains, exits = _lives(Path(folder), rows, text, life, signal.SIGTERM, count)
     soon = sum(one <= LATE for one in exits)
     row = (len(exits), soon, float(np.median(exits)), max(exits), sum(gains))
