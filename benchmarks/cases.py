@@ -42,10 +42,11 @@ GALLERY = """\
 # Gallery
 
 Every case on published measurements or fields, with its variants: estimates with both intervals,
-published values, and the checks of the case. *Inside*: whether the published value lies in the
-interval that allows for model errors. RMSE is one step ahead and includes the learning phase;
-*prior* is the RMSE of the model with its unknowns at their prior. *Time* is the processor time of
-a sample over the time of a forward step. Figures show the first run of each case.
+published values, and the checks of the case. *With model errors*: a dash where this interval was
+not computed. *Inside*: whether the published value lies in it, else in the plain one. RMSE is one
+step ahead and includes the learning phase; *prior* is the RMSE of the model with its unknowns at
+their prior. *Time* is the processor time of a sample over the time of a forward step. Figures show
+the first run of each case.
 
 **What to expect of measurements.** No model of a field is exact, and a long record shows it. Then
 the verdict is `caution` and not `trusted`: use the interval with model errors. `do not trust` says
@@ -294,12 +295,12 @@ def run_job(job: Job) -> Run:
 
 
 def _both_intervals(data: xr.Dataset) -> dict[str, tuple[float, float, float, float]]:
-    """Return the last intervals of each number; equal ones where the verdict has none."""
+    """Return the last intervals of each number; NaN for the second where the verdict has none."""
     errors, found = verdict(data).errors, {}
     allowed = {one.label: one for one in errors.unknowns} if errors is not None else {}
     for label in scalars(data):
         low, high = (float(end[-1]) for end in interval_95(data, label))
-        found[label] = low, high, low, high
+        found[label] = low, high, math.nan, math.nan
         if label in allowed:
             one = allowed[label]
             found[label] = one.plain_low, one.plain_high, one.low, one.high
@@ -310,8 +311,8 @@ def _compared(job: Job) -> dict[str, Any]:
     """Return what `livepde compare` prints of a case."""
     command = [sys.executable, "-m", "livepde", "compare", str(job.path), "--json", "--jobs", "1"]
     command += ["--most", str(job.compared), "--allow-code"]
-    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    return dict(json.loads(ended.stdout)) if ended.stdout.startswith("{") else {}
+    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+    return dict(json.loads(ended.stdout))
 
 
 def _verdict(data: xr.Dataset) -> str:
@@ -437,7 +438,8 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
             estimate = digits(numbers[label], numbers[f"{label}.std"])
             std, ends = numbers[f"{label}.std"], run.intervals[label]
             both = (_interval(ends[:2], std), _interval(ends[2:], std))
-            held = "yes" if ends[2] <= reference <= ends[3] else "no"
+            low, high = ends[2:] if math.isfinite(ends[2]) else ends[:2]
+            held = "yes" if low <= reference <= high else "no"
             inside = held if math.isfinite(reference) else "–"
             published = shown(reference, ".5g")
             rows.append((job.label, label, *estimate, unit, *both, published, inside))
@@ -449,7 +451,7 @@ def _tables(runs: Sequence[tuple[Job, Run]]) -> list[Table]:
 
 def _interval(ends: Sequence[float], std: float) -> str:
     """Return an interval with the digits that a standard deviation leaves."""
-    return " to ".join(digits(end, std)[0] for end in ends)
+    return " to ".join(digits(end, std)[0] for end in ends) if math.isfinite(ends[0]) else "–"
 
 
 def _recommendation(run: Run) -> list[str]:

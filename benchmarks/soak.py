@@ -71,7 +71,7 @@ MIB = 2.0**20
 
 Row: TypeAlias = dict[str, Any]
 
-# Name -> first minute in a week, how many rows, and what comes in the place of each.
+# Name -> its first minute in a week, the number of rows, and the rows that replace each of them.
 FAULTS: Mapping[str, tuple[int, int, Callable[[Row], list[Row]]]] = {
     "ten years ahead": (500, 1, lambda row: [{**row, "t": row["t"] + 5_256_000}, row]),
     "three hours ahead": (1000, 8, lambda row: [{**row, "t": row["t"] + 180}, row]),

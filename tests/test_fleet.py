@@ -630,3 +630,11 @@ def test_the_benchmark_compares_equal_estimates(monkeypatch):
     ((_, low, middle, high),) = outcome.tables[0].rows
     assert low <= middle <= high
     assert len(benchmark(members=2, runs=0).tables) == 1
+
+
+def test_a_member_that_is_taken_out_late_has_an_estimate():
+    rod = lp.models.heat(lp.interval(0.0, 1.0, 10), lp.LogNormal(0.1, std=0.05))
+    fleet = Fleet(rod, lp.Points({"a": 0.5}, noise=0.1), lp.SensitivityLaw(), 2, u0=0.0)
+    for k in range(30):
+        fleet.step(0.1 * (k + 1), np.zeros((2, 1)))
+    assert fleet.identifier(0).estimate().verdict.level == "not judged"

@@ -111,9 +111,10 @@ class SensitivityWork:
     @cached_property
     def tried(self) -> int:
         """Samples that are kept for trials of columns where constant unknowns are not fitted."""
-        kept = self.refit is not None and self.window and self.filter.judge is not None
         constant = self.filter.problem.input_noise and not (self.fades or self.filter.moves)
-        return self.refit.window if self.refit and kept and constant else 0
+        if self.refit is None or self.filter.judge is None or not constant:
+            return 0
+        return self.refit.window if self.window else 0
 
     @cached_property
     def back(self) -> int:

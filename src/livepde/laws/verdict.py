@@ -272,10 +272,10 @@ class StepLedger(NamedTuple):
 
     @property
     def _late(self) -> float:
-        """Length of the first interval in later ones, which are some; else 0."""
+        """Length of the first interval over the mean of the later ones; 0 for a few."""
         first, later = self.lengths.tolist()
         count = int(self.counts[:-1].sum()) - 1
-        return first * count / later if count >= SETTLED else 0.0
+        return first * count / later if count >= SETTLED and later > 0.0 else 0.0
 
     @property
     def irregular(self) -> bool:

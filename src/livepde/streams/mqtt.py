@@ -446,7 +446,7 @@ class MqttSink(_Peer):
         Where to: TOPIC has the objects; TOPIC/unknowns/LABEL the unknowns; TOPIC/status "running",
         or "offline" when the run has ended or cannot be reached. All but the first are retained.
     discovery
-        Whether Home Assistant is told of a sensor for each unknown, and one for the verdict.
+        Whether to publish a discovery message for each sensor of Home Assistant.
     title
         Name of the run, as Home Assistant shows it.
     keep
@@ -506,7 +506,7 @@ class MqttSink(_Peer):
             self._changed.notify()
 
     def _send(self) -> None:
-        shown = True  # to Home Assistant
+        discovered = True  # by Home Assistant
         while not self._given_up.is_set():
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting or self._announce or self._closing)
@@ -514,13 +514,13 @@ class MqttSink(_Peer):
                 estimate = self._waiting.popleft() if self._waiting else None
                 last = self._closing and not self._waiting
             if announce:
-                shown = not self._discovery
+                discovered = not self._discovery
                 self._publish(f"{self._topic}/status", "running")
             if estimate is not None:
-                found = () if shown else home_assistant(estimate, self._topic, self._title)
-                for topic, content in found:
-                    self._publish(topic, json.dumps(content))
-                shown = True
+                if not discovered:
+                    for topic, content in home_assistant(estimate, self._topic, self._title):
+                        self._publish(topic, json.dumps(content))
+                    discovered = True
                 self._publish_estimate(estimate)
             if last:
                 self._publish(f"{self._topic}/status", "offline")

@@ -81,7 +81,7 @@ def _application_of(path: Path) -> str:
         raise DataError(f"the certificate {path} names no application (URI)") from None
 
 
-class _Connection:
+class _Client:
     """A connection to a server, in its own thread, that reconnects until it is closed."""
 
     def __init__(self, server: OpcuaServer) -> None:
@@ -153,7 +153,7 @@ class _Connection:
         self._thread.join(PATIENCE)
 
 
-class OpcuaSource(_Connection, RowSource):
+class OpcuaSource(_Client, RowSource):
     """Rows from nodes of a server, one for each change of a value.
 
     A row has the time at which the server's source saw the change, as a date. A value whose status
@@ -279,7 +279,7 @@ class _Changes:
         self.ended = status.Status.name
 
 
-class OpcuaSink(_Connection):
+class OpcuaSink(_Client):
     """Writes estimates to nodes of a server, at most once a second, always the newest ones.
 
     Parameters
@@ -319,16 +319,15 @@ class OpcuaSink(_Connection):
 
         nodes = [await _writable(client, node, name) for node, name in self._columns.items()]
         self._connected()
-        stopped = False
+        stopped, written = False, None
         while not stopped:
             stopped = await self._stopped(LOOK)  # the last values are written before the end
             await client.check_connection()
             values = self._newest
-            for node, kind, name in nodes:
+            for node, kind, name in () if values is written else nodes:
                 if (value := values.get(name)) is not None:
                     await node.write_value(DataValue(Variant(value, kind)))
-            if self._newest is values:
-                self._newest = {}
+            written = values
 
 
 async def _writable(client: Any, name: str, column: str) -> tuple[Any, Any, str]:
