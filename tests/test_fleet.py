@@ -13,7 +13,7 @@ from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
 from benchmarks.fleet import fleet as benchmark
-from livepde.fleet import FleetRecords
+from livepde.fleet import Fleet, FleetRecords
 from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
 from livepde.models import heat
