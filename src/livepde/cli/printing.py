@@ -50,7 +50,7 @@ def can_draw(console: Console) -> bool:
 def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict[str, Any]:
     """Return the figures of a run: name -> function that draws.
 
-    A journal has the readings for the first panels of `overview`, and for the figure `curves`.
+    A journal has the readings for the first panels.
     """
     from livepde import plots
 
@@ -61,10 +61,7 @@ def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict
     if journal is None or not names or len(journal) > MOST_CURVES:
         return {"overview": lambda: plots.overview(dataset, title=title)}
     kept = journal.readings(names)
-    return {
-        "overview": lambda: plots.overview(dataset, title=title, measured=kept),
-        "curves": lambda: plots.curves(dataset, *kept, title=title),
-    }
+    return {"overview": lambda: plots.overview(dataset, title=title, measured=kept)}
 
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:

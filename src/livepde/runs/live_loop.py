@@ -766,7 +766,9 @@ class Live:
         self._tell_wild(estimate)
         self._steps += 1
         # Counted from the start of the run, so that a resumed run judges the same samples.
-        if len(self.result) % JUDGED == 0:
+        look, others = divmod(len(self.result), JUDGED)
+        # A run of finished data ends with a verdict: it is looked at seldom before.
+        if not others and (self.waits or _due(look)):
             self._judge(estimate)
         by_count = self._steps % CHECKPOINT == 0
         if by_count or self._seconds - self._kept_at >= max(APART, self._cost / COST):
