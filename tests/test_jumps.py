@@ -153,3 +153,18 @@ def test_the_noise_is_found_from_any_first_guess(guess: float):
 def test_what_noise_cannot_be_is_one_sentence():
     with pytest.raises(lp.errors.LawError, match="a positive number or 'auto'; got 'white'"):
         lp.SensitivityLaw(noise="white")
+
+
+def test_a_sensor_that_is_stuck_is_no_jump_and_hides_none():
+    stream, kept = [], np.zeros(len(POINTS))
+    for k, (t, z) in enumerate(samples(lambda t: 0.3 if t < 30.0 else 0.36, 700, 1)):
+        stuck = any(first <= k < first + 60 for first in (150, 300, 450))
+        z = np.where([False, stuck, False], kept, z)
+        stream.append((t, z))
+        kept = z
+    found = run(lp.SensitivityLaw(jumps=Jumps()), stream)
+    alarms = [k for k, estimate in enumerate(found) if estimate.diagnostics.jump > 0.0]
+    assert len(alarms) == 1
+    assert 599 <= alarms[0] < 629
+    value, std = found[-1].parameters["a"]
+    assert abs(value - 0.36) < 3.0 * std

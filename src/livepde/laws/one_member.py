@@ -263,16 +263,16 @@ def _watched(
     """
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, report
-    e = new.now.innovations.newest
-    watch, alarms = jumps.add(state.watch, e, new.now.screened.refused)
+    screened, e = new.now.screened, new.now.innovations.newest
+    watch, alarms = jumps.add(state.watch, e, screened.refused, screened.run)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
     if alarm:
         row = int(state.since_older[0])
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
-        screened = new.now.screened
         doubted = int(np.where(screened.aside, 0, screened.refused).max())
-        onset = max(jumps.onset(state.watch, e), doubted)
+        moving = np.where(state.watch.stuck(screened.run), np.nan, e)
+        onset = max(jumps.onset(state.watch, moving), doubted)
         guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         before = _most_likely(work, jumps, state.older, known, guess)
         x, status = changed(work.filter.relinearised(state.older), kept=new.now.kept), Status()

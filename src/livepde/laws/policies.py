@@ -15,6 +15,7 @@ from livepde.laws.member_arrays import where
 from livepde.linalg import Array, IntArray, Mask
 
 LARGEST = 3.0  # Huber's bound: of Gaussian innovations it cuts off 0.3 %, and 1 % of their variance
+CHANCE = 1e-2  # of so many repetitions in a row, below which a sensor seems stuck
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,17 @@ class Watch:
     usual: Innovations
     # Usual scatter before each of the last samples, newest first, shape (members, samples).
     scatters: Array
+    # Readings that repeated the one before, of sensors that did not seem stuck, (members, sensors).
+    repeats: IntArray
+
+    def stuck(self, run: IntArray) -> Mask:
+        """Return which sensors seem stuck; they tell nothing on a jump.
+
+        `run`: how often in a row each reading has been repeated, (members, sensors). A sensor of a
+        coarse resolution repeats its readings often.
+        """
+        usual = (self.repeats + 1.0) / (self.seen[:, None] + 2.0)
+        return np.asarray(run * np.log(usual) < np.log(CHANCE))
 
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
@@ -168,7 +180,7 @@ class Watch:
             usual = new if counted.all() else where(counted, new, usual)
         scatters = np.concatenate([self.usual.scatter[:, None], self.scatters[:, :-1]], axis=1)
         resting = np.maximum(self.resting - 1, 0)
-        return Watch(squares, counts, self.seen + 1, resting, usual, scatters)
+        return Watch(squares, counts, self.seen + 1, resting, usual, scatters, self.repeats)
 
 
 @dataclass(frozen=True)
@@ -241,18 +253,36 @@ class Jumps:
         """Return the value before any innovation."""
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)
         usual = Innovations.start(sensors, members)
-        return Watch(zero, zero, none, none + self.settle, usual, zero + 1.0)
+        repeats = np.zeros((members, sensors), dtype=np.int64)
+        return Watch(zero, zero, none, none + self.settle, usual, zero + 1.0, repeats)
 
-    def add(self, watch: Watch, e: Array, refused: IntArray | None = None) -> tuple[Watch, Mask]:
+    def add(
+        self,
+        watch: Watch,
+        e: Array,
+        refused: IntArray | None = None,
+        run: IntArray | None = None,
+    ) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
         Parameters
         ----------
         e
             Normalised innovations, shape (members, sensors), NaN where missing.
-        refused
-            As for `Watch.add`.
+        refused, run
+            As for `Watch.add` and `Watch.stuck`; None: no reading repeats one.
         """
+        if run is not None and np.count_nonzero(run):
+            stuck = watch.stuck(run)
+            # The reading that is repeated has counted: the test begins anew.
+            fresh = stuck.any(axis=1)[:, None]
+            watch = replace(
+                watch,
+                squares=np.where(fresh, 0.0, watch.squares),
+                counts=np.where(fresh, 0.0, watch.counts),
+                repeats=watch.repeats + ((run > 0) & ~stuck),
+            )
+            e = np.where(stuck, np.nan, e)
         new = watch.add(e, watch.seen < self.settle, refused)
         early = watch.resting > 0  # the first linearisations are poor: what they miss is no jump
         if early.any():

@@ -443,7 +443,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 beyond = scale.beyond(span.z1 - told.predicted, noise)
                 usual = usual & ~(beyond > guards.runaway)
         if (jumps := self.jumps) is not None and (present := span.present).any():
-            seen, alarm = jumps.add(state.watch, x.innovations.newest, x.screened.refused)
+            screened, newest = x.screened, x.innovations.newest
+            seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run)
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)
