@@ -275,7 +275,7 @@ class Jumps:
         if run is not None and np.count_nonzero(run):
             stuck = watch.stuck(run)
             # The reading that is repeated has counted: the test begins anew.
-            fresh = stuck.any(axis=1)[:, None]
+            fresh = stuck.any(axis=1, keepdims=True)
             watch = replace(
                 watch,
                 squares=np.where(fresh, 0.0, watch.squares),
