@@ -85,24 +85,16 @@ class LastEstimate:
 class VariantRun:
     """How the run of a variant ended.
 
-    Attributes
-    ----------
-    log_evidence
-        `Result.log_evidence` of all readings that it assimilates, as a density in the unit of the
-        data: variants with another unit of a sensor are comparable.
-    readings
-        Sensor that it assimilates -> number of the readings that are assimilated.
-    same_readings
-        Log evidence of the case itself with these readings, NaN if it has not all of them; None if
-        they are those of the case, since no late channel leaves some out.
-    misfits
-        Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
-        one step ahead, second half of the samples.
-    errors, validation
-        Assimilated and validation sensor -> root mean square of its errors one step ahead, second
-        half of the samples.
-    unknowns
-        How many numbers were unknown; of a field the number of modes.
+    `log_evidence`: `Result.log_evidence` of all readings that it assimilates, as a density in the
+    unit of the data: variants with another unit of a sensor are comparable.
+    `readings`: sensor that it assimilates -> number of the readings that are assimilated.
+    `same_readings`: log evidence of the case itself with these readings, NaN if it has not all of
+    them; None if they are those of the case, since no late channel leaves some out.
+    `misfits`: sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its
+    errors one step ahead, second half of the samples.
+    `errors`, `validation`: assimilated and validation sensor -> root mean square of its errors one
+    step ahead, second half of the samples.
+    `unknowns`: how many numbers were unknown; of a field the number of modes.
     """
 
     variant: Variant

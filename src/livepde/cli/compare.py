@@ -61,8 +61,7 @@ def compare(
         bool, typer.Option("--force", help="With --write: replace an existing file.")
     ] = False,
     figure: Annotated[
-        Path | None,
-        option("Draw the intervals of all variants to a figure.", metavar="FILE.png"),
+        Path | None, option("Draw the intervals of all variants to a figure.", metavar="FILE.png")
     ] = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,

@@ -74,8 +74,7 @@ def fleet(
         ),
     ],
     out: Annotated[
-        Path | None,
-        option("Folder for the run directories. Default: a new one in runs/."),
+        Path | None, option("Folder for the run directories. Default: a new one in runs/.")
     ] = None,
     jobs: Annotated[
         int, typer.Option(min=-1, help="Number of processes. -1: one for each processor.")
@@ -88,8 +87,7 @@ def fleet(
         ),
     ] = None,
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Resume the runs in --out, and start the missing ones."),
+        bool, typer.Option("--resume", help="Resume the runs in --out, and start the missing ones.")
     ] = False,
     separately: Annotated[
         bool,
@@ -477,12 +475,8 @@ def in_parts(
     A part whose worker died is run again; `run` has to resume from its run directories. Dask uses
     all workers of its cluster. `told` receives a sentence for each loss of a worker.
 
-    Raises
-    ------
-    ConfigurationError
-        joblib or the backend is not installed.
-    RunError
-        Workers died `ATTEMPTS` times in a row without a finished part in between.
+    Raises `ConfigurationError`: joblib or the backend is not installed.
+    Raises `RunError`: workers died `ATTEMPTS` times in a row without a finished part in between.
     """
     try:
         from joblib import Parallel, delayed, effective_n_jobs

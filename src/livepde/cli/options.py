@@ -27,10 +27,7 @@ def argument(text: str, **more: Any) -> Any:
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object. If a check fails, exit with code 1.")
 ]
-OutOption = Annotated[
-    Path | None,
-    option("Run directory to create. Default: a new one in runs/."),
-]
+OutOption = Annotated[Path | None, option("Run directory to create. Default: a new one in runs/.")]
 CodeOption = Annotated[
     bool,
     typer.Option(

@@ -325,10 +325,7 @@ def quiet() -> Iterator[None]:
 def packages() -> tuple[Any, Any]:
     """Return do_mpc and casadi.
 
-    Raises
-    ------
-    ConfigurationError
-        One of them is not installed.
+    Raises `ConfigurationError`: one of them is not installed.
     """
     try:
         with quiet():

@@ -12,16 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from livepde import checkpoint
-from livepde.errors import (
-    ConfigurationError,
-    MissingInputError,
-    RunError,
-    SampleError,
-    TimeOrderError,
-)
+from livepde import checkpoint, errors
+from livepde.checkpoint import Fingerprint
 from livepde.fem import Inputs, Moment
-from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.frames import layout_of
@@ -159,12 +152,12 @@ class Fleet:
             readings = [self._one._initial_readings(one) for one in made_of]
             return BlockEngine(self.law, self._work, readings, self._errors, u0s)
         if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 "u0_errors differ between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
         if any(one.keys() != made_of[0].keys() for one in made_of):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
@@ -175,7 +168,7 @@ class Fleet:
         if not isinstance(value, list):
             return [value] * len(self.members)
         if len(value) != len(self.members):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 f"{what}: a list of {len(value)} for {len(self.members)} members; give one for "
                 "each, or a single value for all."
             )
@@ -227,7 +220,7 @@ class Fleet:
         if self.inputs and not self._engine.finite(state):
             for k, name in enumerate(self.members):
                 if not self.law.finite(self._work, self._engine.member(state, k)):
-                    raise SampleError(
+                    raise errors.SampleError(
                         f"member '{name}' gets no finite initial state: check the values of its "
                         f"inputs {list(self.inputs)}; the run begins with the next sample."
                     )
@@ -259,13 +252,13 @@ class Fleet:
         """
         t = float(t)
         if not np.isfinite(t):
-            raise SampleError(f"time t is {t}; give the time of the sample.")
+            raise errors.SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, validation, named = self._parsed(z, inputs or {})
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
         if t < last or (t == last and self._samples):
-            raise TimeOrderError(
+            raise errors.TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
                 "sort the stream, and drop repeated samples."
             )
@@ -472,7 +465,7 @@ class Fleet:
         measured, noise, validation, named = parse(z)
         for name, values in inputs.items():
             if name not in self.inputs:
-                raise SampleError(
+                raise errors.SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = self._column(name, values)
@@ -484,7 +477,9 @@ class Fleet:
         noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
         for name in z:
             if name not in channels and name not in noisy:
-                raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
+                raise errors.SampleError(
+                    f"unknown channel '{name}'; this fleet has {list(channels)}."
+                )
         columns = {name: self._column(name, values) for name, values in z.items()}
         nothing = np.full(len(self), np.nan)
 
@@ -506,7 +501,7 @@ class Fleet:
             for name, column in zip(names, noise.T, strict=True):
                 _check_positive(name, column)
         if array.shape != expected:
-            raise SampleError(
+            raise errors.SampleError(
                 f"z has shape {array.shape}; {expected[0]} members with {expected[1]} sensors each "
                 f"need {expected}, NaN where a sample is missing."
             )
@@ -523,7 +518,7 @@ class Fleet:
         """Return a value of a channel for each member."""
         array = _numbers(f"channel '{name}'", values)
         if array.shape not in ((), (len(self),)):
-            raise SampleError(
+            raise errors.SampleError(
                 f"channel '{name}' has shape {array.shape}; give one number for all, or "
                 f"{len(self)}, one for each member."
             )
@@ -534,7 +529,7 @@ class Fleet:
     def _refuse_infinite(self, name: str, column: Array) -> None:
         if np.isinf(column).any():
             member = self.members[int(np.argmax(np.isinf(column)))]
-            raise SampleError(
+            raise errors.SampleError(
                 f"channel '{name}' of member '{member}' is infinite; send NaN for a missing sample."
             )
 
@@ -548,7 +543,7 @@ class Fleet:
                 column = np.where(missing, self._known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]
-                    raise MissingInputError(
+                    raise errors.MissingInputError(
                         f"input '{name}' of member '{member}' has no value in the first sample; "
                         "start the stream where every member has one."
                     )
@@ -580,7 +575,7 @@ class Fleet:
         """Raise `RunError` unless a checkpoint, named `where` in messages, is of such a fleet."""
         other = [key for key, value in self.header.items() if header.get(key) != value]
         if differs := other[0] if other else self.fingerprint.differing(leaves):
-            raise RunError(
+            raise errors.RunError(
                 f"{where} was saved with another {differs}; build the fleet as it was then."
             )
 
@@ -624,7 +619,7 @@ class Fleet:
                 state = self._engine.restored(template, inner)
             ends, samples = {name: leaves[name] for name in self.ends}, int(leaves["samples"])
         except (KeyError, ValueError) as error:
-            raise RunError(
+            raise errors.RunError(
                 f"{where} does not fit this fleet ({error}): build it with the law's options as "
                 "they were when it was saved."
             ) from error
@@ -639,9 +634,9 @@ def _named(members: int | Sequence[str]) -> tuple[str, ...]:
     """Return the names of the members: numbers from 0 if only their count is given."""
     names = tuple(map(str, range(members)) if isinstance(members, int) else members)
     if not names:
-        raise ConfigurationError("a fleet needs at least one member.")
+        raise errors.ConfigurationError("a fleet needs at least one member.")
     if len(set(names)) < len(names):
-        raise ConfigurationError("the names of the members of a fleet must differ.")
+        raise errors.ConfigurationError("the names of the members of a fleet must differ.")
     return names
 
 
@@ -658,4 +653,4 @@ def _numbers(what: str, values: ArrayLike) -> Array:
             raise TypeError
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise SampleError(f"{what} holds something that is not a number.") from None
+        raise errors.SampleError(f"{what} holds something that is not a number.") from None

@@ -112,17 +112,11 @@ class NoisyTwin:
 class Ensemble:
     """Runs of one law on the same exact data with several noise realisations.
 
-    Attributes
-    ----------
-    times
-        Shape (samples,).
-    energy, error, size
-        Energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain, relative L2 error
-        of q, and ||q^||_L2, each of shape (seeds, samples).
-    result
-        The run of the first seed.
-    failed
-        Number of samples with a failed step, over all seeds.
+    `times`: shape (samples,).
+    `energy`, `error`, `size`: energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the
+    gain, relative L2 error of q, and ||q^||_L2, each of shape (seeds, samples).
+    `result`: the run of the first seed.
+    `failed`: number of samples with a failed step, over all seeds.
     """
 
     times: Array
@@ -292,9 +286,7 @@ def made(alone: Ensemble) -> float:
 
 
 def excited_noise(
-    seeds: Sequence[int] = SEEDS,
-    progress: bool = False,
-    kinds: Sequence[Kind] = ("nodal", "band"),
+    seeds: Sequence[int] = SEEDS, progress: bool = False, kinds: Sequence[Kind] = ("nodal", "band")
 ) -> tuple[Runs, Table]:
     """Run the second figure on the excited twin; nodal noise with the first seed only."""
     case = excited_case()
