@@ -253,6 +253,8 @@ class FleetRunner:
         self, rows: Sequence[Member]
     ) -> tuple[dict[str, Prepared], dict[str, MemberOutcome]]:
         """Return the members whose case and data could be read, and how the others ended."""
+        from livepde import runs
+
         ended: dict[str, MemberOutcome] = {}
         ready: dict[str, Prepared] = {}
         # Members with the same settings share a case, which is then read and checked only once.
@@ -263,7 +265,11 @@ class FleetRunner:
                     path = self.home / self.case
                     loaded[row.settings] = load_case(path, self.allow_code, self._own(row))
                 case = loaded[row.settings]
-                self._refuse_other(row, case)
+                target = self._target(row.name)
+                if self.resume and (target / runs.RECORD).exists():
+                    # A run to resume has to be one of this member.
+                    command = self._command(row)
+                    runs.open(target).refuse_other(command, case.text, self._own(row))
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
             except LivepdeError as error:
                 ended[row.name] = MemberOutcome(row.name, "failed", error=str(error))
@@ -319,15 +325,6 @@ class FleetRunner:
         command = ["livepde", "run", str(self.case), "--out", str(target)]
         command += ["--data", member.data] if member.data else []
         return command + [word for text in self._own(member) for word in ("--set", text)]
-
-    def _refuse_other(self, member: Member, case: Case) -> None:
-        """Raise `RunError` if there is a run to resume that is not a run of this member."""
-        from livepde import runs
-
-        target = self._target(member.name)
-        if self.resume and (target / runs.RECORD).exists():
-            run = runs.open(target)
-            run.refuse_other(self._command(member), case.text, self._own(member))
 
     def _writer(self, member: Member, case: Case) -> RunWriter:
         target, command = self._target(member.name), self._command(member)
