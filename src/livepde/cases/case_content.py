@@ -57,13 +57,41 @@ class CaseContent:
 
     @cached_property
     def mesh(self) -> Any:
-        """The mesh."""
-        return _mesh_of(self)
+        """The mesh: from a file, or a line or rectangle of nodes or cells."""
+        spec, unit = self.spec.mesh, self.equation.length_unit
+        if spec.file is not None:
+            scale = conversion(spec.unit or unit, unit, self.where("mesh.unit")).factor
+            with self.located("mesh.file", SpaceError):
+                return fem.read_mesh(self.path.parent / spec.file, scale)
+        if spec.nodes is not None:
+            nodes = [self.convert(node, unit, "mesh.nodes") for node in spec.nodes]
+            with self.located("mesh.nodes", SpaceError):
+                return fem.line(nodes)
+        if spec.x is not None and spec.y is not None:
+            return _rectangle(self, spec.x, spec.y)
+        return _interval(self)
 
     @cached_property
     def options(self) -> dict[str, Any]:
         """Options of the equation: numbers in its units, text and booleans."""
-        return _options_of(self)
+        known, given = self.equation.options, self.spec.options
+        self.only(given, known, "options")
+        values: dict[str, Any] = {}
+        for name, option in known.items():
+            key = f"options.{name}"
+            if name == self.equation.storage and name in self.spec.unknowns:
+                if name in given:
+                    raise self.error(key, f"unknowns.{name} is stated, too; keep one of the two.")
+                continue
+            if name in given:
+                values[name] = _option_value(self, option, given[name], key)
+            elif option.default is not None:
+                values[name] = option.default
+            else:
+                unit = f", in {option.unit}" if option.unit else ""
+                choices = f": one of {', '.join(option.choices)}" if option.choices else ""
+                raise self.missing(key, f"the {option.text}{unit}{choices}.")
+        return values
 
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""
@@ -133,22 +161,6 @@ class CaseContent:
         if self.spec.channels[channel].is_flux and self.equation.fluxes is not None:
             return self.equation.fluxes.flux
         return self.equation.state.unit
-
-
-def _mesh_of(case: CaseContent) -> Any:
-    """Return the mesh of a case: from a file, or a line or rectangle of nodes or cells."""
-    spec, unit = case.spec.mesh, case.equation.length_unit
-    if spec.file is not None:
-        scale = conversion(spec.unit or unit, unit, case.where("mesh.unit")).factor
-        with case.located("mesh.file", SpaceError):
-            return fem.read_mesh(case.path.parent / spec.file, scale)
-    if spec.nodes is not None:
-        nodes = [case.convert(node, unit, "mesh.nodes") for node in spec.nodes]
-        with case.located("mesh.nodes", SpaceError):
-            return fem.line(nodes)
-    if spec.x is not None and spec.y is not None:
-        return _rectangle(case, spec.x, spec.y)
-    return _interval(case)
 
 
 def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
@@ -297,28 +309,6 @@ def sides_of(case: CaseContent, given: Any, dimension: int, key: str) -> list[tu
         raise case.error(key, f"got {list(given)}; expected {expected}.")
     unit = case.equation.length_unit
     return [case.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
-
-
-def _options_of(case: CaseContent) -> dict[str, Any]:
-    """Return the options of the equation: numbers in its units, text and booleans."""
-    known, given = case.equation.options, case.spec.options
-    case.only(given, known, "options")
-    values: dict[str, Any] = {}
-    for name, option in known.items():
-        key = f"options.{name}"
-        if name == case.equation.storage and name in case.spec.unknowns:
-            if name in given:
-                raise case.error(key, f"unknowns.{name} is stated, too; keep one of the two.")
-            continue
-        if name in given:
-            values[name] = _option_value(case, option, given[name], key)
-        elif option.default is not None:
-            values[name] = option.default
-        else:
-            unit = f", in {option.unit}" if option.unit else ""
-            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
-            raise case.missing(key, f"the {option.text}{unit}{choices}.")
-    return values
 
 
 def _option_value(case: CaseContent, option: Option, value: Any, key: str) -> Any:
