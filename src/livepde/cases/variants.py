@@ -14,7 +14,7 @@ from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import freed, with_settings
+from livepde.cases.remedies import PLACE, freed, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.plots.style import modes_told
@@ -37,7 +37,6 @@ GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
 MOST = 12  # variants that the program chooses
-PLACE = 0.01  # of the length of the domain: how far off a sensor may be
 SAMPLES = 64  # in which a source moves the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from livepde.result import Estimate
     from livepde.runs import Check, Driven, RunWriter, Table
     from livepde.runs.live_loop import Sink
+    from livepde.verdict import Verdict
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
 METRICS_PORT = 9100
@@ -270,17 +271,7 @@ def concluded(
     draw: bool = True,
 ) -> Conclusion:
     """Write the results of a run, with figures if `draw`, and return them."""
-    from livepde.cases.remedies import with_settings
-    from livepde.runs import (
-        arrivals,
-        checks_of,
-        clock_findings,
-        input_findings,
-        sampling_findings,
-        tables,
-        verdict,
-        verdict_table,
-    )
+    from livepde.runs import arrivals, checks_of, tables, verdict_table
     from livepde.runs.directory import attempted
     from livepde.verdict import Verdict
 
@@ -291,20 +282,7 @@ def concluded(
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
-    driving = loaded.roles("boundary", "input")
-
-    def readings() -> tuple[Array, Array]:
-        raw, journal = prepared.raw, driven.journal
-        return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
-
-    def judged() -> Verdict:
-        found = [
-            *sampling_findings(dataset, readings),
-            *clock_findings(driven.journal),
-            *input_findings(driven.journal, driving),
-        ]
-        return with_settings(prepared, verdict(dataset).with_findings(found))
-
+    judged = partial(_judged, prepared, driven, dataset)
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())
     shown = [
@@ -337,6 +315,24 @@ def concluded(
         figures=figures,
     )
     return Conclusion(dataset, shown, checks, notes)
+
+
+def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
+    """Return the verdict on a run, with settings of the case that would remedy what was found."""
+    from livepde import runs
+    from livepde.cases.remedies import with_settings
+
+    raw, journal = prepared.raw, driven.journal
+
+    def readings() -> tuple[Array, Array]:
+        return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
+
+    found = [
+        *runs.sampling_findings(dataset, readings),
+        *runs.clock_findings(journal),
+        *runs.input_findings(journal, prepared.case.roles("boundary", "input")),
+    ]
+    return with_settings(prepared, runs.verdict(dataset).with_findings(found))
 
 
 def _with_smoothed(

@@ -75,7 +75,7 @@ def page_of(run: Run) -> str:
         samples=data.sizes["time"],
         span=[axis.text(float(data["time"][k])) for k in (0, -1)],
         verdict=[
-            *findings(data, (), run.checks, doubts),
+            *findings(run.dataset, (), run.checks, doubts),
             *(("info", note) for note in run.notes if note not in doubts),
         ],
         tables=list(map(_shown, runs.tables(data))),

@@ -6,7 +6,7 @@ import copy
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -271,40 +271,35 @@ class Fleet:
                 held = {**held, **self._held_at_start(held)}
             self._begin(self._opening(values) if t > last else values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
+        ending = partial(
+            Span, t0=self._t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
+        )
         if t == last:
-            span = Span(
-                t0=self._t,
-                t1=t,
-                channels=self.inputs,
-                inputs0=values,
-                inputs1=values,
-                z0=used,
-                z1=used,
-                noise=noise,
-            )
+            span = ending(inputs0=values, z0=used)
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
             gaps = np.stack([self._held, missing], axis=1)
-            some = gaps if gaps.any() else None
-            span = Span(
-                t0=self._t,
-                t1=t,
-                channels=self.inputs,
-                inputs0=self._inputs,
-                inputs1=values,
-                z0=self._z,
-                z1=used,
-                noise=noise,
-                gaps=some,
-            ).driven(self.problem.control.held)
+            span = ending(inputs0=self._inputs, z0=self._z, gaps=gaps if gaps.any() else None)
+            span = span.driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
+        self._count(t, report.statuses)
+        self._keep(t, used, values, missing, report.statuses)
+        return self._estimate(span, measured, validation, report, held)
+
+    def _count(self, t: float, statuses: Sequence[Status]) -> None:
+        """Count the steps that end at t."""
         self._samples += 1
-        codes = [STATUS_CODES.index(status.code) for status in report.statuses]
+        codes = [STATUS_CODES.index(status.code) for status in statuses]
         self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
         self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
+
+    def _keep(
+        self, t: float, used: Array, values: Array, missing: Array, statuses: Sequence[Status]
+    ) -> None:
+        """Keep time and values of a sample for the members whose step was taken."""
         # A member whose step failed keeps its time and values: its next step covers both intervals.
-        good = np.array([status.taken for status in report.statuses])
+        good = np.array([status.taken for status in statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing
         self._held = np.where(good[:, None], lasting, self._held)
         if self.inputs:
@@ -316,7 +311,6 @@ class Fleet:
         # A value that holds until the next reading may not be read again.
         stays = np.array([name in self.problem.control.held.last for name in self.inputs], bool)
         self._known = np.where(good[:, None] | stays, values, self._known)
-        return self._estimate(span, measured, validation, report, held)
 
     def _opening(self, inputs: Array) -> Array:
         """Return the inputs at the initial time, from those of a later first sample."""
