@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import livepde
-from livepde.cases.json_schema import case_schema
+from livepde.cases.new_case import case_schema
 
 Schema = Mapping[str, Any]
 

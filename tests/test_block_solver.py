@@ -17,7 +17,7 @@ from livepde.laws.coupled import block_factors
 from livepde.laws.coupled.block_factors import BlockJacobian, BlockSolver
 from livepde.laws.coupled.equation import Metric, StageProblem
 from livepde.laws.coupled.monolithic import BilinearSolver
-from livepde.linalg import choice
+from livepde.linalg import solvers
 
 EXACT = lp.stepping.Newton(tolerance=1e-11, share=0.0)
 
@@ -46,7 +46,7 @@ def data_of(model, sensors, times):
 def run(model, sensors, law, monkeypatch, large, samples=5, missing=None, **options):
     """Return (u, q) of each step, and the iterations of each solve by blocks."""
     monkeypatch.setattr(block_factors, "LARGE", 1 if large else 10**9)
-    monkeypatch.setattr(choice, "WIDEST_BAND", 10)  # as it would be on a finer mesh
+    monkeypatch.setattr(solvers, "WIDEST_BAND", 10)  # as it would be on a finer mesh
     times = 0.05 * np.arange(samples)
     ident = lp.Identifier(model, sensors, law, q0=0.5, u0=2.0, **options)
     counts = []
@@ -137,7 +137,7 @@ def test_blocks_serve_the_second_order_scheme_and_averages(monkeypatch):
 def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
     """Return the solver by blocks, the first stage, and a point."""
     monkeypatch.setattr(block_factors, "LARGE", 1)
-    monkeypatch.setattr(choice, "WIDEST_BAND", 10)
+    monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     law = lp.GradientLaw(gain=gain, damping=lp.laws.ResidualDamping(c1))
     ident = lp.Identifier(model, sensors or lp.Full(), law, q0=0.5, u0=2.0)
     stage = ident._work.stage(np.ones(ident.observed.size, dtype=bool))
@@ -154,7 +154,7 @@ def first_stage(model, gain, monkeypatch, sensors=None, c1=1.0):
 def test_iterations_with_new_factors(monkeypatch):
     """To 1e-8, on two meshes: they hardly depend on the mesh."""
     monkeypatch.setattr(block_factors, "LARGE", 1)
-    monkeypatch.setattr(choice, "WIDEST_BAND", 10)
+    monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     outcome = scale.iterations((1600, 2500))
     assert len(outcome.checks) == 2 * len(scale.ITERATIONS)
     assert [check.name for check in outcome.checks if not check.ok] == []
@@ -231,7 +231,7 @@ def settled(model, sensors, samples, identifier=None):
 @pytest.fixture
 def stream(monkeypatch):
     monkeypatch.setattr(block_factors, "LARGE", 1)
-    monkeypatch.setattr(choice, "WIDEST_BAND", 10)
+    monkeypatch.setattr(solvers, "WIDEST_BAND", 10)
     model, sensors = plane(), lp.Subdomain(inside)
     times = 0.05 * np.arange(30)
     samples = list(zip(times, data_of(model, sensors, times), strict=True))
@@ -276,7 +276,7 @@ def test_a_jump_of_the_process_renews_the_factors(stream):
 def test_nothing_of_the_size_of_the_square_is_made(monkeypatch):
     """64 times the unknowns may take at most 100 times the memory of a step."""
     monkeypatch.setattr(block_factors, "LARGE", 1)
-    monkeypatch.setattr(choice, "WIDEST_BAND", 2)
+    monkeypatch.setattr(solvers, "WIDEST_BAND", 2)
 
     def peak(cells):
         model, sensors = plane(cells), lp.Subdomain(inside)

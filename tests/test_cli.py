@@ -82,7 +82,7 @@ def test_main_returns_codes(monkeypatch, capsys):
         def close(self):
             self.closed = True
 
-    monkeypatch.setattr("livepde.cli.program.app", broken)
+    monkeypatch.setattr("livepde.cli.app", broken)
     monkeypatch.setattr(sys, "stderr", Stream())
     assert cli.main() == 0
 

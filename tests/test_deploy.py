@@ -15,7 +15,7 @@ import pytest
 from patience import PATIENCE
 from typer.testing import CliRunner
 
-from livepde.cli.program import app
+from livepde.cli import app
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.web import Address
 

@@ -22,7 +22,6 @@ from livepde.linalg import (
     Pattern,
     SuperLUSolver,
     analyse,
-    choice,
     choose,
     conjugate_gradients,
     gmres,
@@ -30,6 +29,7 @@ from livepde.linalg import (
     positive_definite,
     row_product,
     sandwich,
+    solvers,
 )
 
 NUMBERS = st.floats(-10, 10, allow_nan=False, width=32)
@@ -253,7 +253,7 @@ def test_krylov_methods_say_what_to_do_if_they_do_not_converge(method):
 
 
 def test_engine_is_chosen_by_the_band(monkeypatch):
-    monkeypatch.setattr(choice, "_installed", lambda module: False)
+    monkeypatch.setattr(solvers, "_installed", lambda module: False)
     narrow = Pattern.of(sp.diags_array([np.ones(99), np.ones(100)], offsets=[1, 0]))
     wide = Pattern.of(sp.csr_array(np.ones((100, 100))))
     assert isinstance(analyse(narrow), BandedSolver)
@@ -284,7 +284,7 @@ def test_engine_is_chosen_by_the_band(monkeypatch):
 def test_engine_is_chosen_by_the_band_and_by_what_is_installed(
     modules, symmetric, expected, monkeypatch
 ):
-    monkeypatch.setattr(choice, "_installed", lambda module: module in modules.split())
+    monkeypatch.setattr(solvers, "_installed", lambda module: module in modules.split())
     for band, name in zip((100, 400, 600), expected, strict=True):
         diagonals = [np.ones(3000 - k) for k in (0, band, band)]
         pattern = Pattern.of(sp.diags_array(diagonals, offsets=[0, band, -band]))

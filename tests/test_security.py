@@ -27,7 +27,7 @@ from waitress import parser
 import livepde as lp
 from livepde import cases, checkpoint, runs
 from livepde.atomic_write import replacing, write_bytes
-from livepde.cli.program import app
+from livepde.cli import app
 from livepde.runs import RunWriter, visitors
 from livepde.runs.monitor import Metrics, Monitor
 from livepde.runs.visitors import IN_MEMORY, LONGEST_BODY, THREADS

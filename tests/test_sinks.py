@@ -118,7 +118,7 @@ def test_a_log_as_text(capsys, logs):
 PROGRAM = """
 import logging, sys, warnings
 import numpy as np, typer
-from livepde.cli.program import main
+from livepde.cli import main
 from livepde.runs.monitor import configure
 
 program = typer.Typer()

@@ -3,6 +3,12 @@
 The buffer is MAGIC, the length of a text, a digest of all that follows, the text, and the bytes of
 the arrays one after the other, each begun at a multiple of ALIGNED. The text is JSON: the header,
 and for each array its name, its type as NumPy writes it ("<f8"), and its shape.
+
+The header has the fingerprint of the problem, by which its checkpoints are recognised. Digests of
+matrices would differ between machines, whose sums round differently. So numbers are kept as they
+are, a few for each part: model, priors, sensors and options are evaluated at fixed states,
+parameters and times, and the results summed with fixed weights. Two builds of one problem agree in
+them to rounding, two problems do not.
 """
 
 from __future__ import annotations
@@ -12,8 +18,8 @@ import json
 import math
 import os
 import struct
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -22,7 +28,11 @@ import numpy as np
 
 from livepde.atomic_write import write_bytes
 from livepde.errors import RunError
-from livepde.linalg import Array
+from livepde.fem import Inputs, Moment
+from livepde.laws import AnyLaw, Problem
+from livepde.linalg import Array, nonfinite_allowed
+from livepde.model import Model
+from livepde.observation import Observed
 
 MAGIC = b"livepde1"
 DIGEST = 16  # bytes
@@ -200,3 +210,216 @@ def read(path: str | os.PathLike[str]) -> bytes:
         raise RunError(
             f"{path} is not a checkpoint that can be read: {error.strerror or error}."
         ) from error
+
+
+ROUNDING = 1e-8  # relative: far above what the order of sums changes, far below any other change
+TIMES = (0.37, 1.91)
+SUMS = 2  # for each vector
+PREFIX = "built."  # of the leaves of a checkpoint
+
+NAMES = {
+    "law": "option of the law",
+    "steps": "scheme, dt_max, halvings, between or input_noise",
+    "unknowns": "prior, evolution or bounds of an unknown",
+    "start": "u0 or q0",
+    "model": "model: its equation, mesh, source or boundary values",
+    "sensors": "sensor: its place, function or noise",
+}
+# Model and sensors are evaluated at the start and near it: only from the same one can it be known
+# whether they differ.
+EVALUATED = ("model", "sensors")
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprint:
+    """Texts and numbers of each part of a problem.
+
+    `texts` has the options of a part, with a sign instead of each number; `numbers` the numbers,
+    and sizes of what they are sums of, shape (numbers, 2).
+    """
+
+    texts: Mapping[str, str]
+    numbers: Mapping[str, Array]
+
+    @property
+    def leaves(self) -> dict[str, Any]:
+        """The leaves of a checkpoint that hold it."""
+        texts = {f"{PREFIX}{part}.text": np.array(text) for part, text in self.texts.items()}
+        return texts | {f"{PREFIX}{part}": each for part, each in self.numbers.items()}
+
+    def differing(self, leaves: Mapping[str, Array]) -> str:
+        """Return in words what differs from the problem of a checkpoint; empty if nothing does."""
+        differ = [part for part in NAMES if not self._same(part, leaves)]
+        if {"unknowns", "start"} & set(differ):
+            differ = [part for part in differ if part not in EVALUATED]
+        return ", and another ".join(NAMES[part] for part in differ)
+
+    def of_members(
+        self, q0: Sequence[Array], u0: Sequence[Array], errors: Sequence[Array]
+    ) -> Fingerprint:
+        """Return the fingerprint of members that begin at these parameters and states.
+
+        `errors` are those of each state, each of shape (errors, n).
+        """
+        whole = [np.concatenate([np.ravel(one) for one in each]) for each in (q0, u0, errors)]
+        start = np.concatenate(_start(*whole))
+        return replace(self, numbers={**self.numbers, "start": start})
+
+    def _same(self, part: str, leaves: Mapping[str, Array]) -> bool:
+        text, numbers = leaves.get(f"{PREFIX}{part}.text"), leaves.get(f"{PREFIX}{part}")
+        if text is None or numbers is None or str(text) != self.texts[part]:
+            return False
+        return _alike(self.numbers[part], numbers)
+
+
+def _alike(one: Array, other: Array) -> bool:
+    """Return whether sums are the same to rounding of their terms; not finite is as such."""
+    if one.shape != other.shape:
+        return False
+    finite = np.isfinite(one).all(axis=1)
+    if not np.array_equal(finite, np.isfinite(other).all(axis=1)):
+        return False
+    a, b = one[finite], other[finite]
+    size = np.maximum(a[:, 1], b[:, 1])
+    return bool((np.abs(a - b) <= ROUNDING * size[:, None]).all())
+
+
+@nonfinite_allowed()  # at states that the process never has
+def fingerprint(
+    law: AnyLaw, problem: Problem, validation: Observed | None, q0: Array, u0: Array
+) -> Fingerprint:
+    """Return the fingerprint of an identifier.
+
+    q0 and u0 are latent parameter and state at the start, without boundary values.
+    """
+    probes = _Probes(problem, q0, u0)
+    control = replace(problem.control, start=math.nan)
+    sensors = [problem.observed] if validation is None else [problem.observed, validation]
+    shown = [each for one in sensors for each in probes.of_sensors(one)]
+    own: dict[str, tuple[Any, Iterable[Array]]] = {
+        "model": ((problem.model.channels, problem.model.X.dim), probes.of_model()),
+        "unknowns": (_unknowns(problem.model), probes.of_unknowns()),
+        "sensors": ([one.names for one in sensors], shown),
+        "law": (law, ()),
+        "steps": ((control, problem.input_noise), ()),
+        "start": ((), _start(q0, u0, problem.initial_errors)),
+    }
+    texts, numbers = {}, {}
+    for part, (options, sums) in own.items():
+        told: list[float] = []
+        texts[part] = _described(options, told)
+        stated = np.array([(value, abs(value)) for value in told]).reshape(-1, 2)
+        numbers[part] = np.concatenate([stated, *sums])
+    return Fingerprint(texts, numbers)
+
+
+def _start(q0: Array, u0: Array, errors: Array) -> list[Array]:
+    """Return sums of what a run begins with; none of errors of u0 where there are none."""
+    return [_sums(q0), _sums(u0), *([_sums(errors.ravel())] if errors.size else [])]
+
+
+def _unknowns(model: Model) -> list[Any]:
+    parts = model.latent.parts.values()
+    return [(part.name, part.size, part.unknown.prior, part.evolution) for part in parts]
+
+
+def _sums(values: Any) -> Array:
+    """Return weighted sums of each column of an array, and their sizes, shape (sums, 2)."""
+    rows = np.asarray(values, dtype=float)
+    rows = rows.reshape(len(rows), -1).T if rows.ndim > 1 else rows[None]
+    weights = _weights(rows.shape[1])
+    return np.stack([rows @ weights, np.abs(rows) @ np.abs(weights)], axis=-1).reshape(-1, 2)
+
+
+def _weights(size: int) -> Array:
+    """Return fixed weights, no two of them alike, shape (size, SUMS)."""
+    return np.cos(np.outer(1.0 + np.arange(size), np.sqrt([2.0, 3.0])[:SUMS]))
+
+
+class _Probes:
+    """Evaluations at the start, and at a state and a parameter near it."""
+
+    def __init__(self, problem: Problem, q0: Array, u0: Array) -> None:
+        self.model = model = problem.model
+        inputs = Inputs({name: 1.0 + 0.3 * k for k, name in enumerate(problem.channels)})
+        first, second = (Moment(t, inputs) for t in TIMES)
+        u = u0 + 0.1 * max(1.0, float(np.abs(u0).max(initial=0.0))) * _weights(len(u0))[:, 0]
+        q = q0.copy()
+        for part in model.latent.parts.values():
+            q[part.part] += 0.3 * part.unknown.prior.latent_std
+        self.places = ((q0, u0, first), (q, u, second))
+
+    def of_model(self) -> Iterator[Array]:
+        """Iterate over sums of what the process is made of."""
+        model = self.model
+        yield _sums(model.mass @ _weights(model.X.dim))
+        yield _sums(model.X.free.astype(float))
+        for q, u, at in self.places:
+            yield from self._of_forms(q, u, at)
+
+    def _of_forms(self, q: Array, u: Array, at: Moment) -> Iterator[Array]:
+        model = self.model
+        yield _tried(lambda: model.initial_state(q, at))
+        yield _tried(lambda: model.impose(np.zeros_like(u), at))
+        yield _tried(lambda: model.B(u, at))
+        yield _tried(lambda: model.form_F.vector("v", at))
+        yield _tried(lambda: model.form_A.vector("v", at, u=u, q=q))
+        yield _tried(lambda: model.A(u, at, q).matrix @ _weights(len(q)))
+
+    def of_unknowns(self) -> Iterator[Array]:
+        """Iterate over sums of their priors."""
+        latent = self.model.latent
+        yield _sums(latent.prior)
+        yield _sums(self.model.Q.dual(_weights(len(latent.prior))[:, 0]))
+        for bound in latent.bounds:
+            yield _sums(np.isfinite(bound).astype(float))
+            yield _sums(np.where(np.isfinite(bound), bound, 0.0))
+
+    def of_sensors(self, sensors: Observed) -> Iterator[Array]:
+        """Iterate over sums of what sensors show."""
+        yield _sums(np.zeros(0) if sensors.noise is None else sensors.noise)
+        for q, u, at in self.places:
+            yield from self._shown(sensors, self.model.latent.value(q), u, at)
+
+    @staticmethod
+    def _shown(sensors: Observed, q: Array, u: Array, at: Moment) -> Iterator[Array]:
+        yield _tried(lambda: sensors.predict(u, q, at))
+        yield _tried(lambda: sensors.jacobian(u, q, at)[0] @ _weights(len(u)))
+
+
+def _tried(function: Callable[[], Any]) -> Array:
+    """Return the sums of what a function returns; NaN if it has no value there."""
+    try:
+        return _sums(function())
+    except Exception:  # noqa: BLE001  a form may refuse a state in any way; so it does next time
+        return np.full((1, 2), np.nan)
+
+
+def _described(value: Any, numbers: list[float]) -> str:
+    """Return options as text, with a sign for each number, which is appended to `numbers`.
+
+    Functions have no text: their values are in the numbers of their part.
+    """
+    if isinstance(value, bool | str | None):
+        return repr(value)
+    if isinstance(value, int | float | np.number):
+        numbers.append(float(value))
+        return "#"
+    if isinstance(value, np.ndarray):
+        numbers.extend(np.asarray(value, dtype=float).ravel().tolist())
+        return f"#{value.shape}"
+    if isinstance(value, Mapping):
+        parts = [f"{name}: {_described(each, numbers)}" for name, each in value.items()]
+    elif isinstance(value, Sequence):
+        parts = [_described(each, numbers) for each in value]
+    else:
+        parts = [f"{name}={_described(each, numbers)}" for name, each in _options(value)]
+    return f"{type(value).__name__}({', '.join(parts)})"
+
+
+def _options(value: Any) -> list[tuple[str, Any]]:
+    """Return names and values of the parts of an object, without those that may restart."""
+    if is_dataclass(value):
+        given = [item for item in fields(value) if not item.metadata.get("begins_anew")]
+        return [(item.name, getattr(value, item.name)) for item in given if item.init]
+    return []

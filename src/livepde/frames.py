@@ -188,10 +188,7 @@ def prior_draws(
 
 
 def predictive(
-    measured: pd.DataFrame,
-    expected: Array,
-    std: Array,
-    seed: int | np.random.Generator | None,
+    measured: pd.DataFrame, expected: Array, std: Array, seed: int | np.random.Generator | None
 ) -> dict[str, xr.Dataset]:
     """Return draws of readings and log densities: see `Result.to_inference_data`.
 
@@ -316,10 +313,7 @@ def summary(data: xr.Dataset) -> dict[str, dict[str, float]]:
     """Return the table of a run's dataset: last estimates, and errors of each channel."""
     rows: dict[str, dict[str, float]] = {}
     for label in filter(None, data.attrs["scalars"].split("\n") if data.sizes["time"] else ()):
-        rows[label] = {
-            "value": float(data[label][-1]),
-            "std": float(data[f"{label}_std"][-1]),
-        }
+        rows[label] = {"value": float(data[label][-1]), "std": float(data[f"{label}_std"][-1])}
     for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if variable not in data:
             continue

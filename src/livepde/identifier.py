@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
+from livepde.checkpoint import Fingerprint, fingerprint
 from livepde.dates import origin_at, since_1970, stamp_of
 from livepde.errors import (
     ConfigurationError,
@@ -26,7 +27,6 @@ from livepde.errors import (
     TimeOrderError,
 )
 from livepde.fem import Inputs, Moment
-from livepde.fingerprint import Fingerprint, fingerprint
 from livepde.forecast import Forecast, ahead, seen_rows
 from livepde.hindsight import Hindsight, LinearReadings
 from livepde.laws import (

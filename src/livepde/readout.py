@@ -99,15 +99,10 @@ def _ends(unknown: Any) -> Ends:
 class Marginal:
     """The marginal distribution of one unknown in an estimate: a Gaussian in its latent value.
 
-    Attributes
-    ----------
-    median
-        A number; of a field an array of coefficients.
-    deviation
-        Standard deviation to first order: that of the latent value times the slope of the transform
-        at the median. NaN for a law without covariance.
-    unknown
-        The unknown with its prior.
+    `median`: a number; of a field an array of coefficients.
+    `deviation`: standard deviation to first order: that of the latent value times the slope of the
+    transform at the median. NaN for a law without covariance.
+    `unknown`: the unknown with its prior.
     """
 
     median: Any
@@ -118,11 +113,8 @@ class Marginal:
     def at(self, points: ArrayLike) -> Marginal:
         """Return the marginals of the values of a field at points.
 
-        Parameters
-        ----------
-        points
-            Coordinates of one or more points: on an interval a number or shape (points,), else
-            shape (d,) or (points, d).
+        `points`: coordinates of one or more points: on an interval a number or shape (points,),
+        else shape (d,) or (points, d).
 
         Returns
         -------
@@ -130,12 +122,8 @@ class Marginal:
             Its median, deviation, mean, std and intervals have a number for each point; of a vector
             field a row of components.
 
-        Raises
-        ------
-        ConfigurationError
-            The unknown is a number, or the estimate was pickled.
-        ObservationError
-            A point outside of the mesh.
+        Raises `ConfigurationError`: the unknown is a number, or the estimate was pickled.
+        Raises `ObservationError`: a point outside of the mesh.
 
         Examples
         --------

@@ -87,18 +87,10 @@ class Affine:
 def convert(value: float | str, unit: str, where: str, *, difference: bool = False) -> float:
     """Return a quantity, a number in the model's unit or text such as "20 h", in that unit.
 
-    Parameters
-    ----------
-    where
-        File and key, for the message.
-    difference
-        A difference of two values, such as a standard deviation: the offset of temperature scales
-        drops out.
-
-    Raises
-    ------
-    CaseError
-        Not a quantity, an unknown unit, or one of another dimension.
+    `where`: file and key, for the message.
+    `difference`: a difference of two values, such as a standard deviation: the offset of
+    temperature scales drops out.
+    Raises `CaseError`: not a quantity, an unknown unit, or one of another dimension.
     """
     if not isinstance(value, str):
         return float(value)

@@ -14,20 +14,8 @@ from typing import Any, TypeVar
 import numpy as np
 import tomlkit
 
-from livepde.cases.case_channels import (
-    between_of,
-    check_initial,
-    columns_of,
-    expanded,
-    initial_errors,
-    initial_of,
-    initial_weights,
-    input_noise_of,
-    noise_of,
-    observation_of,
-    sensor_notes,
-    unknowns_of,
-)
+from livepde import laws
+from livepde.cases import case_channels
 from livepde.cases.case_content import CaseContent, resolve
 from livepde.cases.data import assimilation_start, clock_of, read_data, reader_of, without_gaps
 from livepde.cases.process import conditioned, drive_notes, model_of, process_notes, wall_attributes
@@ -38,18 +26,6 @@ from livepde.errors import DataError, LawError
 from livepde.fem import Inputs, Moment
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
-from livepde.laws import (
-    AnyLaw,
-    ConstantDamping,
-    Damping,
-    GradientLaw,
-    Guards,
-    Jumps,
-    Refit,
-    ResidualDamping,
-    SensitivityLaw,
-    Shadows,
-)
 from livepde.model import Model
 from livepde.observation import Observation, Points
 from livepde.records import Layout
@@ -100,7 +76,7 @@ class Prepared:
             raise self.case.error("output.smoothed", f"{why}; leave it out.")
         return identifier
 
-    def identifier_with(self, law: AnyLaw, sensors: Observation | None = None) -> Identifier:
+    def identifier_with(self, law: laws.AnyLaw, sensors: Observation | None = None) -> Identifier:
         """Return an identifier for the same case with another law, and with other sensors."""
         case = self.case
         return Identifier(
@@ -114,19 +90,19 @@ class Prepared:
             scheme=case.scheme,
             dt_max=case.dt_max,
             assimilate_from=self.assimilate_from,
-            between=between_of(case),
+            between=case_channels.between_of(case),
             **self.uncertain(law),
         )
 
-    def uncertain(self, law: AnyLaw) -> dict[str, Any]:
+    def uncertain(self, law: laws.AnyLaw) -> dict[str, Any]:
         """Return the options of an identifier for noise of inputs and errors of the start."""
         case = self.case
-        if isinstance(law, GradientLaw):  # it has no covariance
+        if isinstance(law, laws.GradientLaw):  # it has no covariance
             return {}
-        found: dict[str, Any] = {"input_noise": input_noise_of(case)}
+        found: dict[str, Any] = {"input_noise": case_channels.input_noise_of(case)}
         if self.u0 is not None:
-            found["u0_from"] = initial_weights(case, self.first)
-            found["u0_errors"] = initial_errors(case, self.first)
+            found["u0_from"] = case_channels.initial_weights(case, self.first)
+            found["u0_errors"] = case_channels.initial_errors(case, self.first)
         return found
 
     @cached_property
@@ -134,7 +110,7 @@ class Prepared:
         """The initial state: a number, or a function of x; None if the model defines it."""
         case = self.case
         if case.model.form_initial is None:
-            return initial_of(case, self.first)
+            return case_channels.initial_of(case, self.first)
         if case.spec.initial is not None:
             raise case.error("initial", "the equation has its own initial state; leave it out.")
         return None
@@ -219,7 +195,9 @@ def load(
     spec = read_spec(document, str(file))
     place = (spec, file.parent, str(file), allow_code)
     # Families of sensors become single channels first, because conditions name single ones.
-    content = conditioned(expanded(CaseContent(file, spec, resolve(*place), reader_of(*place))))
+    content = conditioned(
+        case_channels.expanded(CaseContent(file, spec, resolve(*place), reader_of(*place)))
+    )
     case = Case(content.path, content.spec, content.equation, content.reader, text, original)
     case.check()
     return case
@@ -245,8 +223,8 @@ class Case(CaseContent):
         # In this order: an error about the mesh comes before those about what lies on it.
         _ = self.mesh, self.options, self.model, self.observation, self.validation, self.law
         _ = self.columns, self.clock, self.scheme, self.dt_max, self.references
-        _ = input_noise_of(self), wall_attributes(self, self.model)
-        check_initial(self)
+        _ = case_channels.input_noise_of(self), wall_attributes(self, self.model)
+        case_channels.check_initial(self)
         self._check_names()
 
     def _check_names(self) -> None:
@@ -300,12 +278,12 @@ class Case(CaseContent):
     @cached_property
     def columns(self) -> dict[str, Column]:
         """Channel -> its column in the data."""
-        return columns_of(self)
+        return case_channels.columns_of(self)
 
     @cached_property
     def observation(self) -> Observation:
         """The assimilated sensors."""
-        observation = observation_of(self, "sensor")
+        observation = case_channels.observation_of(self, "sensor")
         if observation is None:
             text = "there is no sensor. Add at least one channel with role = 'sensor'."
             raise self.error("channels", text)
@@ -319,7 +297,7 @@ class Case(CaseContent):
     @cached_property
     def validation(self) -> Observation | None:
         """The sensors that are predicted only, or ignored; None if there are none."""
-        return observation_of(self, "validation", "ignored")
+        return case_channels.observation_of(self, "validation", "ignored")
 
     @property
     def ignored(self) -> tuple[str, ...]:
@@ -327,7 +305,7 @@ class Case(CaseContent):
         return tuple(self.roles("ignored"))
 
     @cached_property
-    def law(self) -> AnyLaw:
+    def law(self) -> laws.AnyLaw:
         """The update law."""
         return law_of(self)
 
@@ -352,8 +330,12 @@ class Case(CaseContent):
     @property
     def notes(self) -> list[str]:
         """Notes on allowed settings that may be mistakes."""
-        found = [*drive_notes(self, self.model), *process_notes(self), *sensor_notes(self)]
-        if isinstance(self.law, GradientLaw) and isinstance(self.observation, Points):
+        found = [
+            *drive_notes(self, self.model),
+            *process_notes(self),
+            *case_channels.sensor_notes(self),
+        ]
+        if isinstance(self.law, laws.GradientLaw) and isinstance(self.observation, Points):
             found.append(
                 "The gradient law is made for observed subdomains and averages; a few noisy point "
                 "sensors mislead it. Use law.kind = 'sensitivity' for points."
@@ -445,41 +427,41 @@ class Case(CaseContent):
         return prepared
 
 
-def law_of(case: CaseContent) -> AnyLaw:
+def law_of(case: CaseContent) -> laws.AnyLaw:
     """Return the law; raises `CaseError`."""
     spec = case.spec.law
     with case.located("law", LawError):
         if not isinstance(spec, GradientSpec):
             return _sensitivity(case, spec)
-        damping: Damping = ResidualDamping(1.0 if spec.c1 is None else spec.c1)
+        damping: laws.Damping = laws.ResidualDamping(1.0 if spec.c1 is None else spec.c1)
         if spec.mu is not None:
-            damping = ConstantDamping(spec.mu)
-        return GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
+            damping = laws.ConstantDamping(spec.mu)
+        return laws.GradientLaw(spec.gain, damping, nu=spec.nu, sigma=spec.sigma)
 
 
-def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> SensitivityLaw:
+def _sensitivity(case: CaseContent, spec: SensitivitySpec) -> laws.SensitivityLaw:
     time = case.equation.time_unit
-    return SensitivityLaw(
+    return laws.SensitivityLaw(
         modes=spec.modes,
-        memory=case.positive(spec.memory, time, "law.memory", SensitivityLaw.memory),
+        memory=case.positive(spec.memory, time, "law.memory", laws.SensitivityLaw.memory),
         drift=case.convert(spec.drift, f"1/{time}" if time else "", "law.drift"),
         noise=_noise(case, spec),
-        refit=_chosen(Refit, spec.refit),
+        refit=_chosen(laws.Refit, spec.refit),
         rank=spec.rank,
         gate=spec.gate,
         gate_patience=spec.gate_patience,
         jumps=_jumps(case, spec),
-        guards=_chosen(Guards, spec.guards),
-        shadows=_chosen(Shadows, spec.shadows),
+        guards=_chosen(laws.Guards, spec.guards),
+        shadows=_chosen(laws.Shadows, spec.shadows),
         verdict=spec.verdict,
     )
 
 
-def _jumps(case: CaseContent, spec: SensitivitySpec) -> Jumps | None:
+def _jumps(case: CaseContent, spec: SensitivitySpec) -> laws.Jumps | None:
     """Return the test for jumps: of all unknowns (true), of some (names), or with options."""
     given = spec.jumps
-    found = Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(Jumps, given)
-    known = [*case.spec.unknowns, *unknowns_of(case)]
+    found = laws.Jumps(unknowns=given) if isinstance(given, tuple) else _chosen(laws.Jumps, given)
+    known = [*case.spec.unknowns, *case_channels.unknowns_of(case)]
     key = "law.jumps" if isinstance(given, tuple) else "law.jumps.unknowns"
     for name in (found.unknowns if found is not None else None) or ():
         case.require(name, known, key, f"there is no unknown '{name}'")
@@ -497,7 +479,7 @@ def _noise(case: CaseContent, spec: SensitivitySpec) -> float | str | None:
     """Return the noise of the law, which needs it here or from every sensor."""
     if spec.noise is not None and spec.noise != "auto":
         return case.positive(spec.noise, case.equation.state.unit, "law.noise")
-    if noise_of(case, "sensor") is None:
+    if case_channels.noise_of(case, "sensor") is None:
         if spec.noise == "auto":
             text = "got 'auto', which begins with a guess: give every sensor its noise."
             raise case.error("law.noise", text)

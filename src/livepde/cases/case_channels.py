@@ -11,41 +11,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from livepde import fem, observation
+from livepde.cases import schema
 from livepde.cases.case_content import CaseContent, inside
 from livepde.cases.read import did_you_mean, is_blank
-from livepde.cases.schema import (
-    FLUX,
-    SENSORS,
-    CaseSpec,
-    ChannelSpec,
-    GradientSpec,
-    TikhonovSpec,
-)
 from livepde.errors import CaseError, MissingInputError, SpaceError
-from livepde.fem import (
-    MeanReverting,
-    Normal,
-    Scalars,
-    Unknown,
-    random_field,
-    with_constants,
-)
 from livepde.linalg import Array
-from livepde.observation import (
-    Averages,
-    Calibrated,
-    Combined,
-    Discrepancy,
-    FluxPlates,
-    LineIntegrals,
-    Moving,
-    Observation,
-    Points,
-    Pseudoinverse,
-    Reconstruction,
-    Tikhonov,
-)
-from livepde.observation.placed import POSITION, shift_names
+from livepde.observation.sensors import POSITION, shift_names
 from livepde.samples import Sample, by_name, noise_channel
 from livepde.stepping import Between
 from livepde.streams import Column
@@ -58,7 +30,7 @@ if TYPE_CHECKING:
 EXACT = "interpolate-exact"
 INTERPOLATED = ("readings", "interpolate", EXACT)
 
-Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, ChannelSpec]]
+Kinds: TypeAlias = dict[tuple[str, str | None], dict[str, schema.ChannelSpec]]
 """(kind of sensor, component of the state) -> its channels."""
 MEMBERS = 10_000  # channels of one `each`
 
@@ -88,10 +60,12 @@ def columns_of(case: CaseContent) -> dict[str, Column]:
     return found
 
 
-def _noise_column(case: CaseContent, name: str, channel: ChannelSpec, factor: float) -> Column:
+def _noise_column(
+    case: CaseContent, name: str, channel: schema.ChannelSpec, factor: float
+) -> Column:
     """Return where the noise of the readings of a channel comes from, in its unit."""
     key = f"channels.{name}.noise_column"
-    if isinstance(case.spec.law, GradientSpec):
+    if isinstance(case.spec.law, schema.GradientSpec):
         raise case.error(key, "the gradient law does not weight readings: leave it out.")
     if noise_channel(name) in case.spec.channels:
         raise case.error(key, f"another channel is called '{noise_channel(name)}': rename it.")
@@ -99,7 +73,7 @@ def _noise_column(case: CaseContent, name: str, channel: ChannelSpec, factor: fl
     return Column((str(channel.noise_column),), factor, decimal=decimal, noise_of=name)
 
 
-def observation_of(case: CaseContent, *roles: str) -> Observation | None:
+def observation_of(case: CaseContent, *roles: str) -> observation.Observation | None:
     """Return the observation of the channels of some roles; None if there are none."""
     channels, assimilated = case.roles(*roles), "sensor" in roles
     if not channels:
@@ -115,7 +89,7 @@ def observation_of(case: CaseContent, *roles: str) -> Observation | None:
         "noise": levels and [levels[name] for name in names],
         # Sensors with several units have them from their parts.
         "unit": units.pop() if len(units) == 1 else "",
-        "reconstruction": _reconstruction(case) if assimilated else Pseudoinverse(),
+        "reconstruction": _reconstruction(case) if assimilated else observation.Pseudoinverse(),
     }
     own = any(item.offset or item.gain or item.correlated for item in channels.values())
     if own and assimilated:
@@ -124,25 +98,25 @@ def observation_of(case: CaseContent, *roles: str) -> Observation | None:
     return _whole(case, kinds, outer)
 
 
-def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> Observation:
+def _whole(case: CaseContent, kinds: Kinds, outer: Mapping[str, Any]) -> observation.Observation:
     """Return one observation of all kinds, which has the keyword arguments `outer`."""
     common = outer if len(kinds) == 1 else {}
     parts = [
         _part(case, kind, members, {"unit": case.unit(next(iter(members))), **common}, of)
         for (kind, of), members in kinds.items()
     ]
-    return parts[0] if len(parts) == 1 else Combined(parts, **outer)
+    return parts[0] if len(parts) == 1 else observation.Combined(parts, **outer)
 
 
-def _kind(channel: ChannelSpec) -> str:
+def _kind(channel: schema.ChannelSpec) -> str:
     """Return what makes a channel a sensor of its kind: a key, or the quantity "flux"."""
     if channel.is_flux:
-        return FLUX
+        return schema.FLUX
     given = (key for key in ("over", "along", "follows") if getattr(channel, key) is not None)
     return next(given, "at")
 
 
-def _regions(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+def _regions(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> dict[str, Any]:
     """Return the parts of the mesh over which means are taken."""
     known = {**(case.mesh.boundaries or {}), **(case.mesh.subdomains or {})}
     regions: dict[str, Any] = {}
@@ -156,7 +130,7 @@ def _regions(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str
     return regions
 
 
-def _lines(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, Any]:
+def _lines(case: CaseContent, channels: Mapping[str, schema.ChannelSpec]) -> dict[str, Any]:
     """Return the ends of lines along which means are taken."""
     return {
         name: tuple(_inside_mesh(case, end, f"channels.{name}.along") for end in item.along)
@@ -165,7 +139,9 @@ def _lines(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, 
     }
 
 
-def _followed(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[str, tuple[str, ...]]:
+def _followed(
+    case: CaseContent, channels: Mapping[str, schema.ChannelSpec]
+) -> dict[str, tuple[str, ...]]:
     """Return the channels of the positions of sensors that move."""
     positions: dict[str, tuple[str, ...]] = {}
     known = case.roles("position")
@@ -186,26 +162,26 @@ def _followed(case: CaseContent, channels: Mapping[str, ChannelSpec]) -> dict[st
 def _part(
     case: CaseContent,
     kind: str,
-    channels: Mapping[str, ChannelSpec],
+    channels: Mapping[str, schema.ChannelSpec],
     common: Mapping[str, Any],
     of: str | None,
-) -> Observation:
+) -> observation.Observation:
     """Return the observation of channels of one kind, of a component of the state."""
     if of is not None:
         common = {**common, "of": of}
-    if kind == FLUX:
+    if kind == schema.FLUX:
         places = {name: _flux_place(case, name, item) for name, item in channels.items()}
-        return FluxPlates(places, case.equation.conductivity, **common)
+        return observation.FluxPlates(places, case.equation.conductivity, **common)
     if kind == "over":
-        return Averages(_regions(case, channels), **common)
+        return observation.Averages(_regions(case, channels), **common)
     if kind == "along":
-        return LineIntegrals(_lines(case, channels), mean=True, **common)
+        return observation.LineIntegrals(_lines(case, channels), mean=True, **common)
     if kind == "follows":
-        return Moving(_followed(case, channels), **common)
+        return observation.Moving(_followed(case, channels), **common)
     points = {name: _position(case, name, item) for name, item in channels.items()}
     constants = case.constants
     direct = {  # what a quantity sees beside the state
-        name: with_constants(
+        name: fem.with_constants(
             case.equation.quantities[item.quantity].direct(case.options), constants
         )
         for name, item in channels.items()
@@ -221,10 +197,10 @@ def _part(
                 f"channels.{unnamed}.component", "the component of the vector that it measures."
             )
         common = {**common, "component": numbers}
-    return Points(points, direct, uncertain or None, **common)
+    return observation.Points(points, direct, uncertain or None, **common)
 
 
-def _flux_place(case: CaseContent, name: str, channel: ChannelSpec) -> float | str:
+def _flux_place(case: CaseContent, name: str, channel: schema.ChannelSpec) -> float | str:
     """Return the end of the mesh where a flux is measured, or a position inside."""
     if not case.equation.conductivity:
         text = f"the equation '{case.equation.name}' has no flux to measure; leave it out."
@@ -238,21 +214,21 @@ def _flux_place(case: CaseContent, name: str, channel: ChannelSpec) -> float | s
     return place
 
 
-def _reconstruction(case: CaseContent) -> Reconstruction:
+def _reconstruction(case: CaseContent) -> observation.Reconstruction:
     """Return the reconstruction of the observed part, by the key law.tikhonov."""
     law = case.spec.law
-    given = law.tikhonov if isinstance(law, GradientSpec) else False
+    given = law.tikhonov if isinstance(law, schema.GradientSpec) else False
     if given is False:
-        return Pseudoinverse()
-    spec = TikhonovSpec() if given is True else given
-    alpha = Discrepancy(spec.tau) if spec.alpha == "discrepancy" else spec.alpha
+        return observation.Pseudoinverse()
+    spec = schema.TikhonovSpec() if given is True else given
+    alpha = observation.Discrepancy(spec.tau) if spec.alpha == "discrepancy" else spec.alpha
     if spec.alpha == "discrepancy" and noise_of(case, "sensor") is None:
         text = "the discrepancy principle needs the noise of every sensor; or give alpha a number."
         raise case.error("law.tikhonov.alpha", text)
-    return Tikhonov(spec.norm, alpha)
+    return observation.Tikhonov(spec.norm, alpha)
 
 
-def _position(case: CaseContent, name: str, channel: ChannelSpec) -> Any:
+def _position(case: CaseContent, name: str, channel: schema.ChannelSpec) -> Any:
     """Return where a point sensor sits: a number, or a list of coordinates."""
     key = f"channels.{name}.at"
     low, high = case.mesh.p.min(axis=1), case.mesh.p.max(axis=1)
@@ -304,7 +280,7 @@ def _noisy_fluxes(case: CaseContent) -> Iterator[str]:
 
 def _crowded(case: CaseContent) -> list[str]:
     """Return a note if all sensors lie in one cell."""
-    shown = case.roles(*SENSORS).items()
+    shown = case.roles(*schema.SENSORS).items()
     channels = {name: item for name, item in shown if not item.is_flux}
     if len(case.mesh.p) != 1 or not channels or any(item.at is None for item in channels.values()):
         return []
@@ -405,7 +381,7 @@ def initial_errors(case: CaseContent, first: Sample) -> tuple[Any, ...]:
     if _made_of_readings(case):
         known = dict(zip(*_level(_initial_readings(case, first)), strict=True))
     with case.located("initial", SpaceError):
-        return random_field(case.mesh, std, known=known, length=length)
+        return fem.random_field(case.mesh, std, known=known, length=length)
 
 
 def check_initial(case: CaseContent) -> None:
@@ -466,7 +442,7 @@ def _initial_readings(case: CaseContent, first: Sample) -> list[_Reading]:
 
 def expanded(case: CaseContent) -> CaseContent:
     """Return the case with every family of channels, `each` or `positions`, as single ones."""
-    channels: dict[str, ChannelSpec] = {}
+    channels: dict[str, schema.ChannelSpec] = {}
     for name, channel in case.spec.channels.items():
         if channel.each is not None:
             key, members = f"channels.{name}.each", _evenly(case, name, channel)
@@ -480,11 +456,13 @@ def expanded(case: CaseContent) -> CaseContent:
                 raise case.error(key, f"there is a channel '{label}' already; rename it.")
             member = {"each": None, "positions": None, "at": at, "column": column}
             channels[label] = channel.model_copy(update=member)
-    spec: CaseSpec = case.spec.model_copy(update={"channels": channels})
+    spec: schema.CaseSpec = case.spec.model_copy(update={"channels": channels})
     return CaseContent(case.path, spec, case.equation, case.reader)
 
 
-def _evenly(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+def _evenly(
+    case: CaseContent, name: str, channel: schema.ChannelSpec
+) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a row with even distances."""
     start, stop, count = channel.each or (0.0, 0.0, 0)
     unit, key = case.equation.length_unit, f"channels.{name}.each"
@@ -497,7 +475,9 @@ def _evenly(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tup
     }
 
 
-def _listed(case: CaseContent, name: str, channel: ChannelSpec) -> dict[str, tuple[Any, str]]:
+def _listed(
+    case: CaseContent, name: str, channel: schema.ChannelSpec
+) -> dict[str, tuple[Any, str]]:
     """Return place and column of each sensor of a table of positions."""
     key, file = f"channels.{name}.positions", case.path.parent / str(channel.positions)
     table = _positions_table(case, key, file)
@@ -545,18 +525,18 @@ def _coordinate(case: CaseContent, cell: str, where: str) -> float:
     return number
 
 
-def unknowns_of(case: CaseContent) -> dict[str, Unknown]:
+def unknowns_of(case: CaseContent) -> dict[str, fem.Unknown]:
     """Return the unknowns of the sensors: offset, gain, position, correlated: numbers for each."""
     state = case.equation.state.unit
-    found: dict[str, Unknown] = {}
+    found: dict[str, fem.Unknown] = {}
     # Differences of a temperature are in K.
     unit = "K" if state == "degC" else state
     if offsets := _stated(case, "offset", "sensor"):
-        prior = Normal(0.0, _common(case, offsets, "offset"))
-        found["offset"] = Scalars(tuple(offsets), prior, unit=unit)
+        prior = fem.Normal(0.0, _common(case, offsets, "offset"))
+        found["offset"] = fem.Scalars(tuple(offsets), prior, unit=unit)
     # A gain is a factor without a unit, 1 for an exact sensor.
     if gains := _stated(case, "gain", "sensor", unit=""):
-        found["gain"] = Scalars(tuple(gains), Normal(1.0, _common(case, gains, "gain")))
+        found["gain"] = fem.Scalars(tuple(gains), fem.Normal(1.0, _common(case, gains, "gain")))
     if stds := _shifted(case):
         places = {name: case.spec.channels[name].at for name in stds}
         names = [
@@ -564,13 +544,13 @@ def unknowns_of(case: CaseContent) -> dict[str, Unknown]:
             for name, at in places.items()
             for shift in shift_names(name, len(at) if isinstance(at, tuple) else 1)
         ]
-        prior = Normal(0.0, _common(case, stds, "at_std"))
-        found[POSITION] = Scalars(names, prior, unit=case.equation.length_unit)
+        prior = fem.Normal(0.0, _common(case, stds, "at_std"))
+        found[POSITION] = fem.Scalars(names, prior, unit=case.equation.length_unit)
     if errors := _correlated(case):
         std, time = _common(case, errors, "correlated")
         # An Ornstein-Uhlenbeck process: stationary standard deviation and correlation time.
-        prior, fades = Normal(0.0, std), MeanReverting(time)
-        found["correlated"] = Scalars(tuple(errors), prior, unit=unit, evolution=fades)
+        prior, fades = fem.Normal(0.0, std), fem.MeanReverting(time)
+        found["correlated"] = fem.Scalars(tuple(errors), prior, unit=unit, evolution=fades)
     return found
 
 
@@ -613,8 +593,8 @@ def _common(case: CaseContent, given: Mapping[str, Any], key: str) -> Any:
 
 
 def _calibrated(
-    case: CaseContent, base: Observation, names: Sequence[str], **options: Any
-) -> Observation:
+    case: CaseContent, base: observation.Observation, names: Sequence[str], **options: Any
+) -> observation.Observation:
     """Return the readings: gain * (reading of the base) + offset + correlated."""
     channels = [case.spec.channels[name] for name in names]
     gains = [(k, n) for k, n in enumerate(names) if channels[k].gain is not None]
@@ -638,4 +618,4 @@ def _calibrated(
         slopes = np.array([q.gain[n] if c.gain is not None else 1.0 for n, c in known])
         return slopes, columns | {f"gain[{name}]": y[k] * units[k] for k, name in gains}
 
-    return Calibrated(base, reading, derivatives, **options)
+    return observation.Calibrated(base, reading, derivatives, **options)

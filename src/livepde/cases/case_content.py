@@ -14,17 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from livepde import fem
 from livepde.cases.read import beside, did_you_mean
 from livepde.cases.schema import CaseSpec, ChannelSpec
 from livepde.errors import CaseError, LivepdeError, SpaceError
-from livepde.fem import (
-    grid,
-    interval,
-    line,
-    linear,
-    read_mesh,
-    rectangle,
-)
 from livepde.linalg import Array
 from livepde.model import Model
 from livepde.models import EQUATIONS, Equation, Fluxes, Option, Variable
@@ -64,13 +57,41 @@ class CaseContent:
 
     @cached_property
     def mesh(self) -> Any:
-        """The mesh."""
-        return _mesh_of(self)
+        """The mesh: from a file, or a line or rectangle of nodes or cells."""
+        spec, unit = self.spec.mesh, self.equation.length_unit
+        if spec.file is not None:
+            scale = conversion(spec.unit or unit, unit, self.where("mesh.unit")).factor
+            with self.located("mesh.file", SpaceError):
+                return fem.read_mesh(self.path.parent / spec.file, scale)
+        if spec.nodes is not None:
+            nodes = [self.convert(node, unit, "mesh.nodes") for node in spec.nodes]
+            with self.located("mesh.nodes", SpaceError):
+                return fem.line(nodes)
+        if spec.x is not None and spec.y is not None:
+            return _rectangle(self, spec.x, spec.y)
+        return _interval(self)
 
     @cached_property
     def options(self) -> dict[str, Any]:
         """Options of the equation: numbers in its units, text and booleans."""
-        return _options_of(self)
+        known, given = self.equation.options, self.spec.options
+        self.only(given, known, "options")
+        values: dict[str, Any] = {}
+        for name, option in known.items():
+            key = f"options.{name}"
+            if name == self.equation.storage and name in self.spec.unknowns:
+                if name in given:
+                    raise self.error(key, f"unknowns.{name} is stated, too; keep one of the two.")
+                continue
+            if name in given:
+                values[name] = _option_value(self, option, given[name], key)
+            elif option.default is not None:
+                values[name] = option.default
+            else:
+                unit = f", in {option.unit}" if option.unit else ""
+                choices = f": one of {', '.join(option.choices)}" if option.choices else ""
+                raise self.missing(key, f"the {option.text}{unit}{choices}.")
+        return values
 
     def error(self, key: str, text: str) -> CaseError:
         """Return an error that names file and key."""
@@ -142,22 +163,6 @@ class CaseContent:
         return self.equation.state.unit
 
 
-def _mesh_of(case: CaseContent) -> Any:
-    """Return the mesh of a case: from a file, or a line or rectangle of nodes or cells."""
-    spec, unit = case.spec.mesh, case.equation.length_unit
-    if spec.file is not None:
-        scale = conversion(spec.unit or unit, unit, case.where("mesh.unit")).factor
-        with case.located("mesh.file", SpaceError):
-            return read_mesh(case.path.parent / spec.file, scale)
-    if spec.nodes is not None:
-        nodes = [case.convert(node, unit, "mesh.nodes") for node in spec.nodes]
-        with case.located("mesh.nodes", SpaceError):
-            return line(nodes)
-    if spec.x is not None and spec.y is not None:
-        return _rectangle(case, spec.x, spec.y)
-    return _interval(case)
-
-
 def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | str]) -> Any:
     """Return a rectangle: of the nodes on two sides, or of their ends and numbers of cells."""
     spec, unit = case.spec.mesh, case.equation.length_unit
@@ -168,13 +173,13 @@ def _rectangle(case: CaseContent, x: Iterable[float | str], y: Iterable[float | 
     if not isinstance(spec.cells, tuple):
         _check_cells(float(len(sides[0])) * len(sides[1]), case.where("mesh"))
         with case.located("mesh", SpaceError):
-            return grid(*sides)
+            return fem.grid(*sides)
     _check_cells(float(spec.cells[0]) * spec.cells[1], case.where("mesh.cells"))
     with case.located("mesh", SpaceError):
         if isinstance(spec.spacing, tuple):
             return _graded(case, sides, spec.cells, [one == "geometric" for one in spec.spacing])
         (x0, x1), (y0, y1) = sides
-        return rectangle((x0, x1), (y0, y1), spec.cells)
+        return fem.rectangle((x0, x1), (y0, y1), spec.cells)
 
 
 def _interval(case: CaseContent) -> Any:
@@ -190,12 +195,12 @@ def _interval(case: CaseContent) -> Any:
     _check_graded(case, start, geometric)
     # The nodes nearest to ends of layers move there, because a jump of an unknown inside of a cell
     # would be blurred. If two ends share a nearest node, the second becomes a node of its own.
-    plain = interval(start, stop, cells, geometric=geometric)
+    plain = fem.interval(start, stop, cells, geometric=geometric)
     edges = [edge for _, edge in _layer_edges(case)]
     through = _fitted(plain.p[0], edges)
-    mesh = interval(start, stop, cells, geometric=geometric, through=through)
+    mesh = fem.interval(start, stop, cells, geometric=geometric, through=through)
     own = {edge for edge in edges if _inside(mesh.p[0], edge)} - set(through)
-    return line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
+    return fem.line(sorted({*mesh.p[0].tolist(), *own})) if own else mesh
 
 
 def _graded(
@@ -208,8 +213,8 @@ def _graded(
     nodes = []
     for (start, stop), number, geometric in zip(sides, cells, graded, strict=True):
         _check_graded(case, start, geometric)
-        nodes.append(interval(start, stop, number, geometric=geometric).p[0])
-    return grid(*nodes)
+        nodes.append(fem.interval(start, stop, number, geometric=geometric).p[0])
+    return fem.grid(*nodes)
 
 
 def _check_graded(case: CaseContent, start: float, geometric: bool) -> None:
@@ -306,28 +311,6 @@ def sides_of(case: CaseContent, given: Any, dimension: int, key: str) -> list[tu
     return [case.pair((given[k], given[k + 1]), unit, key) for k in range(0, len(given), 2)]
 
 
-def _options_of(case: CaseContent) -> dict[str, Any]:
-    """Return the options of the equation: numbers in its units, text and booleans."""
-    known, given = case.equation.options, case.spec.options
-    case.only(given, known, "options")
-    values: dict[str, Any] = {}
-    for name, option in known.items():
-        key = f"options.{name}"
-        if name == case.equation.storage and name in case.spec.unknowns:
-            if name in given:
-                raise case.error(key, f"unknowns.{name} is stated, too; keep one of the two.")
-            continue
-        if name in given:
-            values[name] = _option_value(case, option, given[name], key)
-        elif option.default is not None:
-            values[name] = option.default
-        else:
-            unit = f", in {option.unit}" if option.unit else ""
-            choices = f": one of {', '.join(option.choices)}" if option.choices else ""
-            raise case.missing(key, f"the {option.text}{unit}{choices}.")
-    return values
-
-
 def _option_value(case: CaseContent, option: Option, value: Any, key: str) -> Any:
     if option.kind is float and not isinstance(value, bool):
         return case.convert(value, option.unit, key)
@@ -373,7 +356,7 @@ def _plain(name: str, function: Any, spec: CaseSpec, where: str) -> Equation:
         inputs=_variables(inputs | dict.fromkeys(spec.inputs, "")),
         options={key: _option(value) for key, value in spec.options.items()},
         build=_checked(name, function, where),
-        element=linear,
+        element=fem.linear,
         fluxes=Fluxes("", "", ""),
     )
 
@@ -422,10 +405,7 @@ def load_code(name: str, folder: Path, where: str, expected: str, allowed: bool)
 
     `where` and `expected` are for messages: file and key, and the signature of the function.
 
-    Raises
-    ------
-    CaseError
-        Not allowed, not found, or it fails while it is loaded.
+    Raises `CaseError`: not allowed, not found, or it fails while it is loaded.
     """
     source, colon, attribute = name.rpartition(":")
     if not colon:

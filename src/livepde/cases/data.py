@@ -125,10 +125,7 @@ def delays(case: CaseContent) -> dict[str, float]:
 def refuse_late(case: CaseContent) -> None:
     """Refuse late channels of a live source.
 
-    Raises
-    ------
-    CaseError
-        A channel states how late it is.
+    Raises `CaseError`: a channel states how late it is.
     """
     for name in delays(case):
         raise case.error(f"channels.{name}.late", LATE)
@@ -165,7 +162,7 @@ def _read(path: Path, columns: Mapping[str, Column], clock: Clock, spec: DataSpe
     if path.suffix in JSON_LINES:
         return read_json_lines(path, columns, clock, **rows)
     if path.suffix == ".parquet":
-        from livepde.streams.parquet import read_parquet
+        from livepde.streams.table import read_parquet
 
         return read_parquet(path, columns, clock, **rows)
     written: dict[str, Any] = {
@@ -486,12 +483,9 @@ def _server(
 def passwords_of(case: CaseContent, own: bool, allowed: Iterable[str]) -> dict[str, str]:
     """Return the passwords of a case by the key of their connection, before any is opened.
 
-    Parameters
-    ----------
-    own
-        Whether the case's own source is used.
-    allowed
-        Environment variables that may be sent, besides those whose names begin with LIVEPDE_.
+    `own`: whether the case's own source is used.
+    `allowed`: environment variables that may be sent, besides those whose names begin with
+    LIVEPDE_.
     """
     spec, allowed = case.spec, set(allowed)
     sources = {"data.mqtt": spec.data.mqtt, "data.opcua": spec.data.opcua} if own else {}

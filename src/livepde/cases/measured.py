@@ -99,19 +99,11 @@ def measured(
 ) -> Measured:
     """Read a CSV file of which nothing is known.
 
-    Parameters
-    ----------
-    time_unit
-        The unit of time of the equation.
-    time_format
-        Of dates; empty: found from the cells.
-    skip
-        Lines before the header; None: found from the lines.
-
-    Raises
-    ------
-    DataError
-        There is no such file, or it is no table of times and measurements; one sentence.
+    `time_unit`: the unit of time of the equation.
+    `time_format`: of dates; empty: found from the cells.
+    `skip`: lines before the header; None: found from the lines.
+    Raises `DataError`: there is no such file, or it is no table of times and measurements; one
+    sentence.
     """
     if table.suffix in (*JSON_LINES, ".parquet"):
         raise SampleError(f"{table}: expected a CSV file with a header.")

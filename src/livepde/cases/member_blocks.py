@@ -149,7 +149,12 @@ class MemberBlock:
                     self.status, self.error = "failed", error
                     break
                 if self._kept.size > WAITING:
-                    self._write_all()
+                    for k in range(len(self._each)):
+                        identifier = self.fleet.identifier(k)
+                        with self._journal(k, identifier) as journal:
+                            self._write(k, journal, identifier)
+                    self._kept.clear()
+                    self._written = self._taken
 
     def _step(self, t: float) -> None:
         rows = np.array([table.values[self._taken] for table in self._tables])
@@ -160,14 +165,6 @@ class MemberBlock:
             status = estimate.statuses[k]
             event = Event(float(self.fleet.t[k]), status.code, "", str(status))
             self._events[k].append(event)
-
-    def _write_all(self) -> None:
-        for k in range(len(self._each)):
-            identifier = self.fleet.identifier(k)
-            with self._journal(k, identifier) as journal:
-                self._write(k, journal, identifier)
-        self._kept.clear()
-        self._written = self._taken
 
     def _journal(self, k: int, identifier: Identifier) -> Journal:
         """Return the journal of a member: all of them at once would be too many open files."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
@@ -12,16 +13,49 @@ from typing import Any
 
 import numpy as np
 
-from livepde.cases.json_schema import SCHEMA_FILE, case_schema
+from livepde.cases import schema as tables
 from livepde.cases.measured import IN_BRACKETS, Measured, measured, unit_in
 from livepde.cases.read import BLANK, beside, toml_line
-from livepde.cases.schema import DataSpec
+from livepde.cases.schema import CaseSpec, DataSpec
 from livepde.errors import RunError
 from livepde.fem import Channel, Normal, interval
 from livepde.linalg import Array
 from livepde.models import EQUATIONS, Equation, Variable, heat
 from livepde.stepping import Advance, Alexander2, simulate
 from livepde.streams.oddities import sentinels, switches
+
+SCHEMA_FILE = "livepde.schema.json"  # beside a case that `livepde init` writes
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+MEANINGS: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_name("keys.toml").read_text(encoding="utf-8")
+)
+"""Class of a table -> key -> meaning, with the unit of a number."""
+
+
+def case_schema() -> dict[str, Any]:
+    """Return the JSON schema of a case file, with the meaning and the default of each key."""
+    schema = CaseSpec.model_json_schema(by_alias=True)
+    for name, table in [("CaseSpec", schema), *schema["$defs"].items()]:
+        summary, meanings = documented(table.get("description", ""))
+        table["description"] = summary
+        for base in reversed(getattr(tables, name).__mro__):
+            meanings |= MEANINGS.get(base.__name__, {})
+        for key, value in table["properties"].items():
+            if key in meanings:
+                value["description"] = meanings[key]
+    return {"$schema": DIALECT, **schema, "title": "A case of livepde"}
+
+
+def documented(text: str) -> tuple[str, dict[str, str]]:
+    """Return the summary of a docstring, and parameter -> its meaning.
+
+    Options of a law are documented where they are declared, and only there.
+    """
+    summary = text.partition("\n\n")[0].replace("\n", " ")
+    listed = re.search(r"^Parameters\n-+\n(.*?)(?:\n\n|\Z)", text, flags=re.DOTALL | re.MULTILINE)
+    items = re.findall(r"^(\w+)\n((?: +.*\n?)+)", listed[1] if listed else "", flags=re.MULTILINE)
+    return summary, {name: " ".join(meaning.split()) for name, meaning in items}
+
 
 # T_5cm, depth 0.05 m; not m3/h, nor -0.5 m, whose sign may be a hyphen
 PLACE = re.compile(r"(?<![\d.,-])(\d+(?:[.,]\d+)?)[ _]?(mm|cm|m|ft)(?![A-Za-z\d/^²³])")
@@ -46,53 +80,7 @@ ENDS = """\
 # A measured value at a boundary: role = "boundary", at = its name. Other boundaries are closed."""
 TRUE_ALPHA = 9.7e-5  # aluminium; m^2/s
 NOISE = 0.05
-CASE = """\
-# Numbers are in the model's units (m, s, degC). Text such as "40 cm" is converted.
-# For your own data: 'livepde init DIR --data FILE.csv' writes a case from the table.
-title = "A metal rod, heated and cooled at its left end"
-equation = "heat"              # u_t = div(alpha grad u); also: borehole, reaction_diffusion,
-                               # or your own: "file.py:function" (run it with --allow-code)
-initial = "interpolate"        # from the first sample; or a number such as "20 degC"
-
-[mesh]
-from = 0
-to = "40 cm"
-cells = 40                     # for a rectangle: x = [0, 1], y = [0, 1], cells = [20, 20]
-
-[data]
-file = "rod.csv"               # relative to this file; may contain ${{LIVEPDE_DATA}}
-time = "time_s"                # the column of times: numbers, or dates (2025-04-01 12:00)
-time_unit = "s"
-# dates as 01.04.2025 12:00: time_format = "%d.%m.%Y %H:%M", zone = "Europe/Berlin"
-# written by a German Excel: separator = ";", decimal = ",", encoding = "cp1252"
-# start, stop, assimilate_from = "10 min"; every = 2 keeps every second row; missing = [-9999]
-
-[unknowns.alpha]               # an unknown of the equation
-prior = "5e-5 m^2/s"           # best guess before seeing data
-std = "3e-5 m^2/s"             # its standard deviation
-bounds = ["1e-6 m^2/s", "1e-3 m^2/s"]
-# by layer:  regions = {{ left = [0, "20 cm"], right = ["20 cm", "40 cm"] }}
-# as a field: field = true, length = "10 cm"   (and no bounds)
-
-[channels]                     # name = {{ role, column, ... }}; unit = "degF": that of the column
-T_left = {{ role = "boundary", column = "T_left", at = "left" }}
-T_10 = {{ role = "sensor", column = "T_10", at = "10 cm", noise = "0.05 K" }}
-T_20 = {{ role = "validation", column = "T_20", at = "20 cm" }}    # only scored
-T_30 = {{ role = "sensor", column = "T_30", at = "30 cm", noise = "0.05 K" }}
-T_right = {{ role = "boundary", column = "T_right", at = "right" }}
-
-[law]
-kind = "sensitivity"           # for few, noisy sensors; "gradient" for observed subdomains
-# drift = "0.1 1/h"            # if the unknowns change slowly
-
-[steps]
-scheme = "alexander2"          # second order; or "implicit-euler"
-dt_max = "20 s"                # longer intervals between samples are divided
-
-[expect]                       # results for these data: remove it, or adapt it to yours
-alpha = [9e-5, 1.05e-4]        # the rod's data were made with 9.7e-05 m^2/s
-rmse = "<= 0.15"           # its noise is 0.05 K; the rest is learning
-"""
+ROD = Path(__file__).with_name("rod.toml")  # the case of the data that are made up
 
 
 @dataclass(frozen=True)
@@ -427,16 +415,13 @@ def write_template(
 
     The case is for a table of measurements, or else for made-up data that are written beside it.
 
-    Raises
-    ------
-    RunError
-        A file that would be written is there already, or the folder is none or cannot be written.
-    DataError
-        The table cannot be used as it is.
+    Raises `RunError`: a file that would be written is there already, or the folder is none or
+    cannot be written.
+    Raises `DataError`: the table cannot be used as it is.
     """
     if table is None:
         check_free(folder, ["rod.csv", "case.toml"])  # before the simulation, which takes a while
-        text = (HEAD + CASE).format(case=folder / "case.toml")
+        text = HEAD.format(case=folder / "case.toml") + ROD.read_text(encoding="utf-8")
         write_files(folder, {"rod.csv": _measurements(), "case.toml": text})
         return folder / "case.toml", folder / "rod.csv"
     check_free(folder, ["case.toml"])

@@ -10,27 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from livepde import fem
 from livepde.cases.case_channels import unknowns_of
 from livepde.cases.case_content import CaseContent, inside, off_nodes, sides_of, subdomain
 from livepde.cases.read import did_you_mean
 from livepde.cases.schema import BoundarySpec, ChannelSpec, EvolutionSpec, UnknownSpec
 from livepde.errors import CaseError, ModelError, NameClashError, SpaceError
-from livepde.fem import (
-    Channel,
-    Evolution,
-    Field,
-    LogitNormal,
-    LogNormal,
-    MeanReverting,
-    Normal,
-    Periodic,
-    Piecewise,
-    Prior,
-    RandomWalk,
-    Scalar,
-    Sobolev,
-    linear,
-)
 from livepde.fem.field_blocks import base_name
 from livepde.model import Model
 from livepde.models import Exchange, Flux, Fluxes, Source, Variable, with_conditions
@@ -102,7 +87,7 @@ def _dirichlet(case: CaseContent) -> dict[str, Any]:
         case.require(at, known, key, f"no boundary '{at}'")
         if at in values:
             raise case.error(key, f"the boundary '{at}' has a value already; keep one.")
-        values[at] = Channel(name)
+        values[at] = fem.Channel(name)
     return values
 
 
@@ -124,7 +109,7 @@ def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
         if spec.field:
             return _field(case, spec, name, options)
         if spec.regions is None:
-            return Scalar(**options, corrects=name in map(_offset_label, _shifted(case)))
+            return fem.Scalar(**options, corrects=name in map(_offset_label, _shifted(case)))
         places = {region: item.over for region, item in spec.regions.items()}
         regions = _regions(case, places, f"{key}.regions")
         # A region may state a prior of its own; the others share that of the unknown.
@@ -133,8 +118,8 @@ def _unknown(case: CaseContent, name: str, spec: UnknownSpec) -> Any:
             if (there := spec.at(item)) is not None:
                 where = f"{key}.regions.{region}"
                 with case.located(where, SpaceError):
-                    own[region] = Scalar(**_options_of(case, there, unit, where))
-        return Piecewise(regions, **options, own=own)
+                    own[region] = fem.Scalar(**_options_of(case, there, unit, where))
+        return fem.Piecewise(regions, **options, own=own)
 
 
 def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> dict[str, Any]:
@@ -146,7 +131,7 @@ def _options_of(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> di
     return options
 
 
-def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> Prior:
+def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> fem.Prior:
     """Return the prior in the model's unit."""
     rule = conversion(spec.unit or unit, unit, case.where(f"{key}.unit"))
 
@@ -174,7 +159,7 @@ def _prior(case: CaseContent, spec: UnknownSpec, unit: str, key: str) -> Prior:
             text = f"the prior {prior:g} is outside the bounds [{low:g}, {high:g}] {unit}"
             raise case.error(key, f"{text.rstrip()}; widen them, or check the unit of the prior.")
     if spec.transform is None:
-        return Normal(prior, std, (low, high))
+        return fem.Normal(prior, std, (low, high))
     return _transformed(case, spec.transform, prior, std, (low, high), key)
 
 
@@ -185,7 +170,7 @@ def _transformed(
     std: float,
     bounds: tuple[float, float],
     key: str,
-) -> Prior:
+) -> fem.Prior:
     """Return the prior of an unknown with a transform; errors name the keys of the case."""
     low, high = bounds
     if transform == "log":
@@ -197,25 +182,25 @@ def _transformed(
     if not low < median < high:
         text = f"prior {median} is outside the range of transform='{transform}'; move it "
         raise case.error(key, text + "inside the bounds.")
-    return (LogNormal if transform == "log" else LogitNormal)(median, std, (low, high))
+    return (fem.LogNormal if transform == "log" else fem.LogitNormal)(median, std, (low, high))
 
 
 def _evolution(
     case: CaseContent, unknown: UnknownSpec, spec: EvolutionSpec, unit: str, key: str
-) -> Evolution:
+) -> fem.Evolution:
     """Return the evolution of an unknown; a rate is a standard deviation after one unit of time."""
     time = case.equation.time_unit
     if spec.rate is not None:
         # A rate is a difference, of the logarithm under a transform; "degC" cannot be divided.
         moving = "1" if unknown.transform or not unit else unit.replace("degC", "K")
         per = f"({moving})/({time})**0.5" if time else moving.removeprefix("1")
-        return RandomWalk(case.positive(spec.rate, per, f"{key}.rate"))
+        return fem.RandomWalk(case.positive(spec.rate, per, f"{key}.rate"))
     if spec.time is not None:
-        return MeanReverting(case.positive(spec.time, time, f"{key}.time"))
-    return Periodic(case.positive(spec.period, time, f"{key}.period"), spec.harmonics)
+        return fem.MeanReverting(case.positive(spec.time, time, f"{key}.time"))
+    return fem.Periodic(case.positive(spec.period, time, f"{key}.period"), spec.harmonics)
 
 
-def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, Any]) -> Field:
+def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, Any]) -> fem.Field:
     mesh = case.mesh
     # Default correlation length: a third of the extent along x.
     third, key = float(np.ptp(mesh.p[0])) / 3, f"unknowns.{name}.length"
@@ -224,10 +209,10 @@ def _field(case: CaseContent, spec: UnknownSpec, name: str, given: Mapping[str, 
     # In one dimension the covariance is std^2 exp(-|x - y|/length) inside. In two and three the
     # pointwise variance of H^1 would be infinite, so that it takes H^2.
     dimension = len(mesh.p)
-    inner = Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
+    inner = fem.Sobolev(1 if dimension == 1 else 2, length).pointwise(dimension)
     # A transform acts on each coefficient, which in linear elements is the value at a node.
-    element = linear(mesh) if spec.transform else case.equation.element(mesh)
-    return Field(mesh, element, inner=inner, **given)
+    element = fem.linear(mesh) if spec.transform else case.equation.element(mesh)
+    return fem.Field(mesh, element, inner=inner, **given)
 
 
 def _regions(case: CaseContent, regions: Mapping[str, Any], key: str) -> dict[str, Any]:
@@ -451,7 +436,7 @@ def _near(names: _ConditionNames, name: str) -> list[Flux | Exchange]:
     dimension, cells = len(case.mesh.p), case.mesh.t.shape[1]
     cell = float(np.ptp(case.mesh.p, axis=1).max()) / cells ** (1.0 / dimension)
     h = HELD * D / cell
-    return [Exchange(h, Channel(name)), Flux(Multiple(label, -h))]
+    return [Exchange(h, fem.Channel(name)), Flux(Multiple(label, -h))]
 
 
 def _check_drive(case: CaseContent, storage: str) -> None:
@@ -511,7 +496,7 @@ class _ConditionNames:
             if spec.channels[value].role != "input":
                 raise self.case.error(key, f"the channel '{value}' has to be of role 'input'.")
             self._named(self.inputs, self.case.equation.inputs, value, unit, key)
-            return Channel(value)
+            return fem.Channel(value)
         # Text without a digit is no quantity: a name was meant.
         if isinstance(value, str) and not any(letter.isdigit() for letter in value):
             text = f"there is no unknown and no channel '{value}'; "

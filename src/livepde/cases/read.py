@@ -311,17 +311,11 @@ def parse(assignments: Iterable[str]) -> dict[str, Any]:
 def apply(document: Mapping[str, Any], settings: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Return a case's document with other values.
 
-    Parameters
-    ----------
-    settings
-        Key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A table
-        sets the keys in it and leaves the others; None takes the key away. A table for an unknown
-        or a channel that the case has not adds it.
-
-    Raises
-    ------
-    CaseError
-        A key that is none, or an unknown, a channel or a key to take away that the case has not.
+    `settings`: key as the file would have it, 'law.noise' or 'unknowns.k.regions."0-1"' -> value. A
+    table sets the keys in it and leaves the others; None takes the key away. A table for an unknown
+    or a channel that the case has not adds it.
+    Raises `CaseError`: a key that is none, or an unknown, a channel or a key to take away that the
+    case has not.
     """
     changed = copy.deepcopy(dict(document))
     for key, given in settings.items():

@@ -553,8 +553,7 @@ def _kind(value: Any) -> Any:
 
 
 Law: TypeAlias = Annotated[
-    Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")],
-    BeforeValidator(_kind),
+    Annotated[SensitivitySpec | GradientSpec, Field(discriminator="kind")], BeforeValidator(_kind)
 ]
 
 

@@ -8,13 +8,7 @@ from collections.abc import Mapping
 from datetime import date, datetime
 from typing import Annotated, Any, TypeAlias
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    GetJsonSchemaHandler,
-    WithJsonSchema,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, WithJsonSchema
 from pydantic_core import CoreSchema
 
 from livepde.diagnostics.check_report import Bound, Sense
@@ -30,10 +24,7 @@ def _quantity(value: Any) -> Any:
 class Also:
     """Short forms that a validator accepts as well, for the JSON schema.
 
-    Parameters
-    ----------
-    schemas
-        Their JSON schemas.
+    `schemas`: their JSON schemas.
     """
 
     def __init__(self, *schemas: dict[str, Any]) -> None:

@@ -14,7 +14,7 @@ from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import freed, with_settings
+from livepde.cases.remedies import PLACE, freed, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.plots.style import modes_told
@@ -37,7 +37,6 @@ GAINED = 3.0  # of log evidence: strong evidence (Kass and Raftery 1995), 20 to 
 SAME = 1e-9  # of the length of a run: times that differ by less are one moment
 WORSE = 0.02  # share by which the error of validation sensors may grow: about its own error
 MOST = 12  # variants that the program chooses
-PLACE = 0.01  # of the length of the domain: how far off a sensor may be
 SAMPLES = 64  # in which a source moves the state by the usual error
 NAMES = {  # kind of cause -> name of the variant
     "offset": "offset of {}",
@@ -85,24 +84,16 @@ class LastEstimate:
 class VariantRun:
     """How the run of a variant ended.
 
-    Attributes
-    ----------
-    log_evidence
-        `Result.log_evidence` of all readings that it assimilates, as a density in the unit of the
-        data: variants with another unit of a sensor are comparable.
-    readings
-        Sensor that it assimilates -> number of the readings that are assimilated.
-    same_readings
-        Log evidence of the case itself with these readings, NaN if it has not all of them; None if
-        they are those of the case, since no late channel leaves some out.
-    misfits
-        Sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its errors
-        one step ahead, second half of the samples.
-    errors, validation
-        Assimilated and validation sensor -> root mean square of its errors one step ahead, second
-        half of the samples.
-    unknowns
-        How many numbers were unknown; of a field the number of modes.
+    `log_evidence`: `Result.log_evidence` of all readings that it assimilates, as a density in the
+    unit of the data: variants with another unit of a sensor are comparable.
+    `readings`: sensor that it assimilates -> number of the readings that are assimilated.
+    `same_readings`: log evidence of the case itself with these readings, NaN if it has not all of
+    them; None if they are those of the case, since no late channel leaves some out.
+    `misfits`: sensor -> its misfit over noise, as `ModelErrors` has it. Without a fit that of its
+    errors one step ahead, second half of the samples.
+    `errors`, `validation`: assimilated and validation sensor -> root mean square of its errors one
+    step ahead, second half of the samples.
+    `unknowns`: how many numbers were unknown; of a field the number of modes.
     """
 
     variant: Variant

@@ -212,7 +212,7 @@ def schema() -> None:
 
     Example:  livepde schema > livepde.schema.json
     """
-    from livepde.cases.json_schema import case_schema
+    from livepde.cases.new_case import case_schema
 
     text = json.dumps(case_schema(), indent=1, ensure_ascii=False)
     terminal().print(text, markup=False, highlight=False, soft_wrap=True)

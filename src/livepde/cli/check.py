@@ -25,14 +25,12 @@ MOST_CHANNELS = 40  # rows of the table of channels
 def check(
     case: CaseArgument,
     data: Annotated[
-        str | None,
-        option("Use this data instead of the case's (.csv, .jsonl, .parquet)."),
+        str | None, option("Use this data instead of the case's (.csv, .jsonl, .parquet).")
     ] = None,
     allow_code: CodeOption = False,
     settings: SetOption = None,
     advise: Annotated[
-        bool,
-        typer.Option("--advise", help="Recommend a position for one more point sensor."),
+        bool, typer.Option("--advise", help="Recommend a position for one more point sensor.")
     ] = False,
 ) -> None:
     """Check a case and its data, and which unknowns its sensors can identify.

@@ -15,9 +15,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from livepde.cli.options import CodeOption, JsonOption, SetOption, argument, load_case, option
+from livepde.cli.options import (
+    CodeOption,
+    JsonOption,
+    SetOption,
+    argument,
+    load_case,
+    of_a_run,
+    option,
+)
 from livepde.cli.printing import present
-from livepde.errors import CaseError, ConfigurationError, RunError
+from livepde.errors import ConfigurationError, RunError
 
 if TYPE_CHECKING:
     from livepde.cases.variants import LastEstimate, Variant, VariantRun
@@ -61,8 +69,7 @@ def compare(
         bool, typer.Option("--force", help="With --write: replace an existing file.")
     ] = False,
     figure: Annotated[
-        Path | None,
-        option("Draw the intervals of all variants to a figure.", metavar="FILE.png"),
+        Path | None, option("Draw the intervals of all variants to a figure.", metavar="FILE.png")
     ] = None,
     as_json: JsonOption = False,
     allow_code: CodeOption = False,
@@ -97,13 +104,8 @@ def compare(
         _check_target(write, case, force)
     if figure is not None:
         _check_figure(figure)
-    try:
+    with of_a_run(named != case):
         prepared = loaded.prepare(data)
-    except CaseError as error:
-        if named == case:
-            raise
-        moved = "The case has been moved or changed. Add --data FILE with its data."
-        raise RunError(f"{error} {moved}") from error
     run = partial(_run, case, settings, data=data, allow_code=allow_code)
     stated = Variant(AS_STATED)
     (base, *found) = _all(run, [stated, *given], jobs, as_json)

@@ -124,10 +124,7 @@ def reproduce(
         ),
     ] = None,
     as_json: JsonOption = False,
-    out: Annotated[
-        Path | None,
-        option("Keep dataset and figures in a new run directory."),
-    ] = None,
+    out: Annotated[Path | None, option("Keep dataset and figures in a new run directory.")] = None,
 ) -> None:
     """Run a published or stated experiment and compare it with its expected numbers.
 

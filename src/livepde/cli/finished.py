@@ -12,17 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from livepde.cli.options import (
-    CodeOption,
-    ForceOption,
-    JsonOption,
-    RunArgument,
-    SetOption,
-    argument,
-    load_case,
-    option,
-    prepare_again,
-)
+from livepde.cli import options
 from livepde.cli.printing import CHECK_FAILED, can_draw, figures_of, present, terminal
 from livepde.errors import ConfigurationError
 
@@ -33,7 +23,7 @@ PORT = 8050
 
 
 def report(
-    folder: RunArgument,
+    folder: options.RunArgument,
     theory: Annotated[
         bool,
         typer.Option(
@@ -45,8 +35,8 @@ def report(
     data: Annotated[
         str | None, typer.Option(help="With --theory: data of the run, if its case was moved.")
     ] = None,
-    as_json: JsonOption = False,
-    allow_code: CodeOption = False,
+    as_json: options.JsonOption = False,
+    allow_code: options.CodeOption = False,
 ) -> None:
     """Print the tables of a run, and write its figures into the run directory.
 
@@ -96,7 +86,7 @@ def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: boo
     """Process the samples of a run again; print and write the theory report."""
     from livepde.diagnostics import theory_report
 
-    prepared = prepare_again(opened, data, allow_code)
+    prepared = options.prepare_again(opened, data, allow_code)
     found = theory_report(prepared.identifier, prepared.stream)
     target = opened.path / "theory.md"
     target.write_text(found.markdown(f"Theory: {opened.title}"), encoding="utf-8")
@@ -106,19 +96,21 @@ def _report_theory(opened: Any, data: str | None, as_json: bool, allow_code: boo
 
 
 def export(
-    folder: RunArgument,
+    folder: options.RunArgument,
     targets: Annotated[
         list[Path],
-        argument(
+        options.argument(
             "Files to write: .nc, .zarr, .csv, .parquet, .xdmf, .vtu, .vtk or .html.",
             metavar="TARGET...",
         ),
     ],
     at: Annotated[
         str | None,
-        option("Time of the fields in .vtu and .vtk: 3600, '1 h' or a date. Default: the last."),
+        options.option(
+            "Time of the fields in .vtu and .vtk: 3600, '1 h' or a date. Default: the last."
+        ),
     ] = None,
-    force: ForceOption = False,
+    force: options.ForceOption = False,
 ) -> None:
     """Convert a run, also an unfinished one, to formats of other programs.
 
@@ -186,21 +178,20 @@ class Standard(StrEnum):
 def fmu(
     source: Annotated[
         str,
-        argument(
+        options.argument(
             "The case file (TOML), or file.py:function or module:function that returns an "
             "Identifier.",
             metavar="CASE",
         ),
     ],
     out: Annotated[
-        Path | None,
-        option("File to write. Default: named after the case."),
+        Path | None, options.option("File to write. Default: named after the case.")
     ] = None,
     fmi: Annotated[Standard, typer.Option(help="Version of FMI: 2 or 3.")] = (Standard.two),
-    force: ForceOption = False,
-    as_json: JsonOption = False,
-    allow_code: CodeOption = False,
-    settings: SetOption = None,
+    force: options.ForceOption = False,
+    as_json: options.JsonOption = False,
+    allow_code: options.CodeOption = False,
+    settings: options.SetOption = None,
 ) -> None:
     """Export a case as a co-simulation unit (FMU) for Simulink, Modelica tools and others.
 
@@ -214,7 +205,7 @@ def fmu(
     code = is_code(source)
     if code and settings:
         raise ConfigurationError(f"--set requires a case file, but {source} is code.")
-    recipe = recipe_of(source if code else load_case(Path(source), allow_code, settings))
+    recipe = recipe_of(source if code else options.load_case(Path(source), allow_code, settings))
     process = recipe.process
     path = write_unit(recipe, out, fmi=2 if fmi is Standard.two else 3, force=force)
     inside = f"{len(process.inputs)} inputs, {len(process.outputs()) + 1} outputs"
@@ -228,14 +219,14 @@ def watch(
     ],
     address: Annotated[
         str,
-        option(
+        options.option(
             "Address to listen on. Default: port 8050, reachable from this machine only.",
             metavar="HOST:PORT",
         ),
     ] = "",
     token: Annotated[
         str,
-        option(
+        options.option(
             "Token that clients must send. If the address is reachable from other machines, a "
             "token is required, and generated if none is given.",
             envvar="LIVEPDE_TOKEN",

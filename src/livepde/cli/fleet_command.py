@@ -74,8 +74,7 @@ def fleet(
         ),
     ],
     out: Annotated[
-        Path | None,
-        option("Folder for the run directories. Default: a new one in runs/."),
+        Path | None, option("Folder for the run directories. Default: a new one in runs/.")
     ] = None,
     jobs: Annotated[
         int, typer.Option(min=-1, help="Number of processes. -1: one for each processor.")
@@ -88,8 +87,7 @@ def fleet(
         ),
     ] = None,
     resume: Annotated[
-        bool,
-        typer.Option("--resume", help="Resume the runs in --out, and start the missing ones."),
+        bool, typer.Option("--resume", help="Resume the runs in --out, and start the missing ones.")
     ] = False,
     separately: Annotated[
         bool,
@@ -255,6 +253,8 @@ class FleetRunner:
         self, rows: Sequence[Member]
     ) -> tuple[dict[str, Prepared], dict[str, MemberOutcome]]:
         """Return the members whose case and data could be read, and how the others ended."""
+        from livepde import runs
+
         ended: dict[str, MemberOutcome] = {}
         ready: dict[str, Prepared] = {}
         # Members with the same settings share a case, which is then read and checked only once.
@@ -265,7 +265,11 @@ class FleetRunner:
                     path = self.home / self.case
                     loaded[row.settings] = load_case(path, self.allow_code, self._own(row))
                 case = loaded[row.settings]
-                self._refuse_other(row, case)
+                target = self._target(row.name)
+                if self.resume and (target / runs.RECORD).exists():
+                    # A run to resume has to be one of this member.
+                    command = self._command(row)
+                    runs.open(target).refuse_other(command, case.text, self._own(row))
                 ready[row.name] = case.read(str(self.home / row.data) if row.data else None)
             except LivepdeError as error:
                 ended[row.name] = MemberOutcome(row.name, "failed", error=str(error))
@@ -321,15 +325,6 @@ class FleetRunner:
         command = ["livepde", "run", str(self.case), "--out", str(target)]
         command += ["--data", member.data] if member.data else []
         return command + [word for text in self._own(member) for word in ("--set", text)]
-
-    def _refuse_other(self, member: Member, case: Case) -> None:
-        """Raise `RunError` if there is a run to resume that is not a run of this member."""
-        from livepde import runs
-
-        target = self._target(member.name)
-        if self.resume and (target / runs.RECORD).exists():
-            run = runs.open(target)
-            run.refuse_other(self._command(member), case.text, self._own(member))
 
     def _writer(self, member: Member, case: Case) -> RunWriter:
         target, command = self._target(member.name), self._command(member)
@@ -477,12 +472,8 @@ def in_parts(
     A part whose worker died is run again; `run` has to resume from its run directories. Dask uses
     all workers of its cluster. `told` receives a sentence for each loss of a worker.
 
-    Raises
-    ------
-    ConfigurationError
-        joblib or the backend is not installed.
-    RunError
-        Workers died `ATTEMPTS` times in a row without a finished part in between.
+    Raises `ConfigurationError`: joblib or the backend is not installed.
+    Raises `RunError`: workers died `ATTEMPTS` times in a row without a finished part in between.
     """
     try:
         from joblib import Parallel, delayed, effective_n_jobs

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,10 +28,7 @@ def argument(text: str, **more: Any) -> Any:
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object. If a check fails, exit with code 1.")
 ]
-OutOption = Annotated[
-    Path | None,
-    option("Run directory to create. Default: a new one in runs/."),
-]
+OutOption = Annotated[Path | None, option("Run directory to create. Default: a new one in runs/.")]
 CodeOption = Annotated[
     bool,
     typer.Option(
@@ -82,14 +80,21 @@ def load_case(case: Path, allow_code: bool, settings: Sequence[str] | None) -> C
 
 def prepare_again(opened: Run, data: str | None, allow_code: bool) -> Prepared:
     """Read the case and the data of a run, with its settings."""
-    from livepde.errors import CaseError, RunError
-
     case = opened.case_file()
-    try:
+    with of_a_run(case.parent == opened.path):
         loaded = load_case(case, allow_code, opened.settings)
         return loaded.prepare(data or opened.data_file)
+
+
+@contextmanager
+def of_a_run(stored: bool) -> Iterator[None]:
+    """Raise an error of a case as one of its run, if the case is the one that the run stored."""
+    from livepde.errors import CaseError, RunError
+
+    try:
+        yield
     except CaseError as error:
-        if case.parent != opened.path:
+        if not stored:
             raise
         moved = "The case has been moved or changed. Add --data FILE with its data."
         raise RunError(f"{error} {moved}") from error

@@ -23,24 +23,7 @@ import typer
 from rich.markup import escape
 
 from livepde import __version__
-from livepde.cli.options import (
-    CaseArgument,
-    CodeOption,
-    EnvOption,
-    JsonOption,
-    OutOption,
-    SetOption,
-    load_case,
-    option,
-)
-from livepde.cli.printing import (
-    CHECK_FAILED,
-    INTERRUPTED,
-    can_draw,
-    figures_of,
-    present,
-    terminal,
-)
+from livepde.cli import options, printing
 from livepde.errors import ConfigurationError, DataError, LivepdeError
 
 if TYPE_CHECKING:
@@ -53,6 +36,7 @@ if TYPE_CHECKING:
     from livepde.result import Estimate
     from livepde.runs import Check, Driven, RunWriter, Table
     from livepde.runs.live_loop import Sink
+    from livepde.verdict import Verdict
 LOG = logging.getLogger("livepde.run")
 BEAT = 60.0  # seconds between two lines of the log that say how far a run is
 METRICS_PORT = 9100
@@ -66,15 +50,15 @@ class LogKind(StrEnum):
 
 
 def run(
-    case: CaseArgument,
+    case: options.CaseArgument,
     data: Annotated[
         str | None,
-        option(
+        options.option(
             "Use this data instead of the case's: a .csv, .jsonl or .parquet file, or - for JSON "
             "lines from standard input. If `data.follow` is set, the file is followed."
         ),
     ] = None,
-    out: OutOption = None,
+    out: options.OutOption = None,
     resume: Annotated[
         bool,
         typer.Option(
@@ -94,25 +78,29 @@ def run(
     ] = False,
     speed: Annotated[
         float | None,
-        option(
+        options.option(
             "Speed of the replay with --realtime, relative to the recorded times. inf: as fast as "
             "possible. Default: 1."
         ),
     ] = None,
     listen: Annotated[
         str | None,
-        option(
+        options.option(
             "Serve /livez, /readyz, /health and /metrics (Prometheus) at this address.",
             metavar="[HOST:]PORT",
         ),
     ] = None,
     watch: Annotated[
         str | None,
-        option("Serve the live page at this address during the run.", metavar="[HOST:]PORT"),
+        options.option(
+            "Serve the live page at this address during the run.", metavar="[HOST:]PORT"
+        ),
     ] = None,
     token: Annotated[
         str,
-        option("Token that clients of --listen and --watch must send.", envvar="LIVEPDE_TOKEN"),
+        options.option(
+            "Token that clients of --listen and --watch must send.", envvar="LIVEPDE_TOKEN"
+        ),
     ] = "",
     estimates: Annotated[
         bool,
@@ -121,10 +109,10 @@ def run(
         ),
     ] = False,
     log: Annotated[LogKind, typer.Option(help="Format of the log of a live run.")] = LogKind.text,
-    as_json: JsonOption = False,
-    allow_code: CodeOption = False,
-    allow_env: EnvOption = None,
-    settings: SetOption = None,
+    as_json: options.JsonOption = False,
+    allow_code: options.CodeOption = False,
+    allow_env: options.EnvOption = None,
+    settings: options.SetOption = None,
 ) -> None:
     """Estimate the unknowns of a case from its data, and write a run directory.
 
@@ -136,7 +124,7 @@ def run(
     """
     from livepde.runs.monitor import configure
 
-    loaded = load_case(case, allow_code, settings)
+    loaded = options.load_case(case, allow_code, settings)
     source = sys.stdin if data == "-" else data
     own = loaded.goes_on(data)
     goes_on = own or source is sys.stdin
@@ -162,9 +150,9 @@ def run(
     if not estimates:  # which are all that standard output is for then
         _report(loaded.title, folder, driven, found, as_json)
     if driven.status == "interrupted" and not live:  # a live run usually ends by a signal
-        raise typer.Exit(INTERRUPTED)
+        raise typer.Exit(printing.INTERRUPTED)
     if as_json and not all(item.ok for item in found.checks):
-        raise typer.Exit(CHECK_FAILED)
+        raise typer.Exit(printing.CHECK_FAILED)
 
 
 def _run_directory(loaded: Case, out: Path | None, resume: bool) -> Path:
@@ -202,7 +190,7 @@ def _refuse(how: LiveOptions, live: bool, as_json: bool) -> None:
 def _report(title: str, folder: Path, driven: Driven, found: Conclusion, as_json: bool) -> None:
     """Print the results of a run, and where they are."""
     where = escape(str(folder))
-    present(
+    printing.present(
         found.tables,
         found.checks,
         found.notes,
@@ -283,17 +271,7 @@ def concluded(
     draw: bool = True,
 ) -> Conclusion:
     """Write the results of a run, with figures if `draw`, and return them."""
-    from livepde.cases.remedies import with_settings
-    from livepde.runs import (
-        arrivals,
-        checks_of,
-        clock_findings,
-        input_findings,
-        sampling_findings,
-        tables,
-        verdict,
-        verdict_table,
-    )
+    from livepde.runs import arrivals, checks_of, tables, verdict_table
     from livepde.runs.directory import attempted
     from livepde.verdict import Verdict
 
@@ -304,20 +282,7 @@ def concluded(
     dataset = driven.journal.dataset() if ended is None else ended
     # The estimates are written first: they are safe if something below fails or takes long.
     writer.finish(status=driven.status, dataset=dataset, identifier=identifier, notes=loaded.notes)
-    driving = loaded.roles("boundary", "input")
-
-    def readings() -> tuple[Array, Array]:
-        raw, journal = prepared.raw, driven.journal
-        return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
-
-    def judged() -> Verdict:
-        found = [
-            *sampling_findings(dataset, readings),
-            *clock_findings(driven.journal),
-            *input_findings(driven.journal, driving),
-        ]
-        return with_settings(prepared, verdict(dataset).with_findings(found))
-
+    judged = partial(_judged, prepared, driven, dataset)
     found = attempted("The verdict", judged, Verdict.unjudged(), notes)
     dataset.attrs["verdict"] = json.dumps(found.to_dict())
     shown = [
@@ -338,8 +303,8 @@ def concluded(
     if driven.error is not None:
         notes.append(f"Stopped after {len(driven.result)} samples: {driven.error}")
     figures: dict[str, Any] = {}
-    if draw and can_draw(terminal(err=True)):
-        figures = figures_of(dataset, loaded.title, driven.journal)
+    if draw and printing.can_draw(printing.terminal(err=True)):
+        figures = printing.figures_of(dataset, loaded.title, driven.journal)
     writer.finish(
         status=driven.status,
         dataset=dataset,
@@ -350,6 +315,24 @@ def concluded(
         figures=figures,
     )
     return Conclusion(dataset, shown, checks, notes)
+
+
+def _judged(prepared: Prepared, driven: Driven, dataset: xr.Dataset) -> Verdict:
+    """Return the verdict on a run, with settings of the case that would remedy what was found."""
+    from livepde import runs
+    from livepde.cases.remedies import with_settings
+
+    raw, journal = prepared.raw, driven.journal
+
+    def readings() -> tuple[Array, Array]:
+        return journal.readings(journal.channels) if raw is None else (raw.t, raw.values)
+
+    found = [
+        *runs.sampling_findings(dataset, readings),
+        *runs.clock_findings(journal),
+        *runs.input_findings(journal, prepared.case.roles("boundary", "input")),
+    ]
+    return with_settings(prepared, runs.verdict(dataset).with_findings(found))
 
 
 def _with_smoothed(
@@ -405,12 +388,8 @@ def run_live(
 ) -> tuple[RunWriter, tuple[Prepared, Driven]]:
     """Run a case in its run directory until its source ends or a signal comes.
 
-    Parameters
-    ----------
-    write
-        Makes the run directory; called when the source is connected.
-    stack
-        Closes all opened resources, among them the journal, from which the result reads.
+    `write`: makes the run directory; called when the source is connected.
+    `stack`: closes all opened resources, among them the journal, from which the result reads.
     """
     from livepde.cases.live_case import LiveCase
     from livepde.runs import JOURNAL, conduct, stopped_by_signals
@@ -435,7 +414,7 @@ def run_live(
         if live is not None and wiring.prepared is not None:
             return writer, (wiring.prepared, conduct(live, patient=True))
     writer.finish(status="interrupted", notes=["Ended before the first sample."])
-    raise typer.Exit(INTERRUPTED)
+    raise typer.Exit(printing.INTERRUPTED)
 
 
 def _health(wiring: LiveCase) -> Mapping[str, Any]:

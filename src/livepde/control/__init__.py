@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from livepde.control.controllers import LQ, MPC
+from livepde.control.controllers import LQ, MPC, Controller, Decision, Goal, Known, Plan
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
 from livepde.control.galerkin import Discrete, Output
-from livepde.control.goal import Controller, Decision, Goal, Known, Plan
 from livepde.control.loop import Action, Loop
 from livepde.control.reduced import ReducedModel, reduce
 

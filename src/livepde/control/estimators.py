@@ -11,8 +11,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from livepde.checkpoint import packed, unpacked
+from livepde.control.controllers import Known
 from livepde.control.galerkin import Discrete
-from livepde.control.goal import Known
 from livepde.control.reduced import ReducedModel
 from livepde.errors import ConfigurationError, RunError, SampleError, TimeOrderError
 from livepde.identifier import Identifier

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from livepde import checkpoint
+from livepde.control.controllers import Controller, Decision, Known, Plan
 from livepde.control.estimators import Estimator, Kalman, Learned, Trust
-from livepde.control.goal import Controller, Decision, Known, Plan
 from livepde.errors import ConfigurationError, RunError, SampleError
 from livepde.identifier import Identifier
 from livepde.linalg import Array

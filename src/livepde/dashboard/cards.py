@@ -19,7 +19,7 @@ from livepde.dashboard.canvas import at_time, unit_label, when_axis
 from livepde.dashboard.view import RunView
 from livepde.plots.style import groups, labelled, modes_told, prior_left
 from livepde.records import STATUS_CODES, field_names, interval_95, scalars
-from livepde.runs import severities
+from livepde.runs import Check, severities
 from livepde.runs.summary import STATES, channel_errors, determination, digits
 from livepde.verdict import Severity
 
@@ -131,17 +131,23 @@ def verdict(seen: RunView) -> list[Any]:
 
 def _found(seen: RunView) -> list[tuple[Level, str]]:
     """Return the findings on a run: level and sentence."""
-    data = seen.dataset
-    found: list[tuple[Level, str]] = [("bad", text) for text in _failures(seen)]
+    found = findings(seen.dataset, _failures(seen), seen.checks, seen.doubts)
+    return found + [("info", text) for text in _remarks(seen)]
+
+
+def findings(
+    data: xr.Dataset | None, failures: Iterable[str], checks: Iterable[Check], doubts: Iterable[str]
+) -> list[tuple[Level, str]]:
+    """Return the level and sentence of failures, failed checks and doubts; or that all is well."""
+    found: list[tuple[Level, str]] = [("bad", text) for text in failures]
     found += [("bad", f"Expected {c.name} {c.sense} {c.bound_text}, but it is {c.value:.4g}.")
-              for c in seen.checks if not c.ok]  # fmt: skip
+              for c in checks if not c.ok]  # fmt: skip
     # The notes of a thinned run that ended replace its doubts, without a severity.
     graves = {} if data is None else severities(data)
-    found += [(SEVERITY[graves.get(sentence, "caution")], sentence) for sentence in seen.doubts]
+    found += [(SEVERITY[graves.get(doubt, "caution")], doubt) for doubt in doubts]
     if data is not None and {"bad", "warn"}.isdisjoint(level for level, _ in found):
-        text = "No problems detected."
-        found.insert(0, ("good", text))
-    return found + [("info", text) for text in _remarks(seen)]
+        found.insert(0, ("good", "No problems detected."))
+    return found
 
 
 def _failures(seen: RunView) -> Iterator[str]:

@@ -16,17 +16,7 @@ import scipy.sparse as sp
 import xarray as xr
 from scipy.spatial import Delaunay
 
-from livepde.dashboard.canvas import (
-    GRID,
-    at_time,
-    band,
-    empty,
-    line,
-    show,
-    text,
-    unit_label,
-    unit_of,
-)
+from livepde.dashboard import canvas
 from livepde.linalg import Array
 from livepde.plots import GREY, PALETTE, interval_95, labelled, sensor_places
 
@@ -250,20 +240,20 @@ def _zoomed(data: xr.Dataset) -> bool:
 
 def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
     """Draw a field along an interval: with its 95 % band, and as it was at the start."""
-    k = at_time(data, "snapshot", at)
-    figure = empty(labelled("x", unit_of(data, "x")), unit_label(data, name))
+    k = canvas.at_time(data, "snapshot", at)
+    figure = canvas.empty(labelled("x", canvas.unit_of(data, "x")), canvas.unit_label(data, name))
     x, values = data["x"].values, data[name].values
     reach = [values]
     if k > 0:
-        line(figure, x, values[0], GREY, 1.2, "dot", name="start", hovertemplate="%{y:.4g}")
+        canvas.line(figure, x, values[0], GREY, 1.2, "dot", name="start", hovertemplate="%{y:.4g}")
     if f"{name}_std" in data:
         low, high = interval_95(data, name)
         # The wide band of the prior would determine the scale and hide all later values.
         late = slice(len(values) // 10, None)
         reach += [low[late], high[late]]
-        band(figure, x, low[k], high[k], PALETTE[0], name)
-    line(figure, x, values[k], PALETTE[0], 2.2, name="estimate", hovertemplate="%{y:.4g}")
-    show(figure, reach)
+        canvas.band(figure, x, low[k], high[k], PALETTE[0], name)
+    canvas.line(figure, x, values[k], PALETTE[0], 2.2, name="estimate", hovertemplate="%{y:.4g}")
+    canvas.show(figure, reach)
     figure.update_layout(showlegend=k > 0)
     return figure
 
@@ -271,9 +261,9 @@ def field_profile(data: xr.Dataset, name: str, at: float | None = None) -> go.Fi
 def field_map(data: xr.Dataset, name: str, at: float | None = None) -> go.Figure:
     """Draw a field on a plane domain, on lines as dense as its mesh."""
     drawn = plane_map(data)
-    values = data[name].values[at_time(data, "snapshot", at)]
-    unit = labelled("", unit_of(data, "x")).strip()
-    figure = empty(f"x {unit}", f"y {unit}", height=380)
+    values = data[name].values[canvas.at_time(data, "snapshot", at)]
+    unit = labelled("", canvas.unit_of(data, "x")).strip()
+    figure = canvas.empty(f"x {unit}", f"y {unit}", height=380)
     figure.add_heatmap(
         x=drawn.x,
         y=drawn.y,
@@ -311,8 +301,8 @@ def field_solid(
     data: xr.Dataset, name: str, at: float | None = None, cut: float = 0.5
 ) -> go.Figure:
     """Draw a field in a solid: its surface, seen through, and cuts across x, y and z."""
-    values = data[name].values[at_time(data, "snapshot", at)]
-    figure = empty(height=440)
+    values = data[name].values[canvas.at_time(data, "snapshot", at)]
+    figure = canvas.empty(height=440)
     parts = [(boundary(data), 0.15), *((found, 1.0) for found in slices(data, cut))]
     low, high = float(values.min()), float(values.max())
     for k, (surface, opacity) in enumerate(parts):
@@ -336,9 +326,9 @@ def field_solid(
             lighting={"ambient": 1.0, "diffuse": 0.0, "specular": 0.0},
             hovertemplate="%{x:.4g}, %{y:.4g}, %{z:.4g}: %{intensity:.4g}<extra></extra>",
         )
-    unit = labelled("", unit_of(data, "x")).strip()
+    unit = labelled("", canvas.unit_of(data, "x")).strip()
     axes = {
-        f"{axis}axis": {"title": {"text": text(f"{axis} {unit}")}, "gridcolor": GRID}
+        f"{axis}axis": {"title": {"text": canvas.text(f"{axis} {unit}")}, "gridcolor": canvas.GRID}
         for axis in "xyz"
     }
     camera = {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.1}}
@@ -353,5 +343,5 @@ def _colours(name: str) -> str:
 
 
 def _bar(data: xr.Dataset, name: str) -> dict[str, Any]:
-    title = {"text": text(unit_label(data, name)), "side": "right"}
+    title = {"text": canvas.text(canvas.unit_label(data, name)), "side": "right"}
     return {"title": title, "thickness": 14, "outlinewidth": 0, "exponentformat": "power"}

@@ -45,6 +45,7 @@ def page_of(run: Run) -> str:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
     from livepde.dashboard.canvas import CONFIG, when_axis
+    from livepde.dashboard.cards import findings
     from livepde.dashboard.panels import SECTIONS, panels
 
     data = run.dataset
@@ -57,7 +58,7 @@ def page_of(run: Run) -> str:
             data = with_readings(data, np.array(readings))
     if not data.sizes["time"]:
         raise RunError(f"{run.path} contains no estimates yet, so there is nothing to report.")
-    axis, drawn = when_axis(data), panels(data)
+    axis, drawn, doubts = when_axis(data), panels(data), runs.doubts(run.dataset)
     times = [f"{key} {run.record[key]}" for key in ("started", "ended") if key in run.record]
     case = run.path / CASE
     here = Path(__file__).parent
@@ -73,7 +74,10 @@ def page_of(run: Run) -> str:
         equation=str(data.attrs.get("equation", "")),
         samples=data.sizes["time"],
         span=[axis.text(float(data["time"][k])) for k in (0, -1)],
-        verdict=_verdict(run),
+        verdict=[
+            *findings(run.dataset, (), run.checks, doubts),
+            *(("info", note) for note in run.notes if note not in doubts),
+        ],
         tables=list(map(_shown, runs.tables(data))),
         checks=list(map(_checked, run.checks)),
         sections={
@@ -89,23 +93,6 @@ def page_of(run: Run) -> str:
         plotly=get_plotlyjs(),
         nonce=secrets.token_urlsafe(16),
     )
-
-
-def _verdict(run: Run) -> list[tuple[str, str]]:
-    """Return sentences with their severity, the gravest first."""
-    from livepde.dashboard.cards import SEVERITY
-
-    doubts = runs.doubts(run.dataset)
-    found = [
-        ("bad", f"Expected {name} {bound}, but it is {value}.")
-        for name, value, bound, result in map(_checked, run.checks)
-        if result != "ok"
-    ]
-    graves = runs.severities(run.dataset)
-    found += [(SEVERITY[graves.get(doubt, "caution")], doubt) for doubt in doubts]
-    if not any(level in ("bad", "warn") for level, _ in found):
-        found.append(("good", "No problems detected."))
-    return found + [("info", note) for note in run.notes if note not in doubts]
 
 
 def _shown(table: Table) -> Table:

@@ -14,34 +14,11 @@ import numpy as np
 import plotly.graph_objects as go
 import xarray as xr
 
-from livepde.dashboard.canvas import (
-    MARKS,
-    TimeAxis,
-    at_time,
-    band,
-    empty,
-    line,
-    over_time,
-    show,
-    text,
-    unit_label,
-    when_axis,
-)
+from livepde.dashboard import canvas
 from livepde.dashboard.field_views import drawn_by, field_profile
 from livepde.dashboard.view import READINGS
 from livepde.linalg import Array
-from livepde.plots import GREY, PALETTE
-from livepde.plots.style import (
-    MOST_LINES,
-    groups,
-    labelled,
-    modes_told,
-    note,
-    prior_left,
-    scored_from,
-    sensor_names,
-    sensor_units,
-)
+from livepde.plots import GREY, PALETTE, style
 from livepde.records import field_names, interval_95, scalars, used_errors
 from livepde.runs.summary import shown
 
@@ -81,7 +58,7 @@ def panels(data: xr.Dataset, at: float | None = None, cut: float = 0.5) -> list[
     for variable, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if variable in data and data.sizes.get(dimension):
             found.append(_residual_panel(data, variable, dimension, at))
-    if note(data, "innovation_ratio") is not None:
+    if style.note(data, "innovation_ratio") is not None:
         about = (
             "Ratio of squared innovations to their expected square. If the model is right, it is "
             "about 1 or less. Above 4, the model does not fit the data."
@@ -107,17 +84,17 @@ def _measured_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
     """Return a panel for the sensors of each unit, where the readings are known."""
     if not any(name in data for name in READINGS.values()):
         return []
-    names, found = sensor_names(data), list[Panel]()
-    units = sensor_units(data, names)
+    names, found = style.sensor_names(data), list[Panel]()
+    units = style.sensor_units(data, names)
     for unit in dict.fromkeys(units.values()):
         shown = [name for name in names if units[name] == unit]
         about = "Points: readings. Lines: what the model expected of them one step ahead."
         if any(name in data["validation"] for name in shown if "validation" in data):
             about += " Dashed: validation sensors, which it never uses."
-        if len(shown) > MOST_LINES:
-            about += f" The first {MOST_LINES} of {len(shown)} sensors."
+        if len(shown) > style.MOST_LINES:
+            about += f" The first {style.MOST_LINES} of {len(shown)} sensors."
         title = f"Measured and modelled{f', {unit}' if len(set(units.values())) > 1 else ''}"
-        figure = measured(data, shown[:MOST_LINES], unit, at)
+        figure = measured(data, shown[: style.MOST_LINES], unit, at)
         found.append(Panel(f"measured:{unit}", "measured", title, about, figure))
     return found
 
@@ -127,7 +104,7 @@ def measured(
 ) -> go.Figure:
     """Draw the readings of sensors of one unit, and what the model expected of them."""
     data = _bounded(data)
-    figure, axis = over_time(data, labelled("", unit).strip().strip("[]"), at)
+    figure, axis = canvas.over_time(data, style.labelled("", unit).strip().strip("[]"), at)
     t = axis.values(data["time"].values)
     for error, dimension in (("innovation", "sensor"), ("validation_error", "validation")):
         if error not in data:
@@ -148,14 +125,14 @@ def measured(
                 y=readings[:, k],
                 mode="markers",
                 marker={"color": colour, "size": 4, "opacity": 0.6},
-                name=text(f"{name}, measured"),
+                name=canvas.text(f"{name}, measured"),
                 showlegend=False,
                 **about,
             )
-            label = text(f"{name} (validation)" if validation else name)
+            label = canvas.text(f"{name} (validation)" if validation else name)
             dash = "dash" if validation else None
             mode = "lines+markers" if len(t) == 1 else "lines"
-            line(
+            canvas.line(
                 figure,
                 t,
                 readings[:, k] - errors[:, k],
@@ -172,7 +149,7 @@ def measured(
 
 def _unknown_panels(data: xr.Dataset, at: float | None) -> list[Panel]:
     found = []
-    for name, labels in groups(data).items():
+    for name, labels in style.groups(data).items():
         about = "Line: estimate."
         if np.isfinite(data[f"{labels[0]}_std"].values).any():
             about = "Line: estimate. Band: 95 % interval."
@@ -188,8 +165,8 @@ def _field_panels(data: xr.Dataset, at: float | None, cut: float) -> list[Panel]
     found: list[Panel] = []
     if not data.sizes.get("snapshot"):
         return found
-    k = at_time(data, "snapshot", at)
-    when = when_axis(data).text(float(data["snapshot"].values[k]))
+    k = canvas.at_time(data, "snapshot", at)
+    when = canvas.when_axis(data).text(float(data["snapshot"].values[k]))
     draw, hint = drawn_by(data, cut)
     for name in [*unknown, *state]:
         if name not in data:
@@ -216,7 +193,7 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
             "Measured minus predicted, one step ahead. If the model is right, it scatters about "
             "zero. If it stays on one side, there is an offset or a missing process."
         )
-        if note(data, "residual") is not None:
+        if style.note(data, "residual") is not None:
             about = (
                 "Measured minus estimated, after the step. If the model is right, it is about zero."
             )
@@ -230,7 +207,11 @@ def _residual_panel(data: xr.Dataset, variable: str, dimension: str, at: float |
 def _crowd(data: xr.Dataset, dimension: str) -> str:
     """Return how many sensors are drawn as one."""
     count = data.sizes[dimension]
-    return f" Line: root mean square of {count}; band: their range." if count > MOST_LINES else ""
+    return (
+        f" Line: root mean square of {count}; band: their range."
+        if count > style.MOST_LINES
+        else ""
+    )
 
 
 def _bounded(data: xr.Dataset) -> xr.Dataset:
@@ -241,7 +222,7 @@ def _bounded(data: xr.Dataset) -> xr.Dataset:
     kept = np.zeros(count, dtype=bool)
     kept[np.linspace(0, count - 1, MOST_POINTS).round().astype(int)] = True
     notable = data["status"].values != 0
-    alarms = note(data, "jump")
+    alarms = style.note(data, "jump")
     if alarms is not None:
         notable |= alarms > 0.0
     kept[np.flatnonzero(notable)[:MOST_POINTS]] = True
@@ -254,10 +235,10 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
     `labels`: scalar unknowns of the dataset.
     """
     data = _bounded(data)
-    figure, axis = over_time(data, unit_label(data, labels[0]), at)
+    figure, axis = canvas.over_time(data, canvas.unit_label(data, labels[0]), at)
     t = axis.values(data["time"].values)
     # The prior's band would flatten everything that follows.
-    late = slice(max(len(t) // 2, scored_from(data) + len(t) // 20), None)
+    late = slice(max(len(t) // 2, style.scored_from(data) + len(t) // 20), None)
     reach: list[Array] = []
     opacity = 0.2 if len(labels) <= 2 else 0.1
     for k, label in enumerate(labels):
@@ -267,8 +248,8 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
         reach.append(value)
         if np.isfinite(low[late]).any():
             reach += [low[late], high[late]]
-            if len(labels) <= MOST_LINES:
-                band(figure, t, low, high, colour, label, opacity)
+            if len(labels) <= style.MOST_LINES:
+                canvas.band(figure, t, low, high, colour, label, opacity)
         std = np.zeros_like(value)
         if f"{label}_std" in data:
             std = np.nan_to_num(data[f"{label}_std"].values, nan=0.0)
@@ -277,7 +258,7 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             y=value,
             mode="lines+markers" if len(t) == 1 else "lines",
             line={"color": colour, "width": 2},
-            name=text(_short(label)),
+            name=canvas.text(_short(label)),
             legendgroup=label,
             showlegend=len(labels) > 1,
             customdata=std,
@@ -288,8 +269,8 @@ def unknowns(data: xr.Dataset, labels: Sequence[str], at: float | None = None) -
             reach.append(np.array([float(reference)]))
             about = {"legendgroup": label, "showlegend": k == 0, "hovertemplate": "%{y:.4g}"}
             ends = [float(reference)] * 2
-            line(figure, t[[0, -1]], ends, colour, 1.2, "dash", name="reference", **about)
-    show(figure, reach)
+            canvas.line(figure, t[[0, -1]], ends, colour, 1.2, "dash", name="reference", **about)
+    canvas.show(figure, reach)
     _mark_failures(figure, data, axis)
     return figure
 
@@ -299,7 +280,7 @@ def _short(label: str) -> str:
     return label.partition("[")[2].removesuffix("]") or label
 
 
-def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: TimeAxis) -> None:
+def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: canvas.TimeAxis) -> None:
     failed = data["time"].values[data["status"].values != 0]
     if not len(failed):
         return
@@ -312,7 +293,7 @@ def _mark_failures(figure: go.Figure, data: xr.Dataset, axis: TimeAxis) -> None:
         name="failed step",
         hoverinfo="skip",
     )
-    figure.update_layout(yaxis2=MARKS)
+    figure.update_layout(yaxis2=canvas.MARKS)
 
 
 def residuals(
@@ -323,37 +304,39 @@ def residuals(
     `variable`, `dimension`: "innovation" over "sensor", or "validation_error" over "validation".
     """
     data = _bounded(data)
-    figure, axis = over_time(data, unit_label(data, variable), at)
+    figure, axis = canvas.over_time(data, canvas.unit_label(data, variable), at)
     t, errors = axis.values(data["time"].values), used_errors(data, variable, dimension)
     names = [str(name) for name in data[dimension].values]
     mode = "lines" if len(t) > 60 else "lines+markers"
-    if len(names) <= MOST_LINES:
+    if len(names) <= style.MOST_LINES:
         for k, name in enumerate(names):
-            about = {"name": text(name), "mode": mode, "hovertemplate": "%{y:+.3g}"}
+            about = {"name": canvas.text(name), "mode": mode, "hovertemplate": "%{y:+.3g}"}
             colour = PALETTE[k % len(PALETTE)]
-            line(figure, t, errors[:, k], colour, 1.3, marker={"size": 5}, **about)
+            canvas.line(figure, t, errors[:, k], colour, 1.3, marker={"size": 5}, **about)
         figure.update_layout(showlegend=True)
         return figure
     some = np.isfinite(errors).any(axis=1)
     t, errors = t[some], errors[some]
     if len(t):
         low, high = np.nanmin(errors, axis=1), np.nanmax(errors, axis=1)
-        band(figure, t, low, high, PALETTE[0], "range")
+        canvas.band(figure, t, low, high, PALETTE[0], "range")
         root = np.sqrt(np.nanmean(errors**2, axis=1))
         about = {"name": "root mean square", "mode": mode, "hovertemplate": "%{y:.3g}"}
-        line(figure, t, root, PALETTE[0], 1.8, showlegend=True, **about)
+        canvas.line(figure, t, root, PALETTE[0], 1.8, showlegend=True, **about)
     return figure
 
 
 def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
     """Draw the ratio of squared innovations to their expected square."""
     data = _bounded(data)
-    figure, axis = over_time(data, "", at)
-    t, values = axis.values(data["time"].values), note(data, "innovation_ratio")
+    figure, axis = canvas.over_time(data, "", at)
+    t, values = axis.values(data["time"].values), style.note(data, "innovation_ratio")
     about = {"name": "innovation ratio", "hovertemplate": "%{y:.3g}"}
-    line(figure, t, values, PALETTE[0], 2, **about)
+    canvas.line(figure, t, values, PALETTE[0], 2, **about)
     for level, name, colour in ((1.0, "as expected", GREY), (4.0, "too large", PALETTE[1])):
-        line(figure, t[[0, -1]], [level] * 2, colour, 1.2, "dash", name=name, hoverinfo="skip")
+        canvas.line(
+            figure, t[[0, -1]], [level] * 2, colour, 1.2, "dash", name=name, hoverinfo="skip"
+        )
     figure.update_yaxes(rangemode="tozero")
     return figure
 
@@ -361,14 +344,14 @@ def ratio(data: xr.Dataset, at: float | None = None) -> go.Figure:
 def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
     """Return unknown -> remaining share of its prior standard deviation; of fields over modes."""
     found: dict[str, float] = {}
-    k = at_time(data, "time", at)
+    k = canvas.at_time(data, "time", at)
     for label in scalars(data):
-        left = prior_left(data, label, k)
+        left = style.prior_left(data, label, k)
         if math.isfinite(left):
             found[label] = left
     for name in field_names(data):
         if f"{name}_modes" in data:
-            some, count, left = modes_told(data, name, at_time(data, "snapshot", at))
+            some, count, left = style.modes_told(data, name, canvas.at_time(data, "snapshot", at))
             found[f"{name} ({some:.1f} of {count} modes determined)"] = left
     return found
 
@@ -376,7 +359,7 @@ def open_shares(data: xr.Dataset, at: float | None) -> dict[str, float]:
 def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
     """Draw the remaining share of the prior standard deviation of each unknown."""
     known = dict(reversed(open_shares(data, at).items()))
-    figure = empty(
+    figure = canvas.empty(
         "share of the prior standard deviation [%]", height=max(170, 90 + 26 * len(known))
     )
     shares = [100.0 * left for left in known.values()]
@@ -386,7 +369,7 @@ def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
     ]
     figure.add_bar(
         x=shares,
-        y=[text(name) for name in known],
+        y=[canvas.text(name) for name in known],
         orientation="h",
         marker={"color": colours},
         text=[shown(share, ".2g" if share < 100 else ".0f", " %") for share in shares],
@@ -402,9 +385,9 @@ def told(data: xr.Dataset, at: float | None = None) -> go.Figure:
 
 def correlation(data: xr.Dataset) -> go.Figure:
     """Draw how the newest estimates of numbers are correlated."""
-    names = [text(name) for name in data["unknown"].values]
+    names = [canvas.text(name) for name in data["unknown"].values]
     values = data["correlation"].values
-    figure = empty(height=max(260, 120 + 30 * len(names)))
+    figure = canvas.empty(height=max(260, 120 + 30 * len(names)))
     figure.add_heatmap(
         x=names,
         y=names,

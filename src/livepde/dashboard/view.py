@@ -62,10 +62,6 @@ class Spread(Generic[T]):
             else:
                 self._settled = newest
         self._items[number] = item
-        if len(self._items) > self.most:
-            self._thin()
-
-    def _thin(self) -> None:
         while len(self._items) > self.most:
             self.gap *= 2
             numbers = [*self._items]

@@ -364,12 +364,7 @@ def _derivatives(model: Model, at: _TestPoint) -> list[Check]:
 
 
 def _taylor(
-    name: str,
-    given: str,
-    function: Callable[[Array], Array],
-    slope: Array,
-    at: Array,
-    along: Array,
+    name: str, given: str, function: Callable[[Array], Array], slope: Array, at: Array, along: Array
 ) -> Check:
     """Return the rate of the Taylor remainder, or its size if it is at rounding level."""
     remedy = (

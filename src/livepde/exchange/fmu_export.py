@@ -80,10 +80,7 @@ def recipe_of(source: Case | str) -> Recipe:
     The files of a case, its mesh and user code, are included. Modules are imported where the unit
     runs.
 
-    Raises
-    ------
-    ConfigurationError
-        The function cannot be loaded, or does not build an identifier.
+    Raises `ConfigurationError`: the function cannot be loaded, or does not build an identifier.
     """
     return _of_function(source) if isinstance(source, str) else _of_case(source)
 
@@ -212,11 +209,7 @@ def is_code(source: str) -> bool:
 
 
 def write_unit(
-    recipe: Recipe,
-    target: str | os.PathLike[str] | None,
-    *,
-    fmi: Literal[2, 3],
-    force: bool,
+    recipe: Recipe, target: str | os.PathLike[str] | None, *, fmi: Literal[2, 3], force: bool
 ) -> Path:
     """Write a unit, and return its path; for parameters see `export_fmu`."""
     if fmi not in EXPORTERS:

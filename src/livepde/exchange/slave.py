@@ -28,10 +28,7 @@ if not sys.orig_argv:
 class IdentifierSlave:
     """Co-simulation slave; its class has `Fmi2Slave` or `Fmi3Slave` as second base.
 
-    Attributes
-    ----------
-    fmi
-        2 or 3.
+    `fmi`: 2 or 3.
     """
 
     fmi: int

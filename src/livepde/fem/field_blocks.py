@@ -17,15 +17,7 @@ from skfem.element import DiscreteField, ElementQuadBFS
 
 from livepde.errors import ObservationError, SpaceError
 from livepde.fem.elementwise import scatter, shared
-from livepde.fem.fields import (
-    Channel,
-    Declaration,
-    Field,
-    Piecewise,
-    Scalar,
-    Scalars,
-    is_nodal,
-)
+from livepde.fem.fields import Channel, Declaration, Field, Piecewise, Scalar, Scalars, is_nodal
 from livepde.fem.measure import Measure, Moment, Place, own
 from livepde.fem.meshes import tied
 from livepde.fem.priors import Normal

@@ -209,12 +209,8 @@ PIECE = 30_000
 class Measure:
     """Integration domain (whole mesh, subdomain or boundary) with a quadrature order.
 
-    Parameters
-    ----------
-    members
-        Numbers of its cells, or of its facets on a boundary; default all.
-    thin
-        True: only the first quadrature point of each, to probe an integrand.
+    `members`: numbers of its cells, or of its facets on a boundary; default all.
+    `thin`: true: only the first quadrature point of each, to probe an integrand.
     """
 
     mesh: Mesh

@@ -301,10 +301,8 @@ def tied(field: Field, block: Any) -> IntArray | None:
     Coefficients of a pair of periodic boundaries are identified if they are of the same kind
     (value, slope) and at the same place up to the translation of one boundary to the other.
 
-    Raises
-    ------
-    SpaceError
-        The element has no coefficients on its sides, or those of two boundaries do not match.
+    Raises `SpaceError`: the element has no coefficients on its sides, or those of two boundaries do
+    not match.
     """
     if not field.periodic:
         return None

@@ -444,8 +444,13 @@ class FunctionSpace:
 
         With several fields, a number is the value of all of them.
         """
-        if isinstance(value, Mapping):
-            return self._interpolate_by_name(value)
+        if isinstance(value, Mapping):  # all others have the coefficients of the prior
+            if unknown := set(value) - set(self.parts):
+                raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
+            result = self.prior.copy()
+            for name, item in value.items():
+                result[self.part(name)] = self._interpolate(name, item)
+            return result
         if self.single:
             return self._interpolate(next(iter(self.blocks)), value)
         if len(self.fields) == len(self.blocks) and np.ndim(value) == 0 and not callable(value):
@@ -458,15 +463,6 @@ class FunctionSpace:
         if array.shape != (self.dim,):
             raise SpaceError(f"coefficients of shape {array.shape}; expected ({self.dim},).")
         return array.copy()
-
-    def _interpolate_by_name(self, values: Mapping[str, Any]) -> Array:
-        """Return the coefficients of the values given, those of the prior for all others."""
-        if unknown := set(values) - set(self.parts):
-            raise SpaceError(f"no unknown is called {sorted(unknown)}; {list(self.parts)} are.")
-        result = self.prior.copy()
-        for name, item in values.items():
-            result[self.part(name)] = self._interpolate(name, item)
-        return result
 
     def _interpolate(self, name: str, value: Any) -> Array:
         block, part = self.blocks.get(name), self.part(name)

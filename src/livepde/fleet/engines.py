@@ -10,19 +10,8 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from livepde import checkpoint
+from livepde import checkpoint, laws
 from livepde.fem import Moment
-from livepde.laws import (
-    AnyLaw,
-    Belief,
-    InitialReading,
-    MemberReports,
-    Problem,
-    Report,
-    SensitivityLaw,
-    Status,
-    stepped,
-)
 from livepde.laws.member_arrays import join, take
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.linalg import Array, IntArray, nonfinite_allowed
@@ -77,7 +66,7 @@ class FleetEngine(ABC):
         """Return the state after a sample at the initial time."""
 
     @abstractmethod
-    def step(self, state: State, span: Span) -> tuple[State, MemberReports]:
+    def step(self, state: State, span: Span) -> tuple[State, laws.MemberReports]:
         """Return the state at the end of a span, with that before it for members that failed."""
 
     @abstractmethod
@@ -89,7 +78,7 @@ class FleetEngine(ABC):
         """Return the state after the work that the law spreads over samples; see `Law.settled`."""
 
     @abstractmethod
-    def believed(self, state: State, k: int) -> Belief:
+    def believed(self, state: State, k: int) -> laws.Belief:
         """Return the belief about a member, in latent coefficients."""
 
     @abstractmethod
@@ -111,7 +100,7 @@ class SeparateEngine(FleetEngine):
     The state is a tuple of the states of the law.
     """
 
-    def __init__(self, law: AnyLaw, work: Any, problem: Problem) -> None:
+    def __init__(self, law: laws.AnyLaw, work: Any, problem: laws.Problem) -> None:
         super().__init__(law, work)
         self.problem = problem
 
@@ -124,17 +113,19 @@ class SeparateEngine(FleetEngine):
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
         return tuple(one for one, _ in self._stepped(state, span))
 
-    def step(self, state: tuple[Any, ...], span: Span) -> tuple[tuple[Any, ...], MemberReports]:
+    def step(
+        self, state: tuple[Any, ...], span: Span
+    ) -> tuple[tuple[Any, ...], laws.MemberReports]:
         taken = self._stepped(state, span)
         members, sensors = len(taken), len(taken[0][1].predicted)
         blank = np.zeros((members, sensors)), np.zeros(members, dtype=int)
-        reports = MemberReports((Status(),) * members, *blank)
+        reports = laws.MemberReports((laws.Status(),) * members, *blank)
         each = {k: report for k, (_, report) in enumerate(taken)}
         return tuple(new for new, _ in taken), reports.with_members(each)
 
-    def _stepped(self, state: tuple[Any, ...], span: Span) -> list[tuple[Any, Report]]:
+    def _stepped(self, state: tuple[Any, ...], span: Span) -> list[tuple[Any, laws.Report]]:
         parts = self.law, self.work, self.problem
-        return [stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
+        return [laws.stepped(*parts, one, span.member(k)) for k, one in enumerate(state)]
 
     def finite(self, state: tuple[Any, ...]) -> bool:
         return all(self.law.finite(self.work, one) for one in state)
@@ -142,8 +133,8 @@ class SeparateEngine(FleetEngine):
     def settled(self, state: tuple[Any, ...]) -> tuple[Any, ...]:
         return tuple(self.law.settled(self.work, one) for one in state)
 
-    def believed(self, state: tuple[Any, ...], k: int) -> Belief:
-        belief: Belief = self.law.belief(self.work, state[k])
+    def believed(self, state: tuple[Any, ...], k: int) -> laws.Belief:
+        belief: laws.Belief = self.law.belief(self.work, state[k])
         return belief
 
     def beliefs(self, state: tuple[Any, ...]) -> Beliefs:
@@ -164,14 +155,14 @@ class BlockEngine(FleetEngine):
     (errors, n), `initial` how it was given.
     """
 
-    law: SensitivityLaw
+    law: laws.SensitivityLaw
     work: SensitivityWork
 
     def __init__(
         self,
         law: Any,
         work: SensitivityWork,
-        readings: Sequence[Mapping[str, InitialReading]],
+        readings: Sequence[Mapping[str, laws.InitialReading]],
         errors: Sequence[Array],
         initial: Sequence[Any],
     ) -> None:
@@ -205,7 +196,9 @@ class BlockEngine(FleetEngine):
         )
         return begun
 
-    def step(self, state: SensitivityState, span: Span) -> tuple[SensitivityState, MemberReports]:
+    def step(
+        self, state: SensitivityState, span: Span
+    ) -> tuple[SensitivityState, laws.MemberReports]:
         return self.law.step_members(self.work, state, span)
 
     def finite(self, state: SensitivityState) -> bool:
@@ -214,7 +207,7 @@ class BlockEngine(FleetEngine):
     def settled(self, state: SensitivityState) -> SensitivityState:
         return self.law.settled(self.work, state)
 
-    def believed(self, state: SensitivityState, k: int) -> Belief:
+    def believed(self, state: SensitivityState, k: int) -> laws.Belief:
         return self.law.member_belief(self.work, state.now, k)
 
     @nonfinite_allowed()  # of members whose step has failed

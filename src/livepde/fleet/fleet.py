@@ -6,22 +6,15 @@ import copy
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from livepde import checkpoint
-from livepde.errors import (
-    ConfigurationError,
-    MissingInputError,
-    RunError,
-    SampleError,
-    TimeOrderError,
-)
+from livepde import checkpoint, errors
+from livepde.checkpoint import Fingerprint
 from livepde.fem import Inputs, Moment
-from livepde.fingerprint import Fingerprint
 from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.frames import layout_of
@@ -159,12 +152,12 @@ class Fleet:
             readings = [self._one._initial_readings(one) for one in made_of]
             return BlockEngine(self.law, self._work, readings, self._errors, u0s)
         if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 "u0_errors differ between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
         if any(one.keys() != made_of[0].keys() for one in made_of):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 "u0_from differs between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
@@ -175,7 +168,7 @@ class Fleet:
         if not isinstance(value, list):
             return [value] * len(self.members)
         if len(value) != len(self.members):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 f"{what}: a list of {len(value)} for {len(self.members)} members; give one for "
                 "each, or a single value for all."
             )
@@ -227,7 +220,7 @@ class Fleet:
         if self.inputs and not self._engine.finite(state):
             for k, name in enumerate(self.members):
                 if not self.law.finite(self._work, self._engine.member(state, k)):
-                    raise SampleError(
+                    raise errors.SampleError(
                         f"member '{name}' gets no finite initial state: check the values of its "
                         f"inputs {list(self.inputs)}; the run begins with the next sample."
                     )
@@ -259,13 +252,13 @@ class Fleet:
         """
         t = float(t)
         if not np.isfinite(t):
-            raise SampleError(f"time t is {t}; give the time of the sample.")
+            raise errors.SampleError(f"time t is {t}; give the time of the sample.")
         measured, noise, validation, named = self._parsed(z, inputs or {})
         self._one._check_weighs(noise)
         # The times of members differ after a failed step: a sample has to be later than all.
         last = float(self._t.max())
         if t < last or (t == last and self._samples):
-            raise TimeOrderError(
+            raise errors.TimeOrderError(
                 f"the sample at t = {t!r} is not later than the last one at t = {last!r}: "
                 "sort the stream, and drop repeated samples."
             )
@@ -278,40 +271,35 @@ class Fleet:
                 held = {**held, **self._held_at_start(held)}
             self._begin(self._opening(values) if t > last else values)
         used = measured if t >= self._one.assimilate_from else np.full_like(measured, np.nan)
+        ending = partial(
+            Span, t0=self._t, t1=t, channels=self.inputs, inputs1=values, z1=used, noise=noise
+        )
         if t == last:
-            span = Span(
-                t0=self._t,
-                t1=t,
-                channels=self.inputs,
-                inputs0=values,
-                inputs1=values,
-                z0=used,
-                z1=used,
-                noise=noise,
-            )
+            span = ending(inputs0=values, z0=used)
             report = self._expected(span)
             self._state = self._engine.begin(self._state, span)
         else:
             gaps = np.stack([self._held, missing], axis=1)
-            some = gaps if gaps.any() else None
-            span = Span(
-                t0=self._t,
-                t1=t,
-                channels=self.inputs,
-                inputs0=self._inputs,
-                inputs1=values,
-                z0=self._z,
-                z1=used,
-                noise=noise,
-                gaps=some,
-            ).driven(self.problem.control.held)
+            span = ending(inputs0=self._inputs, z0=self._z, gaps=gaps if gaps.any() else None)
+            span = span.driven(self.problem.control.held)
             self._state, report = self._engine.step(self._state, span)
+        self._count(t, report.statuses)
+        self._keep(t, used, values, missing, report.statuses)
+        return self._estimate(span, measured, validation, report, held)
+
+    def _count(self, t: float, statuses: Sequence[Status]) -> None:
+        """Count the steps that end at t."""
         self._samples += 1
-        codes = [STATUS_CODES.index(status.code) for status in report.statuses]
+        codes = [STATUS_CODES.index(status.code) for status in statuses]
         self._steps = self._steps + np.eye(COUNTS, dtype=np.int64)[codes]
         self._steps[:, -1] += [*map(self.problem.control.stretches, (t - self._t).tolist())]
+
+    def _keep(
+        self, t: float, used: Array, values: Array, missing: Array, statuses: Sequence[Status]
+    ) -> None:
+        """Keep time and values of a sample for the members whose step was taken."""
         # A member whose step failed keeps its time and values: its next step covers both intervals.
-        good = np.array([status.taken for status in report.statuses])
+        good = np.array([status.taken for status in statuses])
         lasting = (self._held + (t - self._t)[:, None]) * missing
         self._held = np.where(good[:, None], lasting, self._held)
         if self.inputs:
@@ -323,7 +311,6 @@ class Fleet:
         # A value that holds until the next reading may not be read again.
         stays = np.array([name in self.problem.control.held.last for name in self.inputs], bool)
         self._known = np.where(good[:, None] | stays, values, self._known)
-        return self._estimate(span, measured, validation, report, held)
 
     def _opening(self, inputs: Array) -> Array:
         """Return the inputs at the initial time, from those of a later first sample."""
@@ -472,7 +459,7 @@ class Fleet:
         measured, noise, validation, named = parse(z)
         for name, values in inputs.items():
             if name not in self.inputs:
-                raise SampleError(
+                raise errors.SampleError(
                     f"unknown input '{name}'; model and sensors have {list(self.inputs)}."
                 )
             named[name] = self._column(name, values)
@@ -484,7 +471,9 @@ class Fleet:
         noisy = dict(zip(map(noise_channel, sensors), sensors, strict=True))
         for name in z:
             if name not in channels and name not in noisy:
-                raise SampleError(f"unknown channel '{name}'; this fleet has {list(channels)}.")
+                raise errors.SampleError(
+                    f"unknown channel '{name}'; this fleet has {list(channels)}."
+                )
         columns = {name: self._column(name, values) for name, values in z.items()}
         nothing = np.full(len(self), np.nan)
 
@@ -506,7 +495,7 @@ class Fleet:
             for name, column in zip(names, noise.T, strict=True):
                 _check_positive(name, column)
         if array.shape != expected:
-            raise SampleError(
+            raise errors.SampleError(
                 f"z has shape {array.shape}; {expected[0]} members with {expected[1]} sensors each "
                 f"need {expected}, NaN where a sample is missing."
             )
@@ -523,7 +512,7 @@ class Fleet:
         """Return a value of a channel for each member."""
         array = _numbers(f"channel '{name}'", values)
         if array.shape not in ((), (len(self),)):
-            raise SampleError(
+            raise errors.SampleError(
                 f"channel '{name}' has shape {array.shape}; give one number for all, or "
                 f"{len(self)}, one for each member."
             )
@@ -534,7 +523,7 @@ class Fleet:
     def _refuse_infinite(self, name: str, column: Array) -> None:
         if np.isinf(column).any():
             member = self.members[int(np.argmax(np.isinf(column)))]
-            raise SampleError(
+            raise errors.SampleError(
                 f"channel '{name}' of member '{member}' is infinite; send NaN for a missing sample."
             )
 
@@ -548,7 +537,7 @@ class Fleet:
                 column = np.where(missing, self._known[:, k], column)
                 if np.isnan(column).any():
                     member = self.members[int(np.argmax(np.isnan(column)))]
-                    raise MissingInputError(
+                    raise errors.MissingInputError(
                         f"input '{name}' of member '{member}' has no value in the first sample; "
                         "start the stream where every member has one."
                     )
@@ -580,7 +569,7 @@ class Fleet:
         """Raise `RunError` unless a checkpoint, named `where` in messages, is of such a fleet."""
         other = [key for key, value in self.header.items() if header.get(key) != value]
         if differs := other[0] if other else self.fingerprint.differing(leaves):
-            raise RunError(
+            raise errors.RunError(
                 f"{where} was saved with another {differs}; build the fleet as it was then."
             )
 
@@ -624,7 +613,7 @@ class Fleet:
                 state = self._engine.restored(template, inner)
             ends, samples = {name: leaves[name] for name in self.ends}, int(leaves["samples"])
         except (KeyError, ValueError) as error:
-            raise RunError(
+            raise errors.RunError(
                 f"{where} does not fit this fleet ({error}): build it with the law's options as "
                 "they were when it was saved."
             ) from error
@@ -639,9 +628,9 @@ def _named(members: int | Sequence[str]) -> tuple[str, ...]:
     """Return the names of the members: numbers from 0 if only their count is given."""
     names = tuple(map(str, range(members)) if isinstance(members, int) else members)
     if not names:
-        raise ConfigurationError("a fleet needs at least one member.")
+        raise errors.ConfigurationError("a fleet needs at least one member.")
     if len(set(names)) < len(names):
-        raise ConfigurationError("the names of the members of a fleet must differ.")
+        raise errors.ConfigurationError("the names of the members of a fleet must differ.")
     return names
 
 
@@ -658,4 +647,4 @@ def _numbers(what: str, values: ArrayLike) -> Array:
             raise TypeError
         return np.array(values, dtype=float)
     except (TypeError, ValueError):
-        raise SampleError(f"{what} holds something that is not a number.") from None
+        raise errors.SampleError(f"{what} holds something that is not a number.") from None

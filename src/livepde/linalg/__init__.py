@@ -4,28 +4,36 @@ from __future__ import annotations
 
 from livepde.linalg.arrays import (
     Array,
+    Assembler,
     IntArray,
     Mask,
     Memo,
+    Pattern,
     RowProduct,
     Sparse,
+    compact,
     nonfinite_allowed,
     row_product,
+    sandwich,
 )
 from livepde.linalg.banded import BandedBlocks, BandedSolver, BlockFactor
-from livepde.linalg.choice import Choice, analyse, choose
-from livepde.linalg.direct import (
+from livepde.linalg.solvers import (
+    Choice,
     CholmodSolver,
     Factor,
     Inverse,
     Leading,
+    MultigridSolver,
     PardisoSolver,
     Solver,
     SuperLUSolver,
+    analyse,
+    approximate_inverse,
+    choose,
+    conjugate_gradients,
+    gmres,
     positive_definite,
 )
-from livepde.linalg.krylov import MultigridSolver, approximate_inverse, conjugate_gradients, gmres
-from livepde.linalg.pattern import Assembler, Pattern, compact, sandwich
 
 __all__ = [
     "Array",

@@ -12,8 +12,7 @@ from scipy.linalg import blas, lapack
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from livepde.errors import LinearAlgebraError
-from livepde.linalg.arrays import Array, IntArray
-from livepde.linalg.pattern import Pattern
+from livepde.linalg.arrays import Array, IntArray, Pattern
 
 # Number of entries of a triangle up to which copying it costs more than the faster solve saves.
 FEW = 300

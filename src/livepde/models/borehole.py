@@ -16,14 +16,7 @@ from livepde.models.description import Equation, Number, Option, Quantity, Varia
 
 
 def borehole(
-    mesh: Any,
-    k: Unknown,
-    R_b: Unknown,
-    *,
-    H: float,
-    rho_c: Number,
-    T0: float,
-    element: Any = None,
+    mesh: Any, k: Unknown, R_b: Unknown, *, H: float, rho_c: Number, T0: float, element: Any = None
 ) -> Model:
     """Return rho_c r T_t - (k r T_r)_r = 0 around a borehole heated by the power Q(t).
 

@@ -5,20 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from livepde import fem
 from livepde.errors import ModelError
-from livepde.fem import (
-    Field,
-    On,
-    Piecewise,
-    Place,
-    Prior,
-    Scalar,
-    Scalars,
-    Unknown,
-    dot,
-    grad,
-    linear,
-)
 from livepde.model import Model
 from livepde.models.description import Equation, Fluxes, Option, Variable, by_name
 
@@ -27,12 +15,12 @@ AMBIENT = "ambient"
 
 def heat(
     mesh: Any,
-    alpha: Unknown,
+    alpha: fem.Unknown,
     dirichlet: Mapping[str, Any] | None = None,
     *,
-    loss: Unknown | None = None,
-    transfer: Unknown | None = None,
-    source: Unknown | None = None,
+    loss: fem.Unknown | None = None,
+    transfer: fem.Unknown | None = None,
+    source: fem.Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
@@ -83,13 +71,13 @@ def heat(
 
 def conduction(
     mesh: Any,
-    k: Unknown,
+    k: fem.Unknown,
     dirichlet: Mapping[str, Any] | None = None,
     *,
-    C: float | Callable[[Place], Any] | Unknown,
-    loss: Unknown | None = None,
-    transfer: Unknown | None = None,
-    source: Unknown | None = None,
+    C: float | Callable[[fem.Place], Any] | fem.Unknown,
+    loss: fem.Unknown | None = None,
+    transfer: fem.Unknown | None = None,
+    source: fem.Unknown | None = None,
     element: Any = None,
     unit: str = "degC",
 ) -> Model:
@@ -130,9 +118,11 @@ def conduction(
     ... )
     """
     unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
-    if isinstance(C, Field | Piecewise | Scalars):  # grad(1/C) would be a term of its own
+    if isinstance(
+        C, fem.Field | fem.Piecewise | fem.Scalars
+    ):  # grad(1/C) would be a term of its own
         raise ModelError("conduction: an unknown C must be one number; give a Scalar or a prior.")
-    if isinstance(C, Scalar | Prior):
+    if isinstance(C, fem.Scalar | fem.Prior):
         unknowns["C"] = C
         return _model("conduction", mesh, "k", unknowns, dirichlet, lambda x: 1.0, element, unit)
     if not callable(C) and not C > 0:
@@ -145,9 +135,9 @@ def _model(
     name: str,
     mesh: Any,
     conductivity: str,
-    unknowns: Mapping[str, Unknown | None],
+    unknowns: Mapping[str, fem.Unknown | None],
     dirichlet: Mapping[str, Any] | None,
-    capacity: Callable[[Place], Any],
+    capacity: Callable[[fem.Place], Any],
     element: Any,
     unit: str,
 ) -> Model:
@@ -160,7 +150,7 @@ def _model(
         return q.C if "C" in given else 1.0
 
     terms: list[Any] = [
-        lambda q, u, v, x: getattr(q, conductivity) / per(q) * dot(grad(u), grad(v)),
+        lambda q, u, v, x: getattr(q, conductivity) / per(q) * fem.dot(fem.grad(u), fem.grad(v))
     ]
     if "loss" in given:
         terms += _exchange("loss", per)
@@ -169,7 +159,7 @@ def _model(
     if "source" in given:
         terms.append(lambda q, _, v, x: -q.source / per(q) * v)
     return Model(
-        Field(mesh, element or linear(mesh), dirichlet=held, unit=unit),
+        fem.Field(mesh, element or fem.linear(mesh), dirichlet=held, unit=unit),
         given,
         A=terms,
         M=lambda u, v, x: capacity(x) * u * v,
@@ -186,7 +176,9 @@ def _exchange(coefficient: str, per: Callable[[Any], Any]) -> list[Any]:
     ]
 
 
-def _transfer(name: str, mesh: Any, held: Mapping[str, Any], per: Callable[[Any], Any]) -> list[On]:
+def _transfer(
+    name: str, mesh: Any, held: Mapping[str, Any], per: Callable[[Any], Any]
+) -> list[fem.On]:
     """Return the Robin terms at the named boundaries without a value."""
     free = (
         [] if "boundary" in held else [side for side in mesh.boundaries or {} if side not in held]
@@ -196,7 +188,7 @@ def _transfer(name: str, mesh: Any, held: Mapping[str, Any], per: Callable[[Any]
             f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
             "it out, or leave one out of dirichlet."
         )
-    return [On(side, term) for side in free for term in _exchange("transfer", per)]
+    return [fem.On(side, term) for side in free for term in _exchange("transfer", per)]
 
 
 SURROUNDINGS = {
@@ -216,7 +208,7 @@ HEAT = Equation(
     },
     inputs=SURROUNDINGS,
     build=by_name(heat),
-    element=linear,
+    element=fem.linear,
     fluxes=Fluxes("K m/s", "m/s", "K/s"),
     conductivity="alpha",
 )
@@ -236,7 +228,7 @@ CONDUCTION = Equation(
     inputs=SURROUNDINGS,
     options={"C": Option("J/(m^3 K)", "volumetric heat capacity")},
     build=by_name(conduction),
-    element=linear,
+    element=fem.linear,
     fluxes=Fluxes("W/m^2", "W/(m^2 K)", "W/m^3"),
     conductivity="k",
     storage="C",

@@ -342,11 +342,7 @@ KDV = Equation(
 
 
 def kuramoto_sivashinsky(
-    mesh: Any,
-    advection: Number,
-    instability: Number,
-    damping: Number,
-    u0: Unknown | None = None,
+    mesh: Any, advection: Number, instability: Number, damping: Number, u0: Unknown | None = None
 ) -> Model:
     """Return u_t + a u u_x + b u_xx + c u_xxxx = 0 on a periodic interval.
 

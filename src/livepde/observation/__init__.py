@@ -5,7 +5,6 @@ from __future__ import annotations
 from livepde.observation.combined import Calibrated, Combined, Transformed, TransformedObserved
 from livepde.observation.functionals import FluxPlates, Functionals
 from livepde.observation.operator import Observation, Observed
-from livepde.observation.placed import Moving
 from livepde.observation.reconstruction import (
     Alpha,
     Apriori,
@@ -17,7 +16,7 @@ from livepde.observation.reconstruction import (
     Split,
     Tikhonov,
 )
-from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Points
+from livepde.observation.sensors import Averages, LineIntegrals, Matrix, Moving, Points
 from livepde.observation.subdomain import Full, Subdomain
 
 __all__ = [

@@ -64,7 +64,15 @@ class Combined(Observation):
 
     @property
     def unknowns(self) -> Mapping[str, Unknown]:
-        return _all_unknowns(self.parts)
+        found: dict[str, Unknown] = {}
+        for part in self.parts:
+            if both := found.keys() & part.unknowns.keys():
+                raise ObservationError(
+                    f"Combined: two parts have the unknown '{min(both)}'; put their sensors "
+                    "together."
+                )
+            found |= part.unknowns
+        return found
 
     @property
     def nodal(self) -> bool:
@@ -83,19 +91,6 @@ class Combined(Observation):
         self, state: FunctionSpace, X: HilbertSpace, parameter: FunctionSpace
     ) -> CombinedObserved:
         return CombinedObserved(self, state, X, parameter)
-
-
-def _all_unknowns(parts: Sequence[Observation]) -> dict[str, Unknown]:
-    """Return the unknowns of all parts, each name of one part only."""
-    found: dict[str, Unknown] = {}
-    for part in parts:
-        for name, unknown in part.unknowns.items():
-            if name in found:
-                raise ObservationError(
-                    f"Combined: two parts have the unknown '{name}'; put their sensors together."
-                )
-            found[name] = unknown
-    return found
 
 
 class CombinedObserved(Observed):

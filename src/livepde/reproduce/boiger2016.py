@@ -23,12 +23,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 
 from livepde import paper, plots
-from livepde.diagnostics.check_report import Check, Table
+from livepde.diagnostics.check_report import Bound, Check, Sense, Table
 from livepde.identifier import Identifier
 from livepde.laws import AnyLaw, ConstantDamping, ResidualDamping
 from livepde.linalg import Array
@@ -112,17 +113,11 @@ class NoisyTwin:
 class Ensemble:
     """Runs of one law on the same exact data with several noise realisations.
 
-    Attributes
-    ----------
-    times
-        Shape (samples,).
-    energy, error, size
-        Energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the gain, relative L2 error
-        of q, and ||q^||_L2, each of shape (seeds, samples).
-    result
-        The run of the first seed.
-    failed
-        Number of samples with a failed step, over all seeds.
+    `times`: shape (samples,).
+    `energy`, `error`, `size`: energy ||e||_Q^2 + ||r||_X^2 with r = R(u^ - u*), not divided by the
+    gain, relative L2 error of q, and ||q^||_L2, each of shape (seeds, samples).
+    `result`: the run of the first seed.
+    `failed`: number of samples with a failed step, over all seeds.
     """
 
     times: Array
@@ -292,9 +287,7 @@ def made(alone: Ensemble) -> float:
 
 
 def excited_noise(
-    seeds: Sequence[int] = SEEDS,
-    progress: bool = False,
-    kinds: Sequence[Kind] = ("nodal", "band"),
+    seeds: Sequence[int] = SEEDS, progress: bool = False, kinds: Sequence[Kind] = ("nodal", "band")
 ) -> tuple[Runs, Table]:
     """Run the second figure on the excited twin; nodal noise with the first seed only."""
     case = excited_case()
@@ -319,44 +312,25 @@ def semiconvergence(runs: Runs, levels: Sequence[float]) -> list[Check]:
     """
     band = [runs["band, mu = 1", level] for level in levels]
     turning = [float(found.turning.mean()) for found in band]
+    shares = [f"{level:.0%}" for level in levels]
     checks = [
         Check(
-            f"excited: time of least error, {levels[k]:.0%} minus {levels[k + 1]:.0%} noise",
-            turning[k] - turning[k + 1],
-            EARLIER,
-            ">=",
+            f"excited: time of least error, {low} minus {high} noise", before - after, EARLIER, ">="
         )
-        for k in range(len(levels) - 1)
+        for (low, before), (high, after) in pairwise(zip(shares, turning, strict=True))
     ]
-    checks.append(
-        Check(
-            f"excited: energy at t = 75 over that at t = 0, {levels[0]:.0%} noise",
-            float(band[0].mean[-1] / band[0].mean[0]),
-            FALLEN,
-            "<=",
-        )
-    )
+    name = f"excited: energy at t = 75 over that at t = 0, {shares[0]} noise"
+    checks.append(Check(name, float(band[0].mean[-1] / band[0].mean[0]), FALLEN, "<="))
     for low, high in ((0, 1), (1, 2)):
-        checks.append(
-            Check(
-                f"excited: late energy, {levels[high]:.0%} over {levels[low]:.0%} noise",
-                band[high].late / band[low].late,
-                RISEN,
-                ">=",
-            )
-        )
-    least = float(band[-1].mean.min())
-    worst = f"{levels[-1]:.0%} noise"
-    checks += [
-        Check(
-            f"excited: least energy over that at t = 0, {worst}",
-            least / float(band[-1].mean[0]),
-            LEAST,
-            "<=",
-        ),
+        name = f"excited: late energy, {shares[high]} over {shares[low]} noise"
+        checks.append(Check(name, band[high].late / band[low].late, RISEN, ">="))
+    least, worst = float(band[-1].mean.min()), f"{shares[-1]} noise"
+    name = f"excited: least energy over that at t = 0, {worst}"
+    return [
+        *checks,
+        Check(name, least / float(band[-1].mean[0]), LEAST, "<="),
         Check(f"excited: late energy over the least, {worst}", band[-1].late / least, RISEN, ">="),
     ]
-    return checks
 
 
 def run(truth: str = "discrete", progress: bool = False) -> Outcome:
@@ -413,42 +387,21 @@ def first_checks(runs: dict[float, Track]) -> list[Check]:
 
 def _hidden(runs: Runs, alone: dict[float, Ensemble]) -> list[Check]:
     """Return the checks of the paper's example: the noise hides q*, 1 % of it does not."""
-    worst, least = LEVELS[-1], LEVELS[0] * PAPER["band, c1 = 1"].share
+    worst, low = LEVELS[-1], LEVELS[0]
+    least = low * PAPER["band, c1 = 1"].share
 
-    def error(name: str, level: float) -> float:
-        return float(runs[name, level].error[:, -1].mean())
+    def check(what: str, name: str, level: float, bound: Bound, sense: Sense) -> Check:
+        error = float(runs[name, level].error[:, -1].mean())
+        return Check(f"paper's example, {what}", error, bound, sense)
 
+    drawn = "paper's example, 10 % band noise, where q* = 0: q^ at t = 75 over ||q*||"
+    at = "error of q at t = 75"
     return [
-        Check(
-            "paper's example, 0.01 % band noise: error of q at t = 75",
-            error("band, c1 = 1", least),
-            LEARNED,
-            "<=",
-        ),
-        Check(
-            "paper's example, 10 % band noise: error of q at t = 75, mu = 1",
-            error("band, mu = 1", worst),
-            SWAMPED,
-            ">=",
-        ),
-        Check(
-            "paper's example, 10 % band noise, where q* = 0: q^ at t = 75 over ||q*||",
-            made(alone[worst]),
-            SWAMPED,
-            ">=",
-        ),
-        Check(
-            "paper's example, 1 % band noise: error of q at t = 75, mu = 10",
-            error("band, mu = 10", LEVELS[0]),
-            (0.9, 1.1),
-            "in",
-        ),
-        Check(
-            "paper's example, 1 % nodal noise: error of q at t = 75, mu = 1",
-            error("nodal, mu = 1", LEVELS[0]),
-            SWAMPED,
-            ">=",
-        ),
+        check(f"0.01 % band noise: {at}", "band, c1 = 1", least, LEARNED, "<="),
+        check(f"10 % band noise: {at}, mu = 1", "band, mu = 1", worst, SWAMPED, ">="),
+        Check(drawn, made(alone[worst]), SWAMPED, ">="),
+        check(f"1 % band noise: {at}, mu = 10", "band, mu = 10", low, (0.9, 1.1), "in"),
+        check(f"1 % nodal noise: {at}, mu = 1", "nodal, mu = 1", low, SWAMPED, ">="),
     ]
 
 

@@ -63,15 +63,10 @@ class Failing(Protocol):
 class Track:
     """Run with the errors against its truth.
 
-    Attributes
-    ----------
-    times, errors
-        Relative L2 error of q after each sample, both of shape (samples,).
-    u_error
-        Relative error of the state in X at the end.
-    divided
-        Number of samples with a divided step. A divided step has another truncation error than the
-        truth, which is enough to hide a parameter as small as the paper's.
+    `times`, `errors`: relative L2 error of q after each sample, both of shape (samples,).
+    `u_error`: relative error of the state in X at the end.
+    `divided`: number of samples with a divided step. A divided step has another truncation error
+    than the truth, which is enough to hide a parameter as small as the paper's.
     """
 
     result: Result

@@ -172,9 +172,7 @@ def _distance(one: Twin, other: Twin) -> float:
 
 
 def _learned(
-    tracks: dict[tuple[float, float], Track],
-    kept: dict[tuple[float, float], Track],
-    effect: float,
+    tracks: dict[tuple[float, float], Track], kept: dict[tuple[float, float], Track], effect: float
 ) -> tuple[Any, Any]:
     """Return checks and sentences for data of the same scheme: q is found."""
     checks = [
@@ -238,7 +236,7 @@ def _hidden(twin: Twin, tracks: dict[tuple[float, float], Track], effect: float)
         f"at t = 6 is {min(early):.1f} to {max(early):.1f}, whatever the gain, against 1.0 for "
         f"q = 0; at t = 60, where the state hardly moves any more, {min(late):.1f} to "
         f"{max(late):.1f}. This is a limit of the time step, not of the method: with --truth "
-        "discrete, where data and estimator share the scheme, it finds q.",
+        "discrete, where data and estimator share the scheme, it finds q."
     ]
     return checks, notes
 

@@ -1,12 +1,18 @@
-"""Conversion of the times of data: numbers, or dates."""
+"""Conversion of the times of data, numbers or dates, and the times of each channel of a source.
+
+The program never changes a time of a source. A row far ahead waits until the rows that follow agree
+with it; a row that went back is not used. Both are reported, with the key that corrects a wrong
+clock.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta, tzinfo
 from itertools import product
 from typing import Any, TypeAlias
@@ -26,6 +32,11 @@ ORDERS = ("%d-%m-%Y", "%m-%d-%Y", "%Y-%m-%d", "%d-%m-%y", "%m-%d-%y", "%y-%m-%d"
 POINTED = ("%d-%m-%Y", "%d-%m-%y", "%Y-%m-%d")  # with points the day is always before the month
 HOURS = ("", *(f" {h}" for h in ("%H:%M", "%H:%M:%S", "%H:%M:%S.%f")))
 HOURS += tuple(f" {h}{p}" for h in ("%I:%M", "%I:%M:%S") for p in (" %p", "%p"))
+FORMATS = tuple(  # of dates that loggers and spreadsheets write, except ISO
+    order.replace("-", mark) + hour
+    for mark, hour in product("/-. ", HOURS)
+    for order in (ORDERS if mark != "." else POINTED)
+)
 POINT = str.maketrans(",.", ".,")  # so that a point where commas are decimals is no number
 
 
@@ -81,10 +92,6 @@ class Clock:
                 high = math.nextafter(self._bound(next_day, dates, f"{where}: stop"), low)
         return low, high
 
-    def set_back(self, t: float) -> bool:
-        """Return whether the clocks of the zone show a time, given since 1970, twice."""
-        return self.repeated_hour(t) != 0.0
-
     def repeated_hour(self, t: float) -> float:
         """Return how much later the clocks show a time again, given since 1970, or 0."""
         try:
@@ -127,17 +134,9 @@ def read_times(
 ) -> tuple[Array, bool]:
     """Return times in the model's unit, and whether they are dates.
 
-    Parameters
-    ----------
-    where
-        Names a cell.
-    before
-        Whether earlier ones were dates, if there were any.
-
-    Raises
-    ------
-    SampleError
-        A time that cannot be read, with the likely remedy.
+    `where`: names a cell.
+    `before`: whether earlier ones were dates, if there were any.
+    Raises `SampleError`: a time that cannot be read, with the likely remedy.
     """
     dates = _are_dates(cells, clock, before)
     times = np.empty(len(cells))
@@ -159,14 +158,9 @@ def with_second_passes(
     A date without a zone of its own that is not later than those before it belongs to the second
     pass of such an hour, unless its row repeats an earlier one.
 
-    Parameters
-    ----------
-    times
-        In the model's unit since 1970, as of the first pass.
-    cells
-        The dates as they are written.
-    repeats
-        Whether a row has the values of another row.
+    `times`: in the model's unit since 1970, as of the first pass.
+    `cells`: the dates as they are written.
+    `repeats`: whether a row has the values of another row.
     """
     if not (np.diff(times) <= 0.0).any():
         return times
@@ -228,12 +222,13 @@ def date_formats(cells: Sequence[str]) -> list[str]:
     >>> date_formats(["06/28/2016 11:45 PM", "06/29/2016 12:00 AM"])
     ['%m/%d/%Y %I:%M %p']
     """
-    forms = dict.fromkeys(["", *_known_formats(), *map(guessed_format, cells[:FIRST_CELLS])])
+    forms = dict.fromkeys(["", *FORMATS, *map(guessed_format, cells[:FIRST_CELLS])])
     steps = {form: np.diff(given) for form in forms if len(given := _stamps(cells, form))}
     if "" in steps:
         return [""]
     steps = {form: step for form, step in steps.items() if (step >= 0).all()} or steps
-    even = [form for form, step in steps.items() if _are_even(step)]
+    # Steps are even if the longest is barely longer than their median.
+    even = [n for n, s in steps.items() if len(s) > 1 and 0 < s.max() <= 1.5 * np.median(s)]
     return even if len(even) == 1 else list(steps)
 
 
@@ -246,18 +241,6 @@ def _stamps(cells: Sequence[str], form: str) -> Array:
     stamps = (clock.stamp(cell, form) for cell in cells)
     given = np.array([stamp for stamp in stamps if stamp is not None])
     return given if len(given) > MOST * len(cells) else np.empty(0)
-
-
-def _are_even(steps: Array) -> bool:
-    """Return whether the longest of several steps is barely longer than their median."""
-    return len(steps) > 1 and bool(0 < steps.max() <= 1.5 * np.median(steps))
-
-
-def _known_formats() -> Iterator[str]:
-    """Yield the formats of dates that loggers and spreadsheets write, except ISO."""
-    for mark, hour in product("/-. ", HOURS):
-        for order in ORDERS if mark != "." else POINTED:
-            yield order.replace("-", mark) + hour
 
 
 def guessed_format(text: str) -> str:
@@ -313,3 +296,108 @@ def _day_after(value: Any) -> date | None:
     if not isinstance(value, date) or isinstance(value, datetime):
         return None
     return value + timedelta(days=1)
+
+
+STEPS = 16  # last steps of a channel, of which the longest but one is the usual step
+NEXT = 1.5  # usual steps up to which a time is the next one
+CALM = 1.5  # intervals between two times that went back, after which a clock is steady again
+FAR = 10.0  # usual steps: a row that is farther ahead waits. It costs a delay, and no row
+NAN = math.nan
+
+
+def usual_of(steps: Sequence[float]) -> float:
+    """Return the longest but one of several steps, NaN of none."""
+    # The longest step may be a pause of the source, which is not usual.
+    return sorted(steps)[-2:][0] if steps else NAN
+
+
+@dataclass
+class _Times:
+    """Times of one channel: the newest used one, steps, and late times since then."""
+
+    newest: float = -math.inf
+    steps: deque[float] = field(default_factory=lambda: deque(maxlen=STEPS))
+    late: float = NAN
+    went_back: bool = False
+    backs: deque[float] = field(default_factory=lambda: deque(maxlen=2))  # newest times then
+
+    def use(self, t: float) -> bool:
+        """Note a time that is used; return whether it shows that the clock was set back."""
+        # Late times that lead on to this one: the clock stays as it is. Else it was wrong for a
+        # while, or a source has sent its past.
+        shifted = self.went_back and t - self.late <= NEXT * usual_of(self.steps)
+        if 0.0 < t - self.newest < math.inf:
+            self.steps.append(t - self.newest)
+        self.newest = max(self.newest, t)
+        self.late, self.went_back = NAN, False
+        return shifted
+
+    @property
+    def unsteady(self) -> bool:
+        """Whether the clock has gone back repeatedly, and not been right for long since then."""
+        if len(self.backs) < 2:
+            return False
+        return self.newest - self.backs[-1] < CALM * (self.backs[-1] - self.backs[0])
+
+    def refuse(self, t: float) -> bool:
+        """Note a late time; return whether it is the first that shows that the clock went back."""
+        # One late row is a row that was delayed. Two that follow one another, with no row in order
+        # between them, show a clock that went back or a source that sends its past.
+        begins = t > self.late and not self.went_back
+        self.went_back |= begins
+        if begins:
+            self.backs.append(self.newest)
+        self.late = t
+        return begins
+
+
+class ChannelTimes:
+    """Times of the channels of a source, each by its own steps.
+
+    `recent`: times and values of the last samples of an earlier session.
+    """
+
+    def __init__(self, recent: Iterable[tuple[float, Mapping[str, float]]] = ()) -> None:
+        self._known: dict[str, _Times] = {}
+        for t, values in recent:
+            self.use(t, values)
+
+    def usual(self, values: Mapping[str, float]) -> float:
+        """Return the usual step of the slowest channel with a value in a row; NaN if unknown."""
+        known = (self._known[name] for name in present(values) if name in self._known)
+        return max((usual_of(times.steps) for times in known if times.steps), default=NAN)
+
+    @property
+    def slowest(self) -> float:
+        """Usual step of the slowest channel; NaN if unknown."""
+        return self.usual(dict.fromkeys(self._known, 0.0))
+
+    def use(self, t: float, values: Mapping[str, float]) -> bool:
+        """Note the time of a row that is used; return whether its clock was set back before."""
+        shown = [self._known.setdefault(name, _Times()).use(t) for name in present(values)]
+        return any(shown)
+
+    def refuse(self, t: float, values: Mapping[str, float]) -> bool:
+        """Note the time of a late row; return whether it shows first that its clock went back."""
+        shown = [self._known.setdefault(name, _Times()).refuse(t) for name in present(values)]
+        return any(shown)
+
+    def withdraw(self, last: float) -> None:
+        """Forget that times later than this one were used."""
+        for times in self._known.values():
+            times.newest = min(times.newest, last)
+
+    @property
+    def unsteady(self) -> list[str]:
+        """Channels whose clock goes back again and again."""
+        return [name for name, times in self._known.items() if times.unsteady]
+
+    @property
+    def went_back(self) -> dict[str, float]:
+        """Channels whose clock went back, with the time of their last late row."""
+        return {name: times.late for name, times in self._known.items() if times.went_back}
+
+
+def present(values: Mapping[str, float]) -> list[str]:
+    """Return the channels with a value, or all channels of a row without any."""
+    return [name for name, value in values.items() if not math.isnan(value)] or list(values)

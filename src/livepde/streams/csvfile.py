@@ -17,6 +17,7 @@ import numpy as np
 
 from livepde.errors import DataError, SampleError
 from livepde.linalg import Array
+from livepde.streams import table
 from livepde.streams.clock import (
     POINT,
     Clock,
@@ -24,17 +25,6 @@ from livepde.streams.clock import (
     has_decimal_comma,
     number_of,
     read_times,
-)
-from livepde.streams.table import (
-    MISSING,
-    Column,
-    DataTable,
-    cell_number,
-    check_columns,
-    decimal_marks,
-    is_data,
-    no_file,
-    to_table,
 )
 
 T = TypeVar("T")
@@ -72,7 +62,7 @@ class Written:
 
 def read_csv(
     path: str | Path,
-    columns: Mapping[str, Column],
+    columns: Mapping[str, table.Column],
     clock: Clock,
     *,
     every: int = 1,
@@ -80,7 +70,7 @@ def read_csv(
     separator: str = ",",
     encoding: str = UTF_8,
     skip: int = 0,
-) -> DataTable:
+) -> table.DataTable:
     """Read channels from a CSV file with one header line.
 
     Parameters
@@ -105,13 +95,13 @@ def read_csv(
         message names file, row (the header is row 1) and column.
     """
     path = Path(path)
-    decimals = decimal_marks(columns)
+    decimals = table.decimal_marks(columns)
     needed = list(dict.fromkeys([*clock.names, *decimals]))
     try:
         _check_text(path)
         rows, cells = _cells(path, needed, separator, encoding, clock, skip)
     except FileNotFoundError:
-        raise no_file(path) from None
+        raise table.no_file(path) from None
     except UnicodeError as error:
         raise _not_text(path, separator, encoding, clock, skip) from error
     except (OSError, csv.Error) as error:
@@ -130,7 +120,9 @@ def read_csv(
         return f"{path}, row {rows[k]}, column '{clock.name}'"
 
     written = stamps if dates else None
-    return to_table(times, written, numbers, columns, clock, every, missing, (f"{path}", where))
+    return table.to_table(
+        times, written, numbers, columns, clock, every, missing, (f"{path}", where)
+    )
 
 
 def is_title(cells: Sequence[str]) -> bool:
@@ -148,7 +140,7 @@ def are_labels(cells: Sequence[str]) -> bool:
     return bool(texts) and not any(
         not text.isprintable()
         or text[0].isdigit()
-        or text.lower() in MISSING
+        or text.lower() in table.MISSING
         or number_of(text, ",") is not None
         for text in texts
     )
@@ -240,7 +232,7 @@ def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
         with path.open(newline="", encoding=encoding, errors="replace") as file:
             text = file.read(LOOK)
     except FileNotFoundError:
-        raise no_file(path) from None
+        raise table.no_file(path) from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
     # The last line may be cut off.
@@ -254,7 +246,7 @@ def _time_formats(
     """Return the formats of the first named column that may hold dates; none without one."""
     for k, name in enumerate(header):
         texts = [row[k].strip() for row in rows if k < len(row)]
-        texts = [text for text in texts if text.lower() not in MISSING]
+        texts = [text for text in texts if text.lower() not in table.MISSING]
         if not name or not texts or number_of(texts[0], decimal) is not None:
             continue
         if formats := tuple(filter(None, date_formats(texts))):  # not of ISO dates
@@ -367,7 +359,7 @@ def _cells(
 
 def _check_names(path: Path, header: list[str], needed: list[str]) -> None:
     """Refuse a header without a needed column, or with two of its name."""
-    check_columns(str(path), needed, header, told=is_data(path))
+    table.check_columns(str(path), needed, header, told=table.is_data(path))
     for name in needed:
         if header.count(name) > 1:
             raise SampleError(f"{path}: two columns are called '{name}'; rename one.")
@@ -417,7 +409,7 @@ def _numbers(
     if np.isinf(found).any():
         found = np.array(
             [
-                cell_number(cell, f"{where}, row {row}, column '{name}'", decimal)
+                table.cell_number(cell, f"{where}, row {row}, column '{name}'", decimal)
                 for cell, row in zip(cells, rows, strict=True)
             ]
         )

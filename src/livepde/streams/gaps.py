@@ -107,13 +107,9 @@ def _threshold(x: Array, size: Array, beyond: float) -> Array:
 def find_spikes(t: Array, x: Array, beyond: float = BEYOND) -> Mask:
     """Return which known values of a channel are spikes, shape (values,).
 
-    Parameters
-    ----------
-    t, x
-        Times and finite values, in order.
-    beyond
-        Distance from the cubic through the neighbours above which a value is suspect, in robust
-        standard deviations: the sum of the global and the local one.
+    `t`, `x`: times and finite values, in order.
+    `beyond`: distance from the cubic through the neighbours above which a value is suspect, in
+    robust standard deviations: the sum of the global and the local one.
     """
     spikes = np.zeros(len(x), dtype=bool)
     if len(x) < FEWEST + NEIGHBOURS - 1:
@@ -324,11 +320,8 @@ class FillGaps:
 class Filled(Iterable[Sample]):
     """A stream without gaps in its input channels.
 
-    Attributes
-    ----------
-    counts
-        (kind, channel) -> number of values in the last iteration that were "interpolated", refused
-        as a "spike", or passed on as "missing".
+    `counts`: (kind, channel) -> number of values in the last iteration that were "interpolated",
+    refused as a "spike", or passed on as "missing".
     """
 
     def __init__(self, stage: FillGaps, stream: Iterable[Any]) -> None:

@@ -11,23 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from livepde.errors import ConfigurationError, DataError, SampleError, optional
+from livepde.errors import ConfigurationError, SampleError
 from livepde.linalg import Array
 from livepde.samples import is_dataset, is_frame, noise_channel
+from livepde.streams import table as tables
 from livepde.streams.clock import CALLED_TIME, Clock
 from livepde.streams.csvfile import how_written, read_csv
-from livepde.streams.parquet import read_parquet
-from livepde.streams.table import (
-    JSON_LINES,
-    Column,
-    DataTable,
-    check_columns,
-    decimal_marks,
-    hint,
-    no_file,
-    read_json_lines,
-    tabulated,
-)
 from livepde.units import conversion
 
 INDEX = "__index_level_0__"  # how pandas names an index without a name in a Parquet file
@@ -43,27 +32,16 @@ def _is_time(name: str) -> bool:
 class Reading:
     """How the channels of an identifier are read from a table.
 
-    Attributes
-    ----------
-    channels
-        Channels that need a column.
-    optional
-        Channels that are read if there is such a column: noise of readings, places.
-    unit
-        The model's unit of time; empty if it has none.
-    sensor_units
-        Sensor -> unit of its readings in the model.
-    time
-        The column of times. Default: the index of a table, the coordinate of a dataset, else the
-        one column that is called time, t, date or the like.
-    time_unit
-        Unit of times that are numbers, default that of the model.
-    columns
-        Channel -> its column, if that has another name.
-    units
-        Sensor -> unit of its column, default that of the model.
-    strict
-        Whether a column that is no channel is an error; else it is ignored.
+    `channels`: channels that need a column.
+    `optional`: channels that are read if there is such a column: noise of readings, places.
+    `unit`: the model's unit of time; empty if it has none.
+    `sensor_units`: sensor -> unit of its readings in the model.
+    `time`: the column of times. Default: the index of a table, the coordinate of a dataset, else
+    the one column that is called time, t, date or the like.
+    `time_unit`: unit of times that are numbers, default that of the model.
+    `columns`: channel -> its column, if that has another name.
+    `units`: sensor -> unit of its column, default that of the model.
+    `strict`: whether a column that is no channel is an error; else it is ignored.
     """
 
     channels: Sequence[str]
@@ -76,16 +54,13 @@ class Reading:
     units: Mapping[str, str] = field(default_factory=dict)
     strict: bool = False
 
-    def table(self, data: Any) -> DataTable:
+    def table(self, data: Any) -> tables.DataTable:
         """Return the samples.
 
-        Raises
-        ------
-        DataError
-            A column that is missing, unknown or holds text; times that do not increase; a file
-            that cannot be read.
-        ConfigurationError
-            Options that do not fit the identifier; dates for a model without a unit of time.
+        Raises `DataError`: a column that is missing, unknown or holds text; times that do not
+        increase; a file that cannot be read.
+        Raises `ConfigurationError`: options that do not fit the identifier; dates for a model
+        without a unit of time.
         """
         self._check()
         if is_dataset(data):
@@ -105,7 +80,7 @@ class Reading:
             for name in given:
                 if name not in known:
                     raise ConfigurationError(
-                        f"{option}: there is no channel '{name}'{hint(name, known)}"
+                        f"{option}: there is no channel '{name}'{tables.hint(name, known)}"
                     )
         for name in self.units:
             if not self.sensor_units.get(name):
@@ -139,15 +114,11 @@ class Reading:
         names: Sequence[str],
         units: Mapping[str, str],
         decimal: str = ".",
-    ) -> dict[str, Column]:
+    ) -> dict[str, tables.Column]:
         """Return the column of each channel that has one, all checked.
 
-        Parameters
-        ----------
-        names
-            Columns of the data.
-        units
-            Column -> its unit, of data that state one.
+        `names`: columns of the data.
+        `units`: column -> its unit, of data that state one.
         """
         found = {}
         for name in (*self.channels, *self.optional):
@@ -155,19 +126,20 @@ class Reading:
             if column not in names:
                 if name in self.optional and name not in self.columns:
                     continue
+                hint = tables.hint(column, list(names))
                 raise SampleError(
-                    f"{where}: there is no column '{column}'{hint(column, list(names))} If it has "
-                    f"another name, give columns={{'{name}': ...}}."
+                    f"{where}: there is no column '{column}'{hint} If it has another name, give "
+                    f"columns={{'{name}': ...}}."
                 )
             unit, own = self.units.get(name, units.get(column, "")), self.sensor_units.get(name)
             rule = conversion(unit or own, own, f"units of '{name}'") if own else None
-            found[name] = Column((column,), decimal=decimal)
+            found[name] = tables.Column((column,), decimal=decimal)
             if rule is not None:
                 found[name] = replace(found[name], factor=rule.factor, offset=rule.offset)
         for name in self.channels:  # of a reading that has its own
             if (noise := noise_channel(name)) in found:
                 factor, names_of = found[name].factor, found[noise].names
-                found[noise] = Column(names_of, factor, decimal=decimal, noise_of=name)
+                found[noise] = tables.Column(names_of, factor, decimal=decimal, noise_of=name)
         used = {time, *(column.names[0] for column in found.values())}
         if self.strict and (more := [name for name in names if name not in used]):
             raise SampleError(
@@ -179,7 +151,7 @@ class Reading:
     def _time(self, where: str, names: Sequence[str]) -> str:
         """Return the column of times."""
         if self.time is not None:
-            check_columns(where, [self.time], list(names))
+            tables.check_columns(where, [self.time], list(names))
             return self.time
         taken = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
         free = [name for name in names if name not in taken]
@@ -196,7 +168,7 @@ class Reading:
             f"time={(called or free or ['t'])[0]!r}."
         )
 
-    def _frame(self, data: Any) -> DataTable:
+    def _frame(self, data: Any) -> tables.DataTable:
         """Return the samples of a pandas table."""
         names = [str(name) for name in data.columns]
         if twice := [name for name in names if names.count(name) > 1]:
@@ -224,7 +196,7 @@ class Reading:
             )
         return True
 
-    def _dataset(self, data: Any) -> DataTable:
+    def _dataset(self, data: Any) -> tables.DataTable:
         """Return the samples of an xarray dataset, whose variables may state their units."""
         wanted = {self.columns.get(name, name) for name in (*self.channels, *self.optional)}
         dims = {dim for name in data.data_vars if name in wanted for dim in data[name].dims}
@@ -246,32 +218,30 @@ class Reading:
 
     def _tabulated(
         self, time: str, times: Any, series: Mapping[str, Any], units: Mapping[str, str]
-    ) -> DataTable:
+    ) -> tables.DataTable:
         """Return the samples in columns of pandas."""
         unit = self.time_unit or units.get(time)
         if times.dtype.kind == "m":
             self._need_unit("the times are durations")
             times, unit = np.asarray(times) / np.timedelta64(1, "s"), "s"
         columns = self._columns("data", time, list(series), units)
-        needed = decimal_marks(columns)
+        needed = tables.decimal_marks(columns)
         values = {name: _numbers(name, series[name]) for name in needed}
-        return tabulated(times, values, columns, self._clock(time, unit), where="data")
+        return tables.tabulated(times, values, columns, self._clock(time, unit), where="data")
 
-    def _file(self, path: Path) -> DataTable:
+    def _file(self, path: Path) -> tables.DataTable:
         """Return the samples of a file; its extension gives the format."""
         where = str(path)
-        if path.suffix in JSON_LINES:
-            names = _first_keys(path)
+        if path.suffix in (*tables.JSON_LINES, ".parquet"):
+            if path.suffix == ".parquet":
+                read = tables.read_parquet
+                with tables.parquet_file(path) as file:
+                    names = list(file.schema_arrow.names)
+            else:
+                read, names = tables.read_json_lines, _first_keys(path)
             time = self._time(where, names)
-            return read_json_lines(
-                path, self._columns(where, time, names, {}), self._clock(time, self.time_unit)
-            )
-        if path.suffix == ".parquet":
-            names = _parquet_names(path)
-            time = self._time(where, names)
-            return read_parquet(
-                path, self._columns(where, time, names, {}), self._clock(time, self.time_unit)
-            )
+            columns = self._columns(where, time, names, {})
+            return read(path, columns, self._clock(time, self.time_unit))
         written = how_written(path)
         time = self._time(where, written.header)
         if len(written.time_formats) > 1:
@@ -308,21 +278,7 @@ def _first_keys(path: Path) -> list[str]:
         with path.open(encoding="utf-8") as file:
             first = json.loads(next((line for line in file if line.strip()), "{}"))
     except FileNotFoundError:
-        raise no_file(path) from None
+        raise tables.no_file(path) from None
     except (OSError, ValueError) as error:
         raise SampleError(f"{path}, line 1: is not JSON ({error}).") from error
     return list(first) if isinstance(first, dict) else []
-
-
-def _parquet_names(path: Path) -> list[str]:
-    """Return the names of the columns of a Parquet file."""
-    with optional("parquet", "Parquet files need pyarrow", DataError):
-        import pyarrow as pa
-        from pyarrow.parquet import read_schema
-    try:
-        return list(read_schema(path).names)
-    except FileNotFoundError:
-        raise no_file(path) from None
-    except (OSError, pa.ArrowException) as error:
-        reason = str(error).splitlines()[0].rstrip(".")
-        raise DataError(f"{path} cannot be read as a Parquet file: {reason}.") from error

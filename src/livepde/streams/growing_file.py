@@ -179,7 +179,10 @@ class _Content:
             if used and self.follows is not None:
                 found += self._missed(chunk, *self.follows)
                 self.follows = None
-            self._advance(chunk[:used])
+            read = chunk[:used]
+            self.offset += used
+            self.head += read[: HEAD - len(self.head)]
+            self.tail = (self.tail + read[-TAIL:])[-TAIL:]
             found += lines
             if found or not used:
                 break
@@ -197,11 +200,6 @@ class _Content:
             f"{offset} between two reads are lost"
         )
         return [Line(self.number, 0, b"", "rewritten", text)]
-
-    def _advance(self, used: bytes) -> None:
-        self.offset += len(used)
-        self.head += used[: HEAD - len(self.head)]
-        self.tail = (self.tail + used[-TAIL:])[-TAIL:]
 
     def _split(self, chunk: bytes, grows: bool) -> tuple[list[Line], int]:
         """Return the lines of a chunk, and how many of its bytes they are."""

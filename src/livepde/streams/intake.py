@@ -18,8 +18,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 from livepde.dates import origin_at, since_1970
 from livepde.errors import DataError, SampleError
 from livepde.stepping import Between
-from livepde.streams.channel_times import FAR, ChannelTimes, present, usual_of
-from livepde.streams.clock import Clock, is_naive
+from livepde.streams.clock import FAR, ChannelTimes, Clock, is_naive, present, usual_of
 from livepde.streams.gaps import BEYOND, RECENT, Series, decided
 from livepde.streams.table import Column, channel_value, row_time, without_noise
 
@@ -28,19 +27,12 @@ from livepde.streams.table import Column, channel_value, row_time, without_noise
 class Habit:
     """Arrival of one channel: waiting time, repeated values, interpolation and spikes.
 
-    Parameters
-    ----------
-    wait
-        Time for which a sample waits for this channel, if longer than `Policy.wait`.
-    repeated
-        Which of two values for one moment is kept; default that of the policy.
-    interpolated
-        A sample without this channel takes a value interpolated from the next one, if that comes
-        while the sample waits; it waits no longer then.
-    screened
-        A spike is refused, if two later values have come while the sample waited.
-    between
-        How the channel behaves between two readings.
+    `wait`: time for which a sample waits for this channel, if longer than `Policy.wait`.
+    `repeated`: which of two values for one moment is kept; default that of the policy.
+    `interpolated`: a sample without this channel takes a value interpolated from the next one, if
+    that comes while the sample waits; it waits no longer then.
+    `screened`: a spike is refused, if two later values have come while the sample waited.
+    `between`: how the channel behaves between two readings.
     """
 
     wait: float = 0.0
@@ -54,22 +46,14 @@ class Habit:
 class Policy:
     """Policy for rows that are late, incomplete, repeated, or ahead of the others.
 
-    Parameters
-    ----------
-    wait
-        Time for which a row may come after a later one; one that comes later still is refused.
-    tolerance
-        Rows whose times differ by at most so much are of one moment: that of the first.
-    leap
-        A row that is later than the newest one by more than this, or by more than ten usual steps
-        of its channels, waits until the rows after it agree with it; a row at the old times
-        refutes it.
-    repeated
-        Which of two values of a channel for one moment is kept, while the sample waits.
-    shift
-        Correction of a wrong clock, as the user states it: added to all times that come.
-    channels
-        Channel -> its own options.
+    `wait`: time for which a row may come after a later one; one that comes later still is refused.
+    `tolerance`: rows whose times differ by at most so much are of one moment: that of the first.
+    `leap`: a row that is later than the newest one by more than this, or by more than ten usual
+    steps of its channels, waits until the rows after it agree with it; a row at the old times
+    refutes it.
+    `repeated`: which of two values of a channel for one moment is kept, while the sample waits.
+    `shift`: correction of a wrong clock, as the user states it: added to all times that come.
+    `channels`: channel -> its own options.
     """
 
     wait: float = 0.0
@@ -116,25 +100,17 @@ Known: TypeAlias = tuple[float, Mapping[str, float]]  # time and values of an ac
 class Remark:
     """A countable irregularity of a row, a value or a sample.
 
-    Attributes
-    ----------
-    kind
-        Not used: "malformed" (unreadable, or without a value), "invalid" (outside of the valid
-        range), "spike", "late", "conflict" (another value than the one accepted for this time),
-        "leap" (a time too far ahead), "repeated" (a row that was accepted before with the same
-        values), "outside" (not between start and stop), "skipped" (a sample without a needed
-        channel). "clock": late rows follow one another, so that a clock went back. Used all the
-        same: "shifted" (late rows lead on to it: the clock was set back), "disordered" (came after
-        a later row), "missing" (a sample without this channel),
-        "interpolated" (the same, with a value between known ones).
-    channel
-        Channel of the value; '' for a whole row.
-    message
-        Description; of several remarks that of the first.
-    number
-        Number of occurrences.
-    row
-        Token of its row; for a sample that of the last row.
+    `kind`: not used: "malformed" (unreadable, or without a value), "invalid" (outside of the valid
+    range), "spike", "late", "conflict" (another value than the one accepted for this time), "leap"
+    (a time too far ahead), "repeated" (a row that was accepted before with the same values),
+    "outside" (not between start and stop), "skipped" (a sample without a needed channel). "clock":
+    late rows follow one another, so that a clock went back. Used all the same: "shifted" (late rows
+    lead on to it: the clock was set back), "disordered" (came after a later row), "missing" (a
+    sample without this channel), "interpolated" (the same, with a value between known ones).
+    `channel`: channel of the value; '' for a whole row.
+    `message`: description; of several remarks that of the first.
+    `number`: number of occurrences.
+    `row`: token of its row; for a sample that of the last row.
     """
 
     kind: str
@@ -155,12 +131,8 @@ def gather(found: dict[tuple[str, str], Remark], remark: Remark) -> None:
 class Ready:
     """A sample that is complete.
 
-    Attributes
-    ----------
-    t, values
-        Time, and values of the channels that have come.
-    tokens
-        Tokens of the source for the rows of the sample, to acknowledge them.
+    `t`, `values`: time, and values of the channels that have come.
+    `tokens`: tokens of the source for the rows of the sample, to acknowledge them.
     """
 
     t: float
@@ -216,30 +188,17 @@ class _Open:
 class Intake:
     """Ordering of rows into samples.
 
-    Parameters
-    ----------
-    columns
-        Channel -> its column.
-    clock
-        Conversion of the time column.
-    policy
-        Policy for rows out of order.
-    missing
-        Numbers that mean a missing value.
-    origin
-        Seconds since 1970 of t = 0 where times are dates; default the first row's.
-    dates
-        Whether times are dates; default as in the first row.
-    last
-        Time of the last sample taken in an earlier session; earlier rows are late.
-    recent
-        Times and values of the last samples of an earlier session, for channels that are
-        interpolated or screened.
+    `columns`: channel -> its column.
+    `clock`: conversion of the time column.
+    `policy`: policy for rows out of order.
+    `missing`: numbers that mean a missing value.
+    `origin`: seconds since 1970 of t = 0 where times are dates; default the first row's.
+    `dates`: whether times are dates; default as in the first row.
+    `last`: time of the last sample taken in an earlier session; earlier rows are late.
+    `recent`: times and values of the last samples of an earlier session, for channels that are
+    interpolated or screened.
 
-    Attributes
-    ----------
-    past
-        The samples in the journal, to recognise rows that were accepted before it had them all.
+    `past`: the samples in the journal, to recognise rows that were accepted before it had them all.
     """
 
     def __init__(

@@ -32,23 +32,12 @@ def join_tables(
     table has begun. Other channels without a value in that row have the one that their neighbours
     give: on a line, or the last or the next one.
 
-    Parameters
-    ----------
-    second
-        One second in the unit of time.
-    sensors
-        Channels that are not interpolated.
-    needed
-        Channels without which a row is left out.
-    where
-        Name of the data, for messages.
-    between
-        Channel -> how it behaves between two readings; a line if it is left out.
-
-    Raises
-    ------
-    DataError
-        Some times are dates and some numbers; or the tables have no time in common.
+    `second`: one second in the unit of time.
+    `sensors`: channels that are not interpolated.
+    `needed`: channels without which a row is left out.
+    `where`: name of the data, for messages.
+    `between`: channel -> how it behaves between two readings; a line if it is left out.
+    Raises `DataError`: some times are dates and some numbers; or the tables have no time in common.
     """
     times, first = _on_one_clock(tables, second, where)
     starts, ends = np.transpose([(t[0], t[-1]) for t in times])
@@ -102,12 +91,8 @@ def not_late(
     A channel without values stays where it is. A sensor whose times are early has no value at the
     start of the table, which begins as before; an input has to be known from the start.
 
-    Parameters
-    ----------
-    late
-        Channel -> how much later than its values its times are, in the unit of the times.
-    sensors
-        Channels that may be missing.
+    `late`: channel -> how much later than its values its times are, in the unit of the times.
+    `sensors`: channels that may be missing.
     """
     seen = np.isfinite(table.values)
     late = {name: by for name, by in late.items() if seen[:, table.names.index(name)].any()}

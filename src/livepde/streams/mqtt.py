@@ -521,16 +521,13 @@ class MqttSink(_Peer):
                     for topic, content in home_assistant(estimate, self._topic, self._title):
                         self._publish(topic, json.dumps(content))
                     discovered = True
-                self._publish_estimate(estimate)
+                row = estimate.to_dict()
+                self._publish(self._topic, json.dumps(row), retain=False)
+                for label, known in row["unknowns"].items():
+                    self._publish(_topic_of(self._topic, label), json.dumps(known))
             if last:
                 self._publish(f"{self._topic}/status", "offline")
                 return
-
-    def _publish_estimate(self, estimate: Estimate) -> None:
-        row = estimate.to_dict()
-        self._publish(self._topic, json.dumps(row), retain=False)
-        for label, known in row["unknowns"].items():
-            self._publish(_topic_of(self._topic, label), json.dumps(known))
 
     def _publish(self, topic: str, content: str, *, retain: bool = True) -> None:
         while not self._free.acquire(timeout=0.1):

@@ -1,4 +1,4 @@
-"""Samples from files of JSON lines, from JSON lines as they come, and from columns in memory."""
+"""Samples from JSON lines (a file, or as they come), Parquet files, and columns in memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from datetime import datetime
 from itertools import chain, islice
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from livepde.dates import origin_at
-from livepde.errors import DataError, SampleError, TimeOrderError
+from livepde.errors import DataError, SampleError, TimeOrderError, optional
 from livepde.linalg import Array, IntArray, Mask
 from livepde.samples import Sample
 from livepde.stepping import Between
@@ -30,7 +31,88 @@ from livepde.streams.clock import (
     read_times,
     with_second_passes,
 )
-from livepde.streams.thinned import Thinned
+
+
+class Thinned:
+    """Every n-th row of a stream, without the loss of a switch or of a share of a mean.
+
+    A row that would be left out stays as a row of its held inputs alone where one of them
+    (`between = "hold"`) changes. So does a row that lacks a channel that each sample needs. The
+    reading of a `"next"` channel becomes the mean, weighted by time, since the last row that stays.
+
+    `between`: behaviour of each column between two readings.
+
+    `held`: columns that are no "line", shape (columns,).
+
+    Examples
+    --------
+    >>> rows = Thinned(["line", "hold"])
+    >>> rows.take(0.0, np.array([20.0, 1.0]), chosen=True, whole=True)
+    array([20.,  1.])
+    >>> rows.take(1.0, np.array([21.0, 0.0]), chosen=False, whole=True)
+    array([nan,  0.])
+    """
+
+    def __init__(self, between: Sequence[Between]) -> None:
+        self.held: Mask = np.array([one != "line" for one in between], dtype=bool)
+        self._hold = [k for k, one in enumerate(between) if one == "hold"]
+        self._means = {k: _Mean() for k, one in enumerate(between) if one == "next"}
+        self._last = np.full(len(between), math.nan)
+        self._begun = False
+
+    def remember(self, row: Array) -> None:
+        """Remember the values of a row before the start that hold until the next reading."""
+        for k in self._hold:
+            if math.isfinite(row[k]):
+                self._last[k] = row[k]
+
+    def take(self, t: float, row: Array, *, chosen: bool, whole: bool) -> Array | None:
+        """Return what is left of a row, NaN where a column is missing; None if nothing.
+
+        `chosen`: whether `every` leaves the row.
+        `whole`: whether the row has all channels that a sample needs.
+        """
+        for k, mean in self._means.items():
+            mean.add(t, float(row[k]))
+        changed = any(math.isfinite(row[k]) and row[k] != self._last[k] for k in self._hold)
+        self.remember(row)
+        kept = chosen and whole
+        states = chosen and bool(np.isfinite(row[self.held]).any())
+        # Before the first row that is kept, values are remembered for it.
+        if not (kept or (self._begun and (changed or states))):
+            return None
+        found = row.copy() if kept else np.where(self.held, row, math.nan)
+        if kept and not self._begun:
+            found[self._hold] = self._last[self._hold]
+            self._begun = True
+        for k, mean in self._means.items():
+            found[k] = mean.taken() if math.isfinite(row[k]) else math.nan
+        return found
+
+
+class _Mean:
+    """Mean of the readings since it was last taken, each weighted by the time since the one before.
+
+    A missing reading leaves its time to the next one.
+    """
+
+    def __init__(self) -> None:
+        self._t = math.nan
+        self._parts: list[tuple[float, float]] = []  # time and value
+
+    def add(self, t: float, value: float) -> None:
+        if math.isfinite(value):
+            time = 0.0 if math.isnan(self._t) else t - self._t
+            self._t = t
+            self._parts.append((time, value))
+
+    def taken(self) -> float:
+        parts, self._parts = self._parts, []
+        whole = sum(time for time, _ in parts)
+        if len(parts) == 1 or whole == 0.0:
+            return parts[-1][1]
+        return sum(time * value for time, value in parts) / whole
+
 
 JSON_LINES = (".jsonl", ".ndjson")  # endings of files of JSON lines
 STREAM = "standard input"
@@ -280,9 +362,8 @@ def to_table(
     if dates:
         origin = origin_at(float(t[0]) / clock.second)
         t = t - t[0]
-    return DataTable(
-        t, values, tuple(columns), origin=origin, remarks=+remarks
-    )  # + drops counts of zero
+    remarks = +remarks  # drops counts of zero
+    return DataTable(t, values, tuple(columns), origin=origin, remarks=remarks)
 
 
 def _chosen(
@@ -298,7 +379,9 @@ def _chosen(
     late = np.flatnonzero(np.diff(times[use]) <= 0)
     if len(late):
         last, t = times[use[late[0] : late[0] + 2]]
-        raise _disorder(row(int(use[late[0] + 1])), bool(t == last), dates and clock.set_back(t))
+        raise _disorder(
+            row(int(use[late[0] + 1])), bool(t == last), dates and clock.repeated_hour(t) != 0.0
+        )
     return use
 
 
@@ -403,7 +486,7 @@ class JsonLines:
             elif first:
                 first = {}
             if t <= last:
-                raise _disorder(where, t == last, dates and clock.set_back(t))
+                raise _disorder(where, t == last, dates and clock.repeated_hour(t) != 0.0)
             if dates and math.isinf(last):  # the first sample is t = 0
                 zero = t
                 self.origin = origin_at(t / clock.second)
@@ -558,3 +641,57 @@ def no_file(path: Path) -> DataError:
         return DataError(f"there is no file '{path}'; did you mean '{below[0]}'?")
     known = sorted(item.name for item in path.parent.glob(f"*{path.suffix}") if item.is_file())
     return DataError(f"there is no file '{path}'{hint(path.name, known)}")
+
+
+@contextmanager
+def parquet_file(path: str | Path) -> Iterator[Any]:
+    """Open a Parquet file; raises `DataError` if there is none, or if it cannot be read."""
+    with optional("parquet", "Parquet files need pyarrow", DataError):
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetFile
+    try:
+        with ParquetFile(path) as file:
+            yield file
+    except FileNotFoundError:
+        raise no_file(Path(path)) from None
+    except (OSError, pa.ArrowException) as error:
+        reason = str(error).splitlines()[0].rstrip(".")
+        raise DataError(f"{path} cannot be read as a Parquet file: {reason}.") from error
+
+
+def read_parquet(
+    path: str | Path,
+    columns: Mapping[str, Column],
+    clock: Clock,
+    *,
+    every: int = 1,
+    missing: Iterable[float] = (),
+) -> DataTable:
+    """Read channels from a Parquet file; only the columns that are needed.
+
+    `columns`, `clock`, `every`, `missing`: as for `read_csv`; the time column may also hold dates
+    with or without a time zone.
+    Raises `DataError`: no such file or column, or it is not Parquet; text in a channel; times that
+    do not increase. The message names file, sample and column.
+    """
+    where = str(path)
+    names = decimal_marks(columns)
+    needed = [clock.name, *(name for name in names if name != clock.name)]
+    with parquet_file(path) as file:
+        check_columns(where, needed, file.schema_arrow.names)
+        frame = file.read(columns=needed)
+    values = {name: _numbers(frame.column(name), where, name) for name in names}
+    times = frame.column(clock.name).to_pylist()
+    return tabulated(times, values, columns, clock, every=every, missing=missing, where=where)
+
+
+def _numbers(column: Any, where: str, name: str) -> Array:
+    """Return a column as numbers, NaN where there is none."""
+    from pyarrow import float64, types
+
+    kind = column.type
+    tests = (types.is_integer, types.is_floating, types.is_decimal, types.is_null)
+    if not any(test(kind) for test in tests):
+        raise SampleError(f"{where}: column '{name}' is of type {kind}; expected numbers.")
+    numbers: Array = column.cast(float64(), safe=False).to_numpy()
+    return numbers

@@ -234,12 +234,7 @@ class Spaces:
 
 
 def constants(
-    spaces: Spaces,
-    q: Array,
-    states: Sequence[Array],
-    *,
-    moment: Moment = START,
-    gain: float = 1.0,
+    spaces: Spaces, q: Array, states: Sequence[Array], *, moment: Moment = START, gain: float = 1.0
 ) -> Constants:
     """Return the constants of Assumption ass:equation for the discretised model.
 

@@ -10,17 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from livepde.diagnostics.check_report import CheckReport, Table
+from livepde.diagnostics.theory import error_bounds
 from livepde.diagnostics.theory.constants import Spaces, constants
-from livepde.diagnostics.theory.error_bounds import (
-    OnlineStopping,
-    StoppingState,
-    TwinTracker,
-    bounds,
-    conditions,
-    noise_size,
-    reconstruction_matrix,
-    stopping_time,
-)
 from livepde.diagnostics.theory.excitation import Excitation, Spectrum, interpolation, link
 from livepde.errors import ConfigurationError, LivepdeError
 from livepde.fem import Inputs, Moment
@@ -196,7 +187,7 @@ class OnlineTracker:
         key, matrix = self._matrix(alpha)
         noise = None if callable(self.noise) else self._sizes.get(key)
         if noise is None:
-            noise = self._sizes[key] = noise_size(self.spaces, std, matrix)
+            noise = self._sizes[key] = error_bounds.noise_size(self.spaces, std, matrix)
         if alpha == 0:
             return noise
         lost = part.norms(matrix @ (observed.G @ u_alpha) - u_alpha)
@@ -213,7 +204,9 @@ class OnlineTracker:
                 self._sizes.clear()
             observed = self.identifier.observed
             self._matrices[key] = (
-                reconstruction_matrix(observed, alpha) if alpha > 0 else observed.split().inverse
+                error_bounds.reconstruction_matrix(observed, alpha)
+                if alpha > 0
+                else observed.split().inverse
             )
         return key, self._matrices[key]
 
@@ -229,9 +222,9 @@ class OnlineTracker:
             raise ConfigurationError("theory: no sample of the run contains a measurement.")
         return constants(self.spaces, self.last.q, self.states, moment=self.moment, gain=self.gain)
 
-    def stopping(self, c: Constants) -> StoppingState:
+    def stopping(self, c: Constants) -> error_bounds.StoppingState:
         """Return the surrogate of T*, which needs a noise level."""
-        rule = OnlineStopping(c)
+        rule = error_bounds.OnlineStopping(c)
         state = rule.init()
         for item in self.moments:
             if item.d is not None:
@@ -317,11 +310,13 @@ def theory_report(
     return TheoryReport(tuple(tables), tuple(reports), tuple(notes), found, spectrum, stopping)
 
 
-def _followed(twin: Twin | None, tracker: OnlineTracker, notes: list[str]) -> TwinTracker | None:
+def _followed(
+    twin: Twin | None, tracker: OnlineTracker, notes: list[str]
+) -> error_bounds.TwinTracker | None:
     if twin is None:
         return None
     try:
-        return TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
+        return error_bounds.TwinTracker(twin, tracker.spaces, tracker.gain, tracker.damping)
     except ConfigurationError as error:
         notes.append(str(error))
         return None
@@ -440,13 +435,13 @@ def _spectrum(tracker: OnlineTracker, tables: list[Table], notes: list[str]) -> 
 
 
 def _with_truth(
-    tracker: TwinTracker, c: Constants, law: Any, tables: list[Table]
+    tracker: error_bounds.TwinTracker, c: Constants, law: Any, tables: list[Table]
 ) -> list[CheckReport]:
     nu, sigma = getattr(law, "nu", 0.0), getattr(law, "sigma", 0.0)
     nu = float(nu) if isinstance(nu, int | float) else 0.0
     errors = tracker.errors
     noisy = tracker.twin.noise is not None
-    T = stopping_time(errors, c) if noisy else np.inf
+    T = error_bounds.stopping_time(errors, c) if noisy else np.inf
     first, last = errors[0], errors[-1]
     rows: list[tuple[Any, ...]] = [
         ("||e||_Q", first.e, last.e),
@@ -461,6 +456,6 @@ def _with_truth(
     data: Any = "noisy" if noisy else "exact"
     q_true = tracker.q_true
     return [
-        conditions(errors, c, data=data, nu=nu, sigma=sigma),
-        bounds(errors, c, data=data, nu=nu, sigma=sigma, q_true=q_true, until=T),
+        error_bounds.conditions(errors, c, data=data, nu=nu, sigma=sigma),
+        error_bounds.bounds(errors, c, data=data, nu=nu, sigma=sigma, q_true=q_true, until=T),
     ]
