@@ -386,6 +386,24 @@ def first_hour(
     return benchmark(tuple(chosen(only, WALKS, "walk", WALKS)), seeds=seeds, progress=True)
 
 
+@program.command(quick="Four wrong cases.")
+def compared(
+    *,
+    seeds: Annotated[int, Count(2, 1, "Truths of each wrong case.")],
+    quick: bool = False,
+    workers: Workers = None,
+) -> Outcome:
+    """Count how often `livepde compare` turns a wrong case into a right one without a hint.
+
+    Example:  python -m benchmarks compared --seeds 1
+    """
+    from benchmarks.compared import QUICK, WRONGS
+    from benchmarks.compared import compared as benchmark
+
+    wrongs = QUICK if quick else WRONGS
+    return benchmark(wrongs, seeds=seeds, workers=workers, progress=True)
+
+
 @program.command(
     quick="Of each process one jump up, one down and one calm run, and one data set for each "
     "wrong model: two false alarms are more than the bound, with all runs five are."

@@ -41,15 +41,15 @@ class Fault(NamedTuple):
     walk, channels
         The walk, and its channels; of several, either may be named.
     kind
-        "late" by some samples, "scaled", "fahrenheit" or "exchanged".
-    samples
-        How late, in intervals of the sensors.
+        "late", "scaled", "fahrenheit", "exchanged" or "offset".
+    amount
+        How late, in intervals of the sensors; by how much an "offset" is too high.
     """
 
     walk: str
     channels: tuple[str, ...]
     kind: str
-    samples: float = 0.0
+    amount: float = 0.0
 
     def __str__(self) -> str:
         return f"{self.walk}: {' and '.join(self.channels)} {self.kind}"
@@ -96,13 +96,15 @@ def with_fault(fault: Fault, header: Sequence[str], table: Array, columns: dict[
         found[:, places] = table[:, places[::-1]]
     elif fault.kind == "scaled":
         found[:, first] *= SCALE
+    elif fault.kind == "offset":
+        found[:, first] += fault.amount
     elif fault.kind == "fahrenheit":
         found[:, first] = 1.8 * table[:, first] + 32.0
     else:
         known = np.isfinite(table[:, first])
         # An interval of the sensors: rows of inputs that are written at changes lie between.
         seen = np.isfinite(table[:, -1])
-        delay = fault.samples * float(np.median(np.diff(t[seen])))
+        delay = fault.amount * float(np.median(np.diff(t[seen])))
         late = t[known] + delay
         if known.all():
             found[:, first] = np.interp(t, late, table[known, first])

@@ -1,0 +1,134 @@
+"""What `livepde compare` makes of wrong tables and wrong cases, without a hint what is wrong.
+
+The walks of docs/first-hour.md, each with one fault that a setting of the case could correct: a
+channel that is late, scaled, exchanged, in degrees Fahrenheit or off by a constant, or a case that
+states a wrong place or a wrong start. The recommended variant should be trusted or cautious, with
+the truth within its intervals.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmarks import ROOT
+from benchmarks.first_hour import FOLDER, TABLES, save
+from benchmarks.jobs import each
+from benchmarks.wrong_channels import FAULTS, Fault, with_fault
+from livepde.cases import load
+from livepde.cases.read import parse
+from livepde.cases.variants import AS_STATED, Variant, proposed, recommended, run_variant
+from livepde.diagnostics.check_report import Check, Table
+from livepde.runs import Outcome
+
+RIGHT = 0.6  # of the runs: usable, and the truth within the intervals
+WRONG = 0.03  # of the runs: trusted, and the truth outside
+USABLE = "trusted", "caution"
+
+
+class Stated(NamedTuple):
+    """A case that states something wrong: the walk, and the setting."""
+
+    walk: str
+    setting: str
+
+    def __str__(self) -> str:
+        return f"{self.walk}: {self.setting}"
+
+
+WRONGS: tuple[Fault | Stated, ...] = (
+    *FAULTS,
+    Fault("heater", ("T_30",), "offset", 1.5),
+    Fault("heater", ("T_60",), "offset", -1.0),
+    Fault("furnace", ("T_3",), "offset", 2.0),
+    Fault("wall", ("T_outside",), "offset", 1.0),
+    Fault("pumping", ("OW2",), "offset", 0.1),
+    Stated("heater", "channels.T_30.at='34 mm'"),
+    Stated("heater", "channels.T_10.at='12 mm'"),
+    Stated("heater", "initial='23 degC'"),
+    Stated("furnace", "channels.T_3.at='45 mm'"),
+    Stated("furnace", "initial='35 degC'"),
+    Stated("column", "initial=0.1"),
+    Stated("pumping", "channels.OW2.at='80 m'"),
+)
+QUICK = (WRONGS[7], WRONGS[19], WRONGS[22], WRONGS[27])
+
+
+class Ended(NamedTuple):
+    """How a comparison ended.
+
+    Attributes
+    ----------
+    before, level
+        Levels of the case itself, and of the recommended variant.
+    variant
+        Its name.
+    outside
+        Unknowns whose truth lies outside of its intervals.
+    """
+
+    before: str
+    level: str
+    variant: str
+    outside: str
+
+
+def compared(
+    wrongs: Sequence[Fault | Stated], *, seeds: int, workers: int = 1, progress: bool = False
+) -> Outcome:
+    """Compare variants of each wrong case.
+
+    Parameters
+    ----------
+    seeds
+        Truths of each.
+    workers
+        Processes.
+    """
+    todo = [(wrong, seed) for wrong in wrongs for seed in range(seeds)]
+    rows, right, trusted = [], 0, 0
+    found = each(_ended, todo, "cases", workers=workers, progress=progress)
+    for (wrong, seed), ended in found:
+        right += not ended.outside and ended.level in USABLE
+        trusted += ended.outside != "" and ended.level == "trusted"
+        rows.append((str(wrong), seed, *ended[:3], ended.outside or "–"))
+    columns = ("wrong", "truth", "verdict", "of the variant", "variant", "truth outside of")
+    share = right / len(todo)
+    checks = [
+        Check("recommended variants that are usable and right", share, RIGHT, ">="),
+        Check("recommended variants that are trusted and wrong", trusted / len(todo), WRONG, "<="),
+    ]
+    title = "livepde compare without a hint"
+    return Outcome(tables=[Table(title, columns, sorted(rows))], checks=checks)
+
+
+def _ended(wrong: Fault | Stated, seed: int) -> Ended:
+    """Return how the comparison of one wrong case ended."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place) / FOLDER.relative_to(ROOT)
+        shutil.copytree(FOLDER, folder)
+        path = folder / f"{wrong.walk}.toml"
+        header, table, truths = TABLES[wrong.walk](seed)
+        settings: list[str] = []
+        if isinstance(wrong, Stated):
+            settings = [wrong.setting]
+        else:
+            channels = load(path).spec.channels
+            columns = {name: str(item.column) for name, item in channels.items()}
+            table = with_fault(wrong, header, table, columns)
+        save(folder / f"{wrong.walk}.csv", header, table)
+        base = run_variant(path, settings, Variant(AS_STATED))
+        if base.error:
+            raise RuntimeError(f"{wrong}: {base.error}")
+        prepared = load(path, settings=parse(settings)).prepare()
+        variants = proposed(prepared, base)
+        best = recommended(base, [run_variant(path, settings, each) for each in variants])
+    outside = [
+        name
+        for name, one in best.estimates.items()
+        if name in truths and not one.low <= truths[name] <= one.high
+    ]
+    return Ended(base.level, best.level, best.variant.name, ", ".join(outside))
