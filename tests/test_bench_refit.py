@@ -1,11 +1,9 @@
 """The benchmark of refits: its lean forward models, truths, priors, references and checks."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import bench
 from scipy.optimize import minimize
 
 import livepde as lp
@@ -288,15 +286,6 @@ def test_checks_of_bad_fits(cost, changes, names):
 def test_checks_of_jumps(changes, names):
     good = JumpTrial(process="rod", seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
     assert failed([], [replace(good, **changes)]) == names
-
-
-@pytest.mark.study
-def test_the_command():
-    _, output = bench("refit", "--only", "few", "--seeds", "1", "--workers", "1", "--json")
-    found = json.loads(output)
-    (row, *_) = found["tables"][0]["rows"]
-    assert row[:2] == ["few", 1]
-    assert {check["name"].split(":")[0] for check in found["checks"]} == {"few"}
 
 
 def test_the_column_is_the_one_of_the_report():

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import livepde.control as ct
-from benchmarks.__main__ import app
 from benchmarks.control import PROBLEMS
 from benchmarks.control import battery as cell
 from benchmarks.control import wall as house
 from benchmarks.control.battery import battery
 from benchmarks.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
 from benchmarks.control.horizon import QUIET, MovingHorizon, Setting
-from benchmarks.control.outcome import both
 from benchmarks.control.problem import Problem, Simulated
 from benchmarks.control.runs import Run, closed_loop, learned, nominal, told
 from benchmarks.control.wall import wall
@@ -248,19 +244,3 @@ def test_a_comparison_has_four_runs_and_the_best_horizon():
     assert found.costs("MPC", HORIZONS[True]).tolist() == tried[2:]
     best = {HORIZONS[False]: settings[int(np.argmin(tried[:2]))], HORIZONS[True]: settings[2]}
     assert found.settings == best
-
-
-@needs_mpc
-def test_the_command_prints_the_checks_and_draws(monkeypatch, tmp_path):
-    def make(seed: int) -> Problem:
-        return replace(battery(seed), samples=12)
-
-    short = replace(PROBLEMS["battery"], settings=both(Setting(4, 1.0, 1.0)), make=make)
-    monkeypatch.setitem(PROBLEMS, "battery", short)
-    command = ["control", "--only", "battery", "--seeds", "1", "--json"]
-    printed = json.loads(CliRunner().invoke(app, [*command, "--draw", str(tmp_path)]).stdout)
-    assert (tmp_path / "battery.png").stat().st_size > 10_000
-    names = [check["name"] for check in printed["checks"]]
-    assert "battery, MPC: violations" in names
-    assert "battery, moving horizon, full model: its processor time over livepde's" in names
-    assert "battery, moving horizon, reduced model: livepde's cost over that with it" in names

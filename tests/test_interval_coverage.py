@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks import coverage
-from benchmarks.__main__ import app
 from benchmarks.coverage import PROBLEMS, twin
 
 pytestmark = pytest.mark.study
@@ -70,14 +67,3 @@ def test_a_field_seen_in_part_is_covered_outside_too():
     several = [twin(PROBLEMS["field, seen in part"], seed) for seed in range(20)]
     assert np.mean([one.inside[0.95] for one in several]) > 0.87
     assert 0.7 < np.sqrt(np.mean([one.error for one in several])) < 1.3
-
-
-def test_the_command_prints_checks(monkeypatch: pytest.MonkeyPatch):
-    short = {name: replace(item, samples=20) for name, item in PROBLEMS.items()}
-    monkeypatch.setattr(coverage, "PROBLEMS", short)
-    done = CliRunner().invoke(app, ["coverage", "--twins", "2", "--json"])
-    found = json.loads(done.stdout)
-    assert done.exit_code == (0 if all(item["ok"] for item in found["checks"]) else 1)
-    assert len(found["tables"][0]["rows"]) == len(PROBLEMS)
-    bounds = {item["name"]: item["bound"] for item in found["checks"]}
-    assert bounds["two numbers: in the 95% interval"] == [0.9, 0.98]

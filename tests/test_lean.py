@@ -210,13 +210,6 @@ def test_filters_as_arrays_find_the_parameter(row):
     assert score.median > 0.0
 
 
-@pytest.mark.study
-def test_what_cannot_be_stepped_as_arrays_says_why():
-    score = table.run_row(PROBLEMS["burgers-varying"], 0.01, 0, "unscented filter as arrays")
-    assert score is not None
-    assert score.note == "not run: constant unknowns and linear sensors only"
-
-
 @pytest.mark.long
 def test_the_lean_reference_is_a_row_where_it_applies():
     score = table.run_row(ROD, 0.01, 0, "lean reference")
@@ -274,16 +267,3 @@ def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 + 2 + 1
     assert all(float(cell) > 0.0 for cell in lines[2].split("|")[3:6])
-
-
-@pytest.mark.study
-def test_peers_are_divided_by_the_prior():
-    outcome = table.peers(["rod"], 2, rows=["lean reference"])
-    (found,) = outcome.tables
-    lines = {row[1]: dict(zip(found.columns, row, strict=True)) for row in found.rows}
-    assert list(lines) == ["prior", "lean reference"]
-    assert lines["prior"]["error"] == 1.0
-    assert lines["prior"]["spread"] == 0.0
-    assert 0.0 < lines["lean reference"]["error"] < 0.5
-    assert lines["lean reference"]["spread"] > 0.0
-    assert found.title == "rod, 2 seeds"
