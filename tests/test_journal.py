@@ -161,29 +161,6 @@ def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
 
 
 @pytest.mark.long
-def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
-    path = tmp_path / NAME
-    run = started(tmp_path, 60, sinks=[Breaks(37)])
-    with pytest.raises(Crash):
-        run.run()
-    run.journal.note(Event(1.0, "odd", "", "something"))
-    run.journal.close()
-    before = content(path)
-    run = started(tmp_path, 60)
-    run.resume()
-    run.journal.note(Event(1.0, "odd", "", "something"))
-    run.run()
-    run.journal.close()
-    after = content(path)
-    for table, kept in before.items():
-        if table == "fields":  # those of the last sample are there only while it is the last
-            kept = {key: row for key, row in kept.items() if not row[1]}
-        assert kept.items() <= after[table].items()
-    assert [event[2] for event in after["events"].values()].count("odd") == 1
-    assert len(after["estimates"]) == 60
-
-
-@pytest.mark.long
 def test_a_run_that_was_stopped_has_the_fields_of_one_that_was_not(tmp_path):
     whole, stopped = folders(tmp_path)
     finished(whole, 60)
@@ -310,41 +287,12 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
 # --- a journal that cannot be written ------------------------------------------------------------
 
 
-def limit_pages(kept: Journal, more: int) -> None:
-    (pages,) = kept._db.execute("PRAGMA page_count").fetchone()
-    kept._db.execute(f"PRAGMA max_page_count = {pages + more}")
-
-
-@pytest.mark.long
-def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
-    whole, full = folders(tmp_path)
-    finished(whole, 150)
-    run = started(full, 150)
-    limit_pages(run.journal, 20)
-    with pytest.raises(
-        lp.errors.RunError, match=r"full.*Earlier results are safe. To continue, free disk space"
-    ):
-        run.run()
-    with pytest.raises(lp.errors.RunError, match="full"):  # it takes nothing more
-        run.journal.commit()
-    kept = len(run.journal)
-    run.journal.close()
-    assert 0 < kept < 150
-    with closing(sqlite3.connect(full / NAME)) as raw:
-        assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    again = started(full, 150)
-    again.resume()
-    again.run()
-    again.journal.close()
-    with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
-        same(other, one)
-        assert other.accepted == 150
-
-
-@pytest.mark.long
+@pytest.mark.slow
 def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
     run = started(tmp_path, 100)
-    limit_pages(run.journal, 10)
+    with closing(sqlite3.connect(tmp_path / NAME)) as raw:
+        (pages,) = raw.execute("PRAGMA page_count").fetchone()
+    run.journal._db.execute(f"PRAGMA max_page_count = {pages + 10}")
     with pytest.raises(lp.errors.RunError):
         run.run()
     run.journal._db.execute("PRAGMA max_page_count = 100000")  # room again, too late
@@ -717,6 +665,8 @@ HOSTILE = [
     "SELECT number + 1 FROM n) SELECT 'a' AS kind, 'b' AS channel, number FROM n",
     "CREATE TRIGGER x AFTER INSERT ON samples BEGIN DELETE FROM estimates; END",
     "ALTER TABLE samples ADD COLUMN more TEXT",
+    "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
+    "INSERT INTO counts VALUES ('a', 'b', 'many', 0)",
 ]
 
 
@@ -747,21 +697,6 @@ def signed(path: Path) -> None:
                 total = database.checksum(table, *values)
                 raw.execute(f"UPDATE {table} SET crc = ? WHERE {key}", (total, *row))
     raw.close()
-
-
-@pytest.mark.long
-def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
-    for command in (
-        "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
-        "INSERT INTO counts VALUES ('a', 'b', 'many', 0)",
-    ):
-        (tmp_path / NAME).unlink(missing_ok=True)
-        path = finished(tmp_path)
-        with sqlite3.connect(path) as raw:
-            raw.execute(command)
-        raw.close()
-        signed(path)
-        refused(path)
 
 
 @pytest.mark.long
