@@ -584,15 +584,6 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
         np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
 
 
-@pytest.mark.long
-def test_an_identifier_of_a_fleet_that_has_not_begun():
-    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2)
-    t, z, inputs = samples(fleet, 5)[0]
-    given = {name: float(values[0]) for name, values in inputs.items()}
-    one = fleet.identifier(0).step(t, z[0], given)
-    np.testing.assert_allclose(fleet.step(t, z, inputs).q[0], one.q, rtol=1e-9)
-
-
 def test_a_leap_of_too_many_substeps_is_taken_in_longer_ones():
     fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, dt_max=0.1)
     t, z, inputs = samples(fleet, 5)[0]
