@@ -181,27 +181,6 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
     assert max(information) <= 1.5 * min(information)
 
 
-@pytest.mark.study
-def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
-    # Noise of each sensor by itself, of one spectral density.
-    rates, meshes = (0.1, 0.05, 0.025), (20, 40, 80)
-    found = [run(*rod(dt=dt), noise=0.01 * np.sqrt(0.1 / dt), told=1.0) for dt in rates]
-    found += [run(*rod(cells=n), noise=0.01 * np.sqrt(n / 20), told=1.0) for n in meshes]
-    assert max(error for error, _, _ in found) <= 0.15
-    alphas = [last.alpha for _, _, last in found[len(rates) :]]
-    assert max(alphas) <= 1.2 * min(alphas)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
-def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(noise: float) -> None:
-    untold = run(*rod(), noise=noise)[0]
-    assert untold <= 0.5 * run(*rod(), noise=noise, own=False)[0]
-    # What is stated is an upper bound; the samples show how large the noise is.
-    for told in (1.0, 2.0):
-        assert run(*rod(), noise=noise, told=told)[0] <= 1.2 * untold
-
-
 @pytest.mark.slow
 def test_exact_data_are_not_smoothed() -> None:
     for told in (0.0, 1e-3):

@@ -11,7 +11,6 @@ from factories import (
     excited,
     excited_q,
     excited_u,
-    filter_alone,
     laplace,
     line,
     product,
@@ -458,33 +457,6 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
         found.append(lp.Identifier(one, lp.Full(), law, **start).run(twin).last)
     np.testing.assert_allclose(found[0].q, found[1].q, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(found[0].u, found[1].u, atol=1e-7)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("law", "inner"),
-    [
-        (lp.GradientLaw(gain=1e3), lp.Sobolev(0.75, 0.2)),
-        (lp.GradientLaw(gain=1e3), lp.Sobolev(2, 0.2)),
-        (filter_alone(noise=1e-3), lp.Sobolev(0.75, 0.2)),
-        (filter_alone(noise=1e-3), lp.Sobolev(1.5, 0.2)),
-    ],
-)
-def test_both_laws_identify(law, inner):
-    model = excited(16, ElementLineP1(), inner=inner)
-    times = 0.05 * np.arange(101)
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=lp.Full(),
-        q_true=excited_q,
-        u_true=excited_u,
-        times=times,
-    )
-    start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
-    last = lp.Identifier(model, lp.Full(), law, **start).run(twin).last
-    assert last.status.ok
-    assert twin.error(last.q) < 0.05
 
 
 def test_bad_orders():
