@@ -894,6 +894,3 @@ def test_inputs_that_are_held_do_not_ramp():
         ends.append(one.step(60.0, nothing, {"heater": 1.0, "room": ROOM}).u)
     np.testing.assert_allclose(ends[0], ends[2], rtol=1e-9)
     assert ends[1][0] < ends[0][0] - 5.0
-
-
-# --- benchmark -----------------------------------------------------------------------------------
