@@ -584,15 +584,6 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
         np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
 
 
-def test_a_leap_of_too_many_substeps_is_taken_in_longer_ones():
-    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, dt_max=0.1)
-    t, z, inputs = samples(fleet, 5)[0]
-    fleet.step(t, z, inputs)
-    estimate = fleet.step(1e6, z, inputs)
-    assert [status.code for status in estimate.statuses] == ["ok", "ok"]
-    assert fleet.step(1e6 + 0.1, z, inputs).statuses[0].ok
-
-
 def test_a_member_that_is_taken_out_late_has_an_estimate():
     rod = lp.models.heat(lp.interval(0.0, 1.0, 10), lp.LogNormal(0.1, std=0.05))
     fleet = Fleet(rod, lp.Points({"a": 0.5}, noise=0.1), lp.SensitivityLaw(), 2, u0=0.0)

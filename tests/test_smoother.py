@@ -107,26 +107,6 @@ def compared(law, evolution, samples):
     return found, (mean[:, columns], std[:, columns])
 
 
-@pytest.mark.parametrize("names", [True, False])
-def test_the_smoother_weighs_each_reading_by_its_noise(names):
-    """With a noise for each reading the last smoothed estimate is that of the filter."""
-    model = sources(EVOLUTIONS["walk"])
-    noise = np.where(np.arange(31) % 2, 0.001, 0.5)
-    pairs = [
-        (t, np.column_stack([z, [std] * 3])) for (t, z), std in zip(irregular(), noise, strict=True)
-    ]
-    samples = [
-        (t, dict(zip("abc", z.tolist(), strict=True))) if names else (t, z) for t, z in pairs
-    ]
-    law = lp.SensitivityLaw(refit=None, gate=np.inf, guards=None, shadows=None)
-    result = lp.Identifier(model, SENSORS, law, u0=0.0).run(samples)
-    data = result.smoothed()
-    for name in "sc":
-        last = result.last[name]
-        assert float(data[name][-1]) == pytest.approx(last.mean, rel=1e-9)
-        assert float(data[f"{name}_std"][-1]) == pytest.approx(last.std, rel=1e-9)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVOLUTIONS)
 def test_smoothed_is_the_least_squares_solution_over_all_times(name):
