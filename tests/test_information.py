@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from factories import observe
+from factories import few, observe
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
@@ -112,13 +112,12 @@ def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[s
     return run(*rod(), **dict(options))[1:]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "options", [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
-)
-@pytest.mark.parametrize(
-    "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
-)
+OPTIONS = [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
+UNITS = [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "units"), few(5, OPTIONS, UNITS))
 def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
     plain, before = unscaled(tuple(options.items()))
     _, scaled, found = run(*rod(**units), **options)

@@ -111,6 +111,19 @@ class Crash(BaseException):
     """As good as a kill, within the process."""
 
 
+class Listens:
+    """A sink that keeps the times of estimates."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def put(self, estimate) -> None:
+        self.times.append(estimate.t)
+
+    def close(self) -> None:
+        pass
+
+
 class Breaks:
     """A sink that breaks the run after so many estimates."""
 
@@ -247,16 +260,8 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
     for name, source in (("one", Rows), ("group", AtHand)):
         folder = tmp_path / name
         folder.mkdir()
-        told = []
-
-        class Sink:
-            def put(self, estimate, told=told):
-                told.append(estimate.t)
-
-            def close(self):
-                pass
-
-        run = live(folder, source(rows(40)), sinks=[Sink()])
+        sink = Listens()
+        run = live(folder, source(rows(40)), sinks=[sink])
         step = run.identifier.step
 
         def unreadable(t, z, inputs=None, step=step):
@@ -274,7 +279,7 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
         run.run()
         times = [record.t for record in run.journal]
         assert len(times) == 39
-        assert told == times
+        assert sink.times == times
         events = [(event.kind, event.message) for event in run.journal.events]
         found.append((list(run.journal), run.journal.counts, events))
         run.journal.close()
@@ -339,26 +344,20 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
     calm = live(whole, source(broken))
     calm.run()
     calm.journal.close()
-    writes, seen = itertools.count(1), []
+    writes = itertools.count(1)
     bad = {first, first + 1, first + 9, first + 80}  # also while it is mended
     monkeypatch.setattr("livepde.runs.live_loop.LOOK", 0.0)
     monkeypatch.setattr(
         "livepde.runs.journal.writer", lambda path: Failing(path, lambda: next(writes) in bad)
     )
 
-    class Sink:
-        def put(self, estimate):
-            seen.append(estimate.t)
-
-        def close(self):
-            pass
-
-    run = live(failing, source(broken), patient=True, sinks=[Sink()])
+    sink = Listens()
+    run = live(failing, source(broken), patient=True, sinks=[sink])
     run.run()
     assert run.health["ok"]
     assert run.journal.health == ""
     run.journal.close()
-    assert seen == [0.1 * k for k in range(40)]
+    assert sink.times == [0.1 * k for k in range(40)]
     with Journal.open(whole / NAME) as one, Journal.open(failing / NAME) as other:
         same(other, one)
         assert other.counts == one.counts

@@ -11,6 +11,7 @@ from factories import (
     excited,
     excited_q,
     excited_u,
+    few,
     laplace,
     line,
     product,
@@ -304,10 +305,11 @@ def test_balakrishnan(sigma, largest):
     np.testing.assert_allclose(power, x**sigma, rtol=1e-3)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"])
-@pytest.mark.parametrize("zero", [False, True])
-@pytest.mark.parametrize("s", ORDERS)
+ELEMENTS = ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "zero", "s"), few(14, ELEMENTS, [False, True], ORDERS))
 def test_gram_is_the_spectral_power(name, zero, s):
     """G = M (M^-1 K)^s on the free coefficients: exact for whole s, to 1e-3 for others."""
     options = {"q_dirichlet": {"boundary": 0.0}} if zero else {}
@@ -322,9 +324,8 @@ def test_gram_is_the_spectral_power(name, zero, s):
     np.testing.assert_allclose(ratios, 1.0, rtol=1e-7 if s == int(s) else 1e-3)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("s", [0.0, 0.75, 1.0, 1.75, 2.0])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "s"), few(14, CASES, [0.0, 0.75, 1.0, 1.75, 2.0]))
 def test_spaces_pass_their_check(name, s):
     for zero in ({}, {"boundary": 0.0}):
         model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), q_dirichlet=zero)
