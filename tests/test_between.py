@@ -142,9 +142,13 @@ def test_a_missing_value_that_holds_is_no_gap() -> None:
         found = sparse.step(t, z[k], new)
         close(dense.step(t, z[k], row(values[k])), found)
         assert not k or found.held == ()
-    mean = identifier(between=dict.fromkeys(CHANNELS, "next"))
+    between = dict.fromkeys(CHANNELS, "next")
+    mean = identifier(between=between)
     mean.step(TIMES[0], z[0], row(values[0]))
     assert mean.step(TIMES[1], z[1], {"T_0": 1.0}).held == ("Q",)
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["kalman"], 2, u0=0.0, between=between)
+    first = fleet.step(TIMES[0], [z[0], z[0]], row(values[0]))  # means need no value at t0
+    assert [first.member(k).held for k in range(2)] == [(), ()]
 
 
 def test_a_sensor_reads_the_input_of_its_row() -> None:

@@ -91,11 +91,13 @@ def test_time_must_go_on():
 
 @pytest.mark.slow
 def test_nan_and_absent_are_missing_samples():
-    one, two = identifier(), identifier()
+    one, two, three = (identifier() for _ in range(3))
     t, values = sample()
     first = one.step(t, {**values, "a": np.nan})
     second = two.step(t, {name: v for name, v in values.items() if name != "a"})
+    third = three.step(t, {**values, "a": None})
     np.testing.assert_array_equal(first.q, second.q)
+    np.testing.assert_array_equal(first.q, third.q)
     assert np.isnan(first.innovation[0])
     assert np.isfinite(first.innovation[1])
 
