@@ -323,6 +323,8 @@ def test_a_rest_is_told_from_noise_alone():
         assert not closed((signal, noise), unit=unit)
         assert not closed((signal, noise), (none, noise), (signal[100:105], noise[:5]), unit=unit)
         assert not closed((signal, noise), (0.1 * signal, none), unit=unit)  # weak, no noise
+        # Weak beside noise, and still correlated.
+        assert not closed((signal, 0.1 * noise), (0.02 * signal, 0.1 * noise), unit=unit)
         assert not closed((none, noise), unit=unit)  # never more than that: perhaps a fast process
         assert not closed((signal, none), (none, 10.0 * noise), unit=unit)
         # Exact, but not resolved in time, and far smaller than it was.
