@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import pairwise
+from itertools import product as combinations
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,11 @@ from skfem import (
 import livepde as lp
 from livepde.cases.new_case import write_template
 from livepde.stepping import ForwardStage, advance
+
+
+def few(count: int, *axes: Iterable[Any]) -> list[tuple[Any, ...]]:
+    """Return some of all combinations, always the same ones."""
+    return random.Random(0).sample(list(combinations(*axes)), count)
 
 
 def line(cells: int = 12) -> Any:

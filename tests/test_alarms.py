@@ -14,8 +14,6 @@ from skfem import ElementLineP1
 from typer.testing import CliRunner
 
 import livepde as lp
-from benchmarks import alarms
-from benchmarks.__main__ import app as benchmarks
 from livepde import cases, runs
 from livepde.cases.new_case import NOISE, TRUE_ALPHA, write_template
 from livepde.cli import app
@@ -242,49 +240,3 @@ def test_a_law_without_covariance_says_nothing_of_it():
     data = identifier.run([(0.1, np.ones(5)), (0.2, np.ones(5))]).to_xarray()
     assert np.isnan(data["a_left"].values).all()
     assert "Identifiability" not in [table.title for table in tables(data)]
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("name", ["heat", "reaction"])
-@pytest.mark.parametrize("change", [0.2, -0.2])
-def test_a_jump_of_the_benchmark_is_flagged_and_the_same_each_time(name: str, change: float):
-    process = alarms.PROCESSES[name]()
-    told = alarms.followed(process, 1, change)
-    assert told == alarms.followed(process, 1, change)
-    assert told.delay <= 30
-    assert told.false == 0
-    assert told.error < 0.03
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("name", alarms.PROCESSES)
-def test_a_process_that_stays_as_it_is_raises_no_alarm(name: str):
-    told = alarms.followed(alarms.PROCESSES[name](), 0, samples=400)
-    assert told.delay == np.inf
-    assert told.false == 0
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("name", alarms.SUSPECTS)
-def test_only_the_wrong_model_is_doubted(name: str):
-    assert alarms.warned(alarms.SUSPECTS[name], 0) == (False, True)
-
-
-@pytest.mark.study
-def test_the_command_prints_a_check_for_each_promise(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(alarms, "PROCESSES", {"heat": alarms.PROCESSES["heat"]})
-    monkeypatch.setattr(alarms, "SUSPECTS", {"loss": alarms.SUSPECTS["loss"]})
-    monkeypatch.setattr(alarms, "CASES", (("nowhere", "nowhere", {}, True),))
-    for name in ("CALM", "WATCHED", "AFTER"):
-        monkeypatch.setattr(alarms, name, 60)
-    done = CliRunner().invoke(benchmarks, ["alarms", "--seeds", "1", "--json"])
-    said = json.loads(done.stdout.splitlines()[-1])
-    names = [item["name"] for item in said["checks"]]
-    assert names == [
-        "heat: flagged within 30 samples",
-        "heat: error after the jump",
-        "false alarms in 10 000 samples",
-        "loss: wrong model warned",
-        "loss: right model warned",
-    ]
-    assert any("nowhere: not run" in note for note in said["notes"])

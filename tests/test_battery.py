@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from factories import observe
 from scipy.optimize import brentq
 
 import livepde as lp
-from benchmarks.control.battery import graphite
 from livepde.errors import ModelError
 from livepde.models import battery_particle
 from livepde.models.battery import FARADAY
 from livepde.stepping import Advance, Alexander2, simulate
-from livepde.streams import AbsoluteNoise, Twin
 
 R, AREA, FULL = 5e-6, 1.0, 30555.0
 D = 5e-14
@@ -92,72 +88,6 @@ def test_diffusivity_follows_the_filling():
     _, without = discharged(particle(30, slope=lp.Normal(0.0, 1.0)), TIMES)
     _, constant = discharged(particle(30), TIMES)
     assert np.allclose(without, constant)
-
-
-def pulses(t: float) -> dict[str, float]:
-    return {"I": 1.36 * (t // 300 % 2 < 1) * (1 if t // 3600 % 2 < 1 else -1)}
-
-
-@pytest.mark.long
-def test_a_twin_finds_how_the_diffusivity_depends_on_the_filling():
-    model = particle(slope=lp.Normal(0.0, 1.0))
-    sensor = lp.Points({"surface": R}, noise=50.0)
-    true = {"D": 2e-14, "slope": -1.5}
-    times = np.arange(0.0, 7201.0, 30.0)
-    twin = Twin(
-        model=model,
-        observation=sensor,
-        q_true=true,
-        u0=START,
-        times=times,
-        inputs=pulses,
-        noise=AbsoluteNoise(50.0),
-        seed=2,
-        scheme=lp.SensitivityLaw.scheme,
-    )
-    law = lp.SensitivityLaw(shadows=None)
-    identifier = lp.Identifier(model, sensor, law, u0=START)
-    for sample in twin:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-    for name, truth in true.items():
-        value, std = estimate.parameters[name]
-        assert abs(value - truth) < 3 * std
-        assert std < 0.1 * abs(truth)
-
-
-@pytest.mark.study
-def test_an_ageing_diffusivity_is_followed_through_a_voltage():
-    """ln D falls by one in eight hours; seen is a voltage behind an unknown resistance."""
-    noise, end = 1e-3, 8 * 3600.0
-    model = particle(20, evolution=lp.RandomWalk(0.1 / 60.0), std=D).with_unknowns(
-        {"R_0": lp.LogNormal(0.03, 0.02)}
-    )
-    voltage = lp.observation.Calibrated(
-        lp.Points({"V": R}),
-        lambda c, q, x: graphite(c / FULL) + q.R_0 * x.inputs["I"],
-        inputs=("I",),
-        noise=noise,
-    )
-    observed = observe(model, voltage)
-    between = {"I": "next"}
-    identifier = lp.Identifier(model, voltage, lp.SensitivityLaw(), u0=START, between=between)
-    rng = np.random.default_rng(0)
-    c = model.initial(START)
-    times = np.arange(0.0, end + 1.0, 40.0)
-    identifier.step(0.0, {"V": np.nan}, pulses(0.0))
-    ratios = []
-    for before, t in pairwise(times):
-        q = {"D": 2 * D * np.exp(-t / end), "R_0": 0.05}
-        latent, now = model.initial_parameter(q), pulses(t)
-        inputs, control = lambda t, now=now: now, Advance(lp.SensitivityLaw.scheme)
-        steps = simulate(model, latent, c, [before, t], control, inputs)
-        *_, (_, c) = steps
-        z = observed.predict(c, model.latent.value(latent), lp.fem.Moment(t, now))
-        estimate = identifier.step(t, {"V": z[0] + noise * rng.normal()}, now)
-        ratios.append(estimate.parameters["D"][0] / q["D"])
-    late = np.array(ratios[len(ratios) // 2 :])
-    assert np.abs(late - 1).mean() < 0.15
-    assert estimate.parameters["R_0"][0] == pytest.approx(0.05, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections import Counter
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from commands import bench
 
 import livepde as lp
 from benchmarks import faults, soak
-from benchmarks.faults import breaks, broken, clocks, damage, disk, hostile, plants, rod
-from benchmarks.journal import journal
-from benchmarks.overhead import overhead
+from benchmarks.faults import breaks, broken, clocks, damage, hostile, plants, rod
 from livepde import cases
 from livepde.records import Record
 
@@ -32,54 +28,11 @@ def failed(outcome) -> list[str]:
     return [check.name for check in outcome.checks if not check.ok]
 
 
-@pytest.mark.process
-@pytest.mark.long
-@pytest.mark.parametrize("part", ["file", "stdin", pytest.param("mqtt", marks=MQTT)])
-def test_runs_are_killed_and_lose_nothing(part):
-    if part == "mqtt":
-        pytest.importorskip("paho.mqtt")
-    outcome = faults.faults(kills=2, samples=100, only=[part], seed=2)
-    assert not failed(outcome)
-    (table,) = outcome.tables
-    assert table.rows[0][0] >= 1
-    assert sum(table.rows[0][1:5]) >= 2
-
-
-@pytest.mark.process
-@pytest.mark.long
-@pytest.mark.skipif(sys.platform != "linux", reason="needs prlimit")
-def test_disks_fail_and_nothing_is_lost(monkeypatch):
-    monkeypatch.setattr(disk, "CALLS", {})
-    monkeypatch.setattr(disk, "FILLED", 1)
-    monkeypatch.setattr(disk, "SIZES", [2**14])
-    outcome = faults.faults(samples=60, only=["disk"])
-    assert not failed(outcome)
-    full, at_the_end = outcome.tables[0].rows
-    assert full[1] >= 1
-    assert at_the_end[2] == 1
-
-
-@pytest.mark.broker
-@pytest.mark.long
-@MQTT
-def test_sources_go_away_and_come_back():
-    pytest.importorskip("paho.mqtt")
-    assert not failed(faults.faults(samples=100, only=["restart"]))
-
-
 @pytest.mark.broker
 @MQTT
 def test_broken_messages_reach_the_real_command():
     pytest.importorskip("paho.mqtt")
     assert not failed(faults.faults(samples=100, malformed=1000, only=["messages"]))
-
-
-@pytest.mark.study
-def test_broken_rows_have_a_reason_and_right_ones_arrive():
-    outcome = faults.faults(samples=100, malformed=1200, only=["malformed"])
-    assert not failed(outcome)
-    sent = sum(row[2] for table in outcome.tables for row in table.rows if row[0] == "sent")
-    assert sent >= 1200
 
 
 @pytest.mark.process
@@ -90,23 +43,6 @@ def test_damaged_journals_are_told():
     assert (flips, different) == (10, 0)
     assert 0 < told <= flips
     assert plain == flips - told
-
-
-FEW = ("none", "one row 10 years ahead", "set back by an hour")
-
-
-@pytest.mark.broker
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "transport", ["file", "standard input", pytest.param("MQTT", marks=MQTT), "OPC UA"]
-)
-def test_clocks_go_wrong_and_are_told(monkeypatch, transport):
-    pytest.importorskip({"MQTT": "paho.mqtt", "OPC UA": "asyncua"}.get(transport, "json"))
-    monkeypatch.setattr(clocks, "TRANSPORTS", (transport,))
-    monkeypatch.setattr(clocks, "FAULTS", {name: clocks.FAULTS[name] for name in FEW})
-    outcome = faults.faults(only=["clocks"])
-    assert not failed(outcome)
-    assert [row[2:4] for row in outcome.tables[0].rows] == [(0, 0)] * len(FEW)
 
 
 def test_clock_faults_that_do_harm_are_seen():
@@ -128,35 +64,6 @@ def test_clock_faults_that_do_harm_are_seen():
     never = clocks.FAULTS["back by 3.5 steps every 30 rows"]
     told.add("trusted", replace(seen, after=doubt, values=clocks._right(never, rows)), never, rows)
     assert [check.value for check in told.checks()] == [1, 1, pytest.approx(10.0), 1, 1, 1]
-
-
-@pytest.mark.study
-def test_files_are_changed_and_lose_nothing():
-    assert not failed(faults.faults(only=["files"]))
-
-
-@pytest.mark.study
-@pytest.mark.process
-def test_runs_that_are_killed_every_few_seconds_make_progress(monkeypatch):
-    monkeypatch.setattr("benchmarks.faults.progress.STEPS", {"50 ms": (40, 60)})
-    monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
-    assert not failed(faults.faults(only=["progress"]))
-
-
-@pytest.mark.study
-@pytest.mark.process
-def test_runs_stop_soon(monkeypatch):
-    monkeypatch.setattr("benchmarks.faults.progress.LATE", 60.0)  # no timed test
-    outcome = faults.faults(only=["sigterm"], kills=2)
-    assert not failed(outcome)
-    assert outcome.tables[0].rows[0][:2] == (2, 2)
-
-
-@pytest.mark.study
-def test_slow_visitors_keep_nobody_out(monkeypatch):
-    monkeypatch.setattr("benchmarks.faults.visitors.PAUSE", 0.0)
-    monkeypatch.setattr("benchmarks.faults.visitors.SOON", 60.0)  # no timed test
-    assert not failed(faults.faults(only=["visitors"]))
 
 
 @pytest.mark.process
@@ -282,31 +189,6 @@ def test_soak_sees_what_grows():
     ]
     meter.failed = 1
     assert len(failed(soak._outcome(meter, 30_000, 1, 0.1, 1))) == 8
-
-
-@pytest.mark.study
-def test_the_journal_has_a_price(monkeypatch, tmp_path, data_dir):
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    monkeypatch.setattr("benchmarks.journal.REPETITIONS", 1)
-    times, ratios = journal(Path(__file__).parents[1] / "cases").tables
-    assert [row[0] for row in times.rows] == ["step", "journal"]
-    assert all(0.0 < cell < 1e3 for row in times.rows for cell in row[1:])
-    assert ratios.rows[0][1] > 0.0
-    (tmp_path / "other.toml").touch()
-    with pytest.raises(lp.errors.ConfigurationError, match="soil_uniform"):
-        journal(tmp_path)
-
-
-@pytest.mark.study
-def test_the_command_line_has_a_price():
-    outcome = overhead(rounds=1, samples=60)
-    (table,) = outcome.tables
-    first, second, loop, read, run, *ratios = (row[2] for row in table.rows)
-    assert 0.0 < first < second
-    assert 0.0 < loop < read < run
-    assert ratios == pytest.approx([run / loop, run / read])
-    assert [check.value for check in outcome.checks] == [second, *ratios]
-    assert [check.bound for check in outcome.checks] == [0.8, 1.4, 1.4]
 
 
 def test_the_commands_print_json(monkeypatch):

@@ -1,11 +1,9 @@
 """The benchmark of refits: its lean forward models, truths, priors, references and checks."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from commands import bench
 from scipy.optimize import minimize
 
 import livepde as lp
@@ -13,9 +11,8 @@ from benchmarks.refit.estimator import Fit
 from benchmarks.refit.jumps import AT, PROCESSES, JumpTrial
 from benchmarks.refit.objective import LOST, Objective
 from benchmarks.refit.problems import PROBLEMS
-from benchmarks.refit.problems.column import Column
 from benchmarks.refit.process import LostError, stages_of
-from benchmarks.refit.reference import Reference, enough, reference
+from benchmarks.refit.reference import Reference, reference
 from benchmarks.refit.report import outcome
 from benchmarks.refit.trial import Trial, with_outliers
 from benchmarks.refit.unknowns import Belief, Coordinates, Unknown, drawn
@@ -149,11 +146,6 @@ def test_priors_that_a_user_has_reported_are_among_them():
     assert (priors["D"], priors["v"]) == (Belief(0.01, 0.01), Belief(0.1, 0.1))
 
 
-def test_few_samples_are_two_to_eight():
-    samples = [len(PROBLEMS["few"].at(seed).readings(seed)) - 1 for seed in range(7)]
-    assert samples == [2, 3, 4, 5, 6, 7, 8]
-
-
 @pytest.mark.parametrize("kind", ["log", "logit", "normal"])
 def test_coordinates_are_those_of_livepde_s_priors(kind):
     unknown = Unknown(0.4, kind)
@@ -184,11 +176,6 @@ def test_no_other_method_finds_less_than_the_reference():
     assert found.cost == pytest.approx(objective.cost(found.a))
 
 
-def test_what_is_enough():
-    assert enough(10.0) == 10.5
-    assert enough(1e4) == pytest.approx(1e4 + 10.0)
-
-
 def test_outliers_are_a_fifth_of_the_readings():
     z = np.zeros((2000, 2))
     wild = with_outliers(z, 0.1, np.random.default_rng(0))
@@ -199,11 +186,6 @@ def test_outliers_are_a_fifth_of_the_readings():
 
 
 # --- jumps ---------------------------------------------------------------------------------------
-
-
-def test_the_rod_of_the_jumps_comes_to_rest_on_a_line():
-    shown = PROCESSES["rod"].shown(np.full(2000, 1.5))
-    np.testing.assert_allclose(shown[-1], 1.5 / 0.2 * np.array([0.9, 0.7, 0.4]), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -288,17 +270,3 @@ def test_checks_of_bad_fits(cost, changes, names):
 def test_checks_of_jumps(changes, names):
     good = JumpTrial(process="rod", seed=0, one=len(AT), every=len(AT), shift=1.0, widest=1.0)
     assert failed([], [replace(good, **changes)]) == names
-
-
-@pytest.mark.study
-def test_the_command():
-    _, output = bench("refit", "--only", "few", "--seeds", "1", "--workers", "1", "--json")
-    found = json.loads(output)
-    (row, *_) = found["tables"][0]["rows"]
-    assert row[:2] == ["few", 1]
-    assert {check["name"].split(":")[0] for check in found["checks"]} == {"few"}
-
-
-def test_the_column_is_the_one_of_the_report():
-    column = Column()
-    assert [item.truth for item in column.unknowns.values()] == [0.0357, 0.258]

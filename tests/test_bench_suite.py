@@ -10,7 +10,6 @@ import pytest
 from factories import driven_rod, line
 
 import livepde as lp
-from benchmarks import accuracy as suite
 from benchmarks import scoring
 from benchmarks.offline import Trajectory, fit
 from benchmarks.peers import table
@@ -70,21 +69,6 @@ def test_same_seed_same_data_and_noise_has_its_level(data):
     assert not np.array_equal(data.z, ROD.data(0.01, 1).z)
     noise = (data.z - data.process.exact) / data.noise
     assert 0.7 < noise.std() < 1.3
-
-
-def test_every_row_is_scored(data):
-    outcome = suite.accuracy(seeds=1, levels=[0.01], problems={"rod": ROD})
-    rows = {row[1]: row for row in outcome.tables[0].rows}
-    # The gradient law is not meant for points.
-    ours = ["sensitivity", "sensitivity, no refit"]
-    assert list(rows) == ["prior", *ours, suite.ALL_DATA, suite.EACH_SAMPLE]
-    assert rows["sensitivity"][2] < rows["prior"][2]
-    assert rows[suite.ALL_DATA][5] == rows[suite.EACH_SAMPLE][5] == 1.0
-    assert all(row[8] == 0 for row in rows.values())
-    error, time = outcome.checks
-    assert error.name.startswith("rod, 1% noise: error")
-    assert error.value == rows[suite.PROMISED][5]
-    assert time.value == rows[suite.PROMISED][7] / rows[suite.EACH_SAMPLE][7]
 
 
 def test_fits_of_the_data_so_far_do_not_know_the_future():
@@ -156,17 +140,6 @@ def test_promises_about_peers_are_checked():
     assert (cheaper.value, cheaper.bound, cheaper.ok) == (0.8, 1.0, True)
     assert (error.value, error.ok) == (pytest.approx(1.25), False)
     assert (work.value, work.bound, work.ok) == (40.0, 50.0, False)
-
-
-@pytest.mark.parametrize(
-    "row", [name for name in table.PEERS if "DAPPER" in name or "filterpy" in name]
-)
-def test_peers_that_are_installed_find_the_parameter(row):
-    if table.PEERS[row].missing:
-        pytest.skip(f"not installed: {table.PEERS[row].missing}")
-    score = table.run_row(ROD, 0.01, 0, row)
-    assert score is not None
-    assert score.error < 0.2
 
 
 @pytest.mark.parametrize("name", [n for n, p in PROBLEMS.items() if None not in p.levels])

@@ -20,7 +20,6 @@ from livepde.cases.measured import measured
 from livepde.cases.member_blocks import MemberBlock
 from livepde.cases.new_case import files_for
 from livepde.errors import ConfigurationError, DataError, RunError
-from livepde.fleet import Fleet
 from livepde.laws import shadow_kinds
 from livepde.models import EQUATIONS
 from livepde.streams import FillGaps
@@ -142,9 +141,13 @@ def test_a_missing_value_that_holds_is_no_gap() -> None:
         found = sparse.step(t, z[k], new)
         close(dense.step(t, z[k], row(values[k])), found)
         assert not k or found.held == ()
-    mean = identifier(between=dict.fromkeys(CHANNELS, "next"))
+    between = dict.fromkeys(CHANNELS, "next")
+    mean = identifier(between=between)
     mean.step(TIMES[0], z[0], row(values[0]))
     assert mean.step(TIMES[1], z[1], {"T_0": 1.0}).held == ("Q",)
+    fleet = lp.Fleet(rod(), SENSORS, LAWS["kalman"], 2, u0=0.0, between=between)
+    first = fleet.step(TIMES[0], [z[0], z[0]], row(values[0]))  # means need no value at t0
+    assert [first.member(k).held for k in range(2)] == [(), ()]
 
 
 def test_a_sensor_reads_the_input_of_its_row() -> None:
@@ -166,25 +169,6 @@ def test_a_forecast_holds_the_value_until_the_next_time() -> None:
         found = who.forecast([0.5, 1.0], {"T_0": 0.0, "Q": [2.0, 2.0]})
         assert (found["b"][0] > 0.1) == rises
         assert found["b"][1] > 0.1
-
-
-@pytest.mark.long
-def test_a_fleet_has_the_behaviour_of_its_members() -> None:
-    between = {"T_0": "hold", "Q": "next"}
-    options = {"u0": 0.0, "scheme": lp.Alexander2(), "dt_max": 0.05, "between": between}
-    fleet = Fleet(rod(), SENSORS, lp.SensitivityLaw(), 2, **options)
-    singles = [identifier(lp.SensitivityLaw(verdict=False), **options) for _ in range(2)]
-    z, values = readings(), drives(TIMES)
-    assert fleet.together
-    for k, t in enumerate(TIMES.tolist()):
-        each = [row(values[k]), row(values[k] * np.array([1.0, 3.0]))]
-        inputs = {name: [one[name] for one in each] for name in CHANNELS}
-        if k % 4 == 3:
-            inputs["T_0"] = [NAN, NAN]
-            each = [{"Q": one["Q"]} for one in each]
-        found = fleet.step(t, [z[k], z[k]], inputs)
-        for m, who in enumerate(singles):
-            close(found.member(m), who.step(t, z[k], each[m]))
 
 
 def test_a_checkpoint_continues_the_same_behaviour_and_no_other() -> None:

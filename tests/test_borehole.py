@@ -16,7 +16,6 @@ from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.models import EQUATIONS, borehole, grouted_borehole
 from livepde.stepping import Advance, Alexander2, simulate
-from livepde.streams import AbsoluteNoise, Twin
 
 KNOWN = {
     "H": 20.0,
@@ -103,33 +102,6 @@ def test_an_unknown_capacity_is_that_capacity(factor):
     (_, one), (_, other) = final(scaled, times, q), final(plain, times, q)
     assert one[0] == pytest.approx(other[0], abs=0.01)
     assert abs(final(scaled, times)[1][0] - one[0]) > 0.3  # and it matters
-
-
-@pytest.mark.long
-def test_a_twin_finds_conductivity_and_resistance():
-    process = model(50)
-    sensor = lp.Points({"T": 0.02}, noise=0.02)
-    steps = {"dt_max": 0.2 * HOUR, "scheme": lp.Alexander2()}
-    true = TRUTH | {"k": 3.2, "R_b": 0.12}
-    twin = Twin(
-        model=process,
-        observation=sensor,
-        q_true=true,
-        u0=10.0,
-        times=np.linspace(0.0, 50 * HOUR, 251),
-        noise=AbsoluteNoise(0.02),
-        inputs=lambda t: {"Q": POWER},
-        seed=3,
-        **steps,
-    )
-    law = lp.SensitivityLaw(shadows=None)
-    identifier = lp.Identifier(process, sensor, law, u0=10.0, **steps)
-    for sample in twin:
-        estimate = identifier.step(sample.t, sample.z, sample.inputs)
-    for name in ("k", "R_b"):
-        value, std = estimate.parameters[name]
-        assert abs(value - true[name]) < 3 * std
-        assert abs(value / true[name] - 1) < 0.05
 
 
 def test_nodes_are_moved_onto_the_radii():

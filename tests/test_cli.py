@@ -15,7 +15,6 @@ import xarray as xr
 from commands import bad, bench, call, cut, estimates, shell, until
 from factories import short_rod
 from patience import PATIENCE
-from typer.testing import CliRunner
 
 import livepde
 from livepde import cli, runs
@@ -114,37 +113,6 @@ def test_values_set_from_outside(rod, here, monkeypatch):
     ]
     code, output = call("report", "runs/rod", "--theory", "--json")
     assert code == 0
-
-
-@pytest.mark.long
-def test_init_check_run_report(here):
-    code, output = call("init", "mine")
-    assert code == 0
-    assert "livepde run mine/case.toml" in output
-    made = {p.name for p in (here / "mine").iterdir()}
-    assert made == {"case.toml", "rod.csv", "livepde.schema.json"}
-
-    code, output = call("check", "mine/case.toml")
-    assert code == 0
-    assert "181 samples" in output
-    assert "model: ok" in output
-    assert "observation: ok" in output
-    assert "not identifiable" not in output
-    assert {p.name for p in here.iterdir()} == {"mine"}  # nothing is written
-
-    code, output = call("run", "mine/case.toml")
-    assert code == 0
-    assert "alpha" in output
-    assert "runs/mine" in output
-    names = {p.name for p in (here / "runs" / "mine").iterdir()}
-    assert {"run.json", "case.toml", "estimates.nc", "checkpoint.bin", "report.md"} <= names
-    assert call("run", "mine/case.toml")[1].strip().endswith("runs/mine-2")
-
-    before = (here / "runs" / "mine" / "report.md").read_text()
-    code, output = call("report", "runs/mine")
-    assert code == 0
-    assert "T_20" in output
-    assert (here / "runs" / "mine" / "report.md").read_text() == before
 
 
 @pytest.mark.slow
@@ -403,17 +371,3 @@ def test_reproduce_and_bench_for_people(fake, here):
     code, output = bench("xyz")
     assert code == 2
     assert "No such command 'xyz'" in output
-
-
-# The preview of the others takes long: they have hundreds of sensors or many unknowns.
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "name", ["thermal_response", "sioux", "streambed_047", "soil_column", "soil_layers"]
-)
-def test_check_understands_the_cases_of_the_project(name, data_dir, monkeypatch):
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    case = Path(__file__).parent.parent / "cases" / f"{name}.toml"
-    result = CliRunner().invoke(cli.app, ["check", str(case), "--allow-code"])
-    assert result.exit_code == 0, result.output
-    assert "model: ok" in result.output
-    assert "observation: ok" in result.output

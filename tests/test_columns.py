@@ -230,17 +230,6 @@ def test_a_fault_that_is_in_no_column_is_not_put_on_one():
     assert not any(cause.share > 0.9 for cause in columns_named)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("options", [{"refit": None}, {"drift": 1e-6}, {"verdict": False}])
-def test_laws_without_a_fit_have_the_causes_that_they_had(options: dict[str, Any]):
-    _, columns = bar(5)
-    wrong = {**columns, "TC5": late(columns["TC5"], 60.0)}
-    verdict = run(wrong, **options).last.verdict
-    assert all(
-        cause.kind not in ("unit", "exchange") for f in verdict.findings for cause in f.causes
-    )
-
-
 def test_causes_are_merged_by_what_they_explain():
     first = Cause("offset", "a", "a may read 1 too high", 0.4)
     second = Cause("boundary", "b", "b may be 2 too high", 0.8)

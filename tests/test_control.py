@@ -894,32 +894,3 @@ def test_inputs_that_are_held_do_not_ramp():
         ends.append(one.step(60.0, nothing, {"heater": 1.0, "room": ROOM}).u)
     np.testing.assert_allclose(ends[0], ends[2], rtol=1e-9)
     assert ends[1][0] < ends[0][0] - 5.0
-
-
-# --- benchmark -----------------------------------------------------------------------------------
-
-
-@pytest.mark.study
-@needs_mpc
-def test_the_benchmark_compares_the_same_task():
-    from benchmarks.control.compare import compare
-    from benchmarks.control.horizon import Setting
-    from benchmarks.control.outcome import promises
-    from benchmarks.control.rod import rod as task
-
-    def make(seed: int) -> Any:
-        return replace(task(seed), samples=14, horizon=5, jump=float("nan"))
-
-    found = compare(make, 1, [Setting(5, 1.0, 1.0)])
-    table = found.table()
-    assert [row[:2] for row in table.rows][:2] == [
-        ["MPC", "true model"],
-        ["MPC", "wrong fixed model"],
-    ]
-    assert {row[0] for row in table.rows} == {"MPC", "LQ"}
-    names = [check.name for check in promises(found)]
-    assert len(set(names)) == len(names)
-    costs = {row[1]: row[2] for row in table.rows if row[0] == "MPC"}
-    assert costs["livepde"] == pytest.approx(found.costs("MPC", "livepde")[0])
-    figure = found.figure(["tip", "face", "heater", "k"])
-    assert len(figure.axes) == 4 * 4

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import livepde.control as ct
-from benchmarks.__main__ import app
 from benchmarks.control import PROBLEMS
 from benchmarks.control import battery as cell
 from benchmarks.control import wall as house
 from benchmarks.control.battery import battery
 from benchmarks.control.compare import FIXED, HORIZONS, LEARNED, TRUE, compare
 from benchmarks.control.horizon import QUIET, MovingHorizon, Setting
-from benchmarks.control.outcome import both
 from benchmarks.control.problem import Problem, Simulated
-from benchmarks.control.runs import Run, closed_loop, learned, nominal, told
+from benchmarks.control.runs import closed_loop
 from benchmarks.control.wall import wall
 from livepde.errors import ConfigurationError
 
@@ -96,34 +92,6 @@ def test_without_its_record_the_wall_says_what_to_set(monkeypatch):
         wall()
 
 
-@needs_mpc
-def test_who_believes_in_a_better_wall_is_late(mild):
-    """Three days behind a wall that loses half as much again: livepde learns to begin in time."""
-    problem = replace(wall(), samples=144)
-    worse = {"k[masonry]": 1.6, "k[insulation]": 1.7, "k[render]": 1.0}
-    runs = held_against(problem, worse, {"wrong": nominal, "livepde": learned})
-    cold = {
-        name: float(run.beyond(problem)[run.t > house.LEARNT].sum()) for name, run in runs.items()
-    }
-    assert cold["wrong"] > 4.0  # kelvins, summed over half hours
-    assert cold["livepde"] < 0.25 * cold["wrong"]
-    estimate = dict(zip(problem.reduced.unknowns, runs["livepde"].q[-1], strict=True))
-    assert estimate["k[masonry]"] == pytest.approx(1.6, rel=0.1)
-    assert estimate["k[insulation]"] == pytest.approx(1.7, rel=0.15)
-
-
-def held_against(problem: Problem, truth: Any, estimators: Any) -> dict[str, Run]:
-    """Return a run of each estimator on a plant with another truth."""
-    start = float(problem.plant(0).outputs()[0])
-    other = replace(
-        problem,
-        truth=lambda t: truth,
-        plant=lambda seed: plant_of(problem, truth, start, seed),
-    )
-    controller = ct.MPC(other.reduced, other.goal, other.period, other.horizon)
-    return {name: closed_loop(other, of(other), controller, 0) for name, of in estimators.items()}
-
-
 # --- the battery -----------------------------------------------------------------------------
 
 
@@ -151,19 +119,6 @@ def test_the_reduced_particle_misses_little():
         missed = problem.reduced.error({"D": factor * cell.D}, h=problem.period)
         assert missed["mean"] < 1e-5
         assert missed["surface"] < 2e-3
-
-
-@needs_mpc
-def test_who_believes_in_a_faster_diffusion_goes_over_the_limit():
-    problem = replace(battery(), samples=50)
-    slow = {"D": 0.35 * cell.D}
-    runs = held_against(problem, slow, {"wrong": nominal, "livepde": learned, "true": told})
-    over = {name: float(run.outputs[:, 1].max()) - 0.85 for name, run in runs.items()}
-    assert over["wrong"] > 0.2
-    assert over["livepde"] < 0.03
-    assert over["true"] < 0.01
-    assert runs["livepde"].q[-1, 0] == pytest.approx(0.35 * cell.D, rel=0.2)
-    assert not runs["livepde"].failed
 
 
 # --- the moving horizon ----------------------------------------------------------------------
@@ -248,19 +203,3 @@ def test_a_comparison_has_four_runs_and_the_best_horizon():
     assert found.costs("MPC", HORIZONS[True]).tolist() == tried[2:]
     best = {HORIZONS[False]: settings[int(np.argmin(tried[:2]))], HORIZONS[True]: settings[2]}
     assert found.settings == best
-
-
-@needs_mpc
-def test_the_command_prints_the_checks_and_draws(monkeypatch, tmp_path):
-    def make(seed: int) -> Problem:
-        return replace(battery(seed), samples=12)
-
-    short = replace(PROBLEMS["battery"], settings=both(Setting(4, 1.0, 1.0)), make=make)
-    monkeypatch.setitem(PROBLEMS, "battery", short)
-    command = ["control", "--only", "battery", "--seeds", "1", "--json"]
-    printed = json.loads(CliRunner().invoke(app, [*command, "--draw", str(tmp_path)]).stdout)
-    assert (tmp_path / "battery.png").stat().st_size > 10_000
-    names = [check["name"] for check in printed["checks"]]
-    assert "battery, MPC: violations" in names
-    assert "battery, moving horizon, full model: its processor time over livepde's" in names
-    assert "battery, moving horizon, reduced model: livepde's cost over that with it" in names

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from browser import chromium, count, text, wait
-from factories import BODIES
+from factories import BODIES, few
 from patience import PATIENCE
 from skfem import MeshTri
 from typer.testing import CliRunner
@@ -87,9 +87,8 @@ def dataset(kind: str = "line", count: int = 6, **options):
 # --- figures -------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("kind", BODIES)
-@pytest.mark.parametrize("field", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "field"), few(5, BODIES, [False, True]))
 def test_every_kind_of_run_has_its_panels(kind, field):
     data = dataset(kind, field=field)
     found = {panel.name: panel for panel in panels.panels(data)}

@@ -106,14 +106,6 @@ def test_the_unit_gives_the_numbers_of_the_identifier(rod, unit):
 
 
 @pytest.mark.long
-def test_the_unit_compares_with_its_case(rod, unit):
-    found = compare_fmu(unit, load(rod))
-    assert found.samples == 61
-    assert set(found.differences) == {*OUTPUTS, "T_30_model", "estimate_time"}
-    assert found.largest <= 1e-10
-
-
-@pytest.mark.long
 def test_a_unit_of_another_case_is_found_out(rod, tmp_path):
     other = load(rod, settings={"unknowns.alpha.prior": "6e-5 m^2/s"})
     found = compare_fmu(export_fmu(other, tmp_path / "other.fmu"), load(rod))
@@ -389,25 +381,6 @@ def test_a_field_goes_out_at_the_vertices(tmp_path):
     large = of_code("own:build", lambda: build(1200))
     assert [item.name for item in large.outputs()] == ["estimate_time", "a_model", "b_model"]
     assert large.notes == ["The field q is not an output: it has 1201 vertices, more than 1000."]
-
-
-@pytest.mark.long
-def test_a_function_of_ones_own_becomes_a_unit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path("own.py").write_text(OWN)
-    unit = export_fmu("own.py:build")
-    assert unit == Path("build.fmu")
-    Path("own.py").unlink()  # the unit has it inside
-    namespace = {}
-    exec(OWN, namespace)
-    identifier = namespace["build"]()
-    with running(unit, 0.0) as instance:
-        for t, (left, one, *_) in history(10):
-            instance.set(["T", "T_10"], [left, one])
-            instance.step(t, 20.0)
-            estimate = identifier.step(t, {"T": left, "T_10": one})
-            found = instance.get(["alpha", "alpha_std"])
-            assert found == pytest.approx([estimate.q[0], estimate.q_std[0]], rel=1e-10)
 
 
 @pytest.mark.long
@@ -777,21 +750,3 @@ def test_rivers_checks_that_fit():
     ):
         getattr(common, f"check_{name}")(model.clone(), data)
     assert model.clone().estimate is None
-
-
-@pytest.mark.long
-def test_the_page_shows_a_controller_in_three_lines():
-    """All blocks run in test_pages.py; here it must act, too."""
-    page = (Path(__file__).parents[1] / "docs" / "exchange.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
-    (loop,) = (block for block in blocks if "on_estimate" in block)
-    assert len([line for line in loop.splitlines() if line]) == 3
-    namespace = {}
-    for block in blocks[: blocks.index(loop) + 1]:
-        exec(block, namespace)
-    result = namespace["result"]
-    data = result.to_xarray()
-    assert len(result) == 60
-    assert float(abs(data["alpha"][-1] - 9e-5)) < 3 * float(data["alpha_std"][-1]) < 1e-5
-    shown = namespace["identifier"].forecast(result.last.t)["T_10"][0]
-    assert shown == pytest.approx(30.0, abs=0.1)  # where the heater should hold it

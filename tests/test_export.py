@@ -320,20 +320,6 @@ def test_xdmf_holds_all_times(tmp_path, kind, monkeypatch):
         assert (lengths > 0.0).all()
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("ending", [".vtu", ".vtk"])
-@pytest.mark.parametrize("kind", BODIES)
-def test_vtk_holds_one_time(tmp_path, kind, ending):
-    run = made(tmp_path / "run", kind)
-    export(run, tmp_path / f"last{ending}")
-    export(run, tmp_path / f"early{ending}", at=110.0)
-    for name, k in (("last", -1), ("early", 1)):
-        found = meshio.read(tmp_path / f"{name}{ending}")
-        assert np.array_equal(found.point_data["u"], run.dataset["u"].values[k])
-        assert [block.type for block in found.cells] == [kind]
-        assert np.array_equal(found.points[:, 0], run.dataset["x"])
-
-
 @pytest.mark.slow
 def test_unknown_fields_are_on_the_mesh_too(tmp_path):
     writer = RunWriter.create(tmp_path / "run", version="1", command=[], title="A rod")
@@ -460,17 +446,6 @@ def test_vtk_reads_the_meshes(tmp_path, kind):
     found = reader.read()
     found = found[0] if isinstance(found, pyvista.MultiBlock) else found
     assert np.allclose(found.point_data["u"], last)
-
-
-@pytest.mark.slow
-def test_netcdf_c_reads_the_files(rod, tmp_path):
-    netCDF4 = pytest.importorskip("netCDF4")
-    export(rod, tmp_path / "rod.nc")
-    for path in (tmp_path / "rod.nc", rod.path / "estimates.nc"):
-        with netCDF4.Dataset(path) as found:
-            assert np.array_equal(found["u"][:], rod.dataset["u"])
-            assert "since" in found["time"].units
-            assert "_FillValue" not in found["time"].ncattrs()
 
 
 def complaints(path) -> list[str]:

@@ -13,7 +13,7 @@ import pytest
 from scipy.special import exp1
 
 from benchmarks import ROOT
-from benchmarks.first_hour import FOLDER, WALKS, WELLS, WRITTEN, aquifer, first_hour, write
+from benchmarks.first_hour import FOLDER, WALKS, WELLS, WRITTEN, aquifer, write
 
 PAGE = (ROOT / "docs" / "first-hour.md").read_text(encoding="utf-8")
 
@@ -51,21 +51,7 @@ def test_the_truth_of_the_pumping_test_is_that_of_theis() -> None:
         np.testing.assert_allclose(drawdown[1:], exact, atol=1e-4)
 
 
-@pytest.mark.long
-def test_a_tracer_pulse_is_found() -> None:
-    outcome = first_hour(("column",), seeds=2)
-    assert outcome.ok, outcome.checks
-
-
 def test_each_case_is_one_file_without_a_law() -> None:
     for name in ("furnace.toml", "borehole.toml", "pumping.toml", "wall.toml"):
         case = tomllib.loads((FOLDER / name).read_text(encoding="utf-8"))
         assert not {"law", "steps", "intake"} & set(case)
-
-
-@pytest.mark.study
-def test_intervals_of_the_walks_hold_the_truth() -> None:
-    walks = (("furnace", 1), ("borehole", 10), ("pumping", 4), ("column", 20), ("wall", 4))
-    for walk, seeds in walks:
-        outcome = first_hour((walk,), seeds=seeds)
-        assert outcome.ok, outcome.checks

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from functools import partial
 
 import numpy as np
@@ -12,7 +11,6 @@ from factories import laplace, line, truth
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
-from benchmarks.fleet import fleet as benchmark
 from livepde.fleet import Fleet, FleetRecords
 from livepde.laws.innovations import Innovations
 from livepde.linalg import BandedBlocks, BandedSolver, Pattern
@@ -196,20 +194,6 @@ PAIRS = [
 def test_equals_separate_identifiers(model, law):
     fleet, _ = compare(MODELS[model](), LAWS[law], partial(samples, steps=11), members=3)
     assert fleet.together, fleet.note
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("model", ["rod", "sources", "layers"])
-def test_equals_separate_identifiers_with_another_scheme_and_substeps(model):
-    fleet, estimate = compare(
-        MODELS[model](),
-        LAWS["plain"],
-        partial(samples, steps=9),
-        scheme=lp.ImplicitEuler(),
-        dt_max=0.04,
-    )
-    assert fleet.together
-    assert estimate.steps.tolist() == [3, 3, 3, 3]
 
 
 @pytest.mark.long
@@ -598,38 +582,6 @@ def test_an_identifier_goes_on_from_where_a_member_is(law):
         np.testing.assert_allclose(estimate.q[1], one.q, rtol=1e-9)
         np.testing.assert_allclose(estimate.u[1], one.u, rtol=1e-9, atol=1e-12)
         np.testing.assert_array_equal(one.q, again.step(t, z[1], given).q)
-
-
-@pytest.mark.long
-def test_an_identifier_of_a_fleet_that_has_not_begun():
-    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2)
-    t, z, inputs = samples(fleet, 5)[0]
-    given = {name: float(values[0]) for name, values in inputs.items()}
-    one = fleet.identifier(0).step(t, z[0], given)
-    np.testing.assert_allclose(fleet.step(t, z, inputs).q[0], one.q, rtol=1e-9)
-
-
-def test_a_leap_of_too_many_substeps_is_taken_in_longer_ones():
-    fleet = lp.Fleet(rod(), SENSORS, LAWS["plain"], 2, dt_max=0.1)
-    t, z, inputs = samples(fleet, 5)[0]
-    fleet.step(t, z, inputs)
-    estimate = fleet.step(1e6, z, inputs)
-    assert [status.code for status in estimate.statuses] == ["ok", "ok"]
-    assert fleet.step(1e6 + 0.1, z, inputs).statuses[0].ok
-
-
-@pytest.mark.study
-def test_the_benchmark_compares_equal_estimates(monkeypatch):
-    monkeypatch.setattr(sys.modules[benchmark.__module__], "SAMPLES", 100)
-    outcome = benchmark(members=3, runs=2)
-    faster, apart, ratio, different = outcome.checks
-    assert apart.ok
-    assert different.ok
-    assert faster.value > 0.0
-    assert ratio.value > 0.0
-    ((_, low, middle, high),) = outcome.tables[0].rows
-    assert low <= middle <= high
-    assert len(benchmark(members=2, runs=0).tables) == 1
 
 
 def test_a_member_that_is_taken_out_late_has_an_estimate():

@@ -64,20 +64,6 @@ def same(one, other):
     return all(np.array_equal(a, b, equal_nan=True) for a, b in zip(one, other, strict=True))
 
 
-@pytest.mark.parametrize("law", ["sensitivity", "refit"])
-@pytest.mark.slow
-def test_a_forecast_is_what_the_next_step_expects(law):
-    identifier = rod(LAWS[law])
-    for k, (t, z) in enumerate(samples(30)):
-        inputs = {name: z[name] for name in ("T_end", "heat")}
-        found = identifier.forecast(t, inputs) if k else None
-        estimate = identifier.step(t, z)
-        if found is not None:
-            expected = np.array([z["a"], z["b"]]) - estimate.innovation
-            assert found.z[0, :2] == pytest.approx(expected, rel=1e-12)
-            assert found.names == ("a", "b", "c")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("law", "build"), PAIRS)
 def test_a_horizon_is_steps_in_which_nothing_is_measured(law, build):

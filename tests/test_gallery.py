@@ -95,13 +95,3 @@ def test_a_table_becomes_dots(maker):
     text = "single run: 1.0\n\nexample  auto\nseed   0%  0.5  0.4  1.25"
     assert maker.shown("auto_gain", text).splitlines()[0] == "example  auto"
     assert maker.shown("jumps", "row\n" * 100).endswith("... (55 lines more)")
-
-
-@pytest.mark.long
-def test_a_picture_becomes_small(maker, tmp_path):
-    from PIL import Image
-
-    Image.effect_noise((2400, 1200), 50).convert("RGB").save(tmp_path / "large.png")
-    maker.small(tmp_path / "large.png", tmp_path / "small.png")
-    with Image.open(tmp_path / "small.png") as small:
-        assert (small.size, small.mode) == ((1100, 550), "P")

@@ -7,7 +7,6 @@ import pytest
 
 import livepde as lp
 from livepde.models import heat
-from livepde.runs.run_verdict import doubts
 
 NOISE = 0.05
 
@@ -88,24 +87,3 @@ def test_what_lasts_is_believed_if_most_sensors_show_it():
     before, after = (found[k].parameters["alpha"] for k in (99, 105))
     assert after[0] == before[0]
     assert after[1] == pytest.approx(before[1], rel=0.01)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("constant", [False, True])
-def test_what_one_sensor_shows_alone_is_set_aside(constant):
-    identifier = rod(lp.SensitivityLaw(gate_patience=5))
-    found = [identifier.step(t, z) for t, z in lasting([True, False], constant)]
-    assert [estimate.diagnostics.refused for estimate in found[100:]] == [1.0] * 100
-    (aside,) = (one for one in found[-1].verdict.findings if one.what == "aside")
-    assert aside.subject == "z0"
-
-
-@pytest.mark.long
-def test_many_refusals_are_said():
-    bad = set(range(10, 200, 15))
-    data = rod(lp.SensitivityLaw()).run(spoiled(readings(), bad, 500.0)).to_xarray()
-    assert float(data["refused"].sum()) == len(bad)
-    (said,) = (text for text in doubts(data) if "excluded" in text)
-    assert said.startswith("The fit of 200 samples excluded 3.2 % of the readings")
-    quiet = rod(lp.SensitivityLaw()).run(spoiled(readings(), {50}, 500.0)).to_xarray()
-    assert not any("excluded" in text for text in doubts(quiet))

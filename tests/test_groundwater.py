@@ -12,8 +12,6 @@ from scipy.special import erfc, erfcx, exp1
 from skfem import ElementQuad1, MeshQuad
 
 import livepde as lp
-from benchmarks.cases import bench_cases
-from livepde import cases
 from livepde.diagnostics import check_model
 from livepde.errors import ModelError
 from livepde.fem import grid
@@ -145,17 +143,6 @@ def test_what_is_wrong_is_said():
         groundwater(lp.interval(0.0, 1.0, 5), T, T, wells={"Q": (0.5,)})
 
 
-@pytest.mark.study
-@pytest.mark.parametrize("name", ["oude_korendijk", "sioux", "horkheim"])
-def test_published_tests_are_found_again(name: str, data_dir: Any, monkeypatch: Any):
-    """Whatever the prior: each case runs with its variants, which expect something, too."""
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    outcome, runs = bench_cases([ROOT / "cases" / f"{name}.toml"])
-    assert len(runs) == 2
-    assert len(outcome.checks) >= 4
-    assert outcome.ok
-
-
 @pytest.mark.slow
 def test_the_tomography_of_horkheim_passes_the_checks():
     place = spec_from_file_location("pumping", ROOT / "cases" / "pumping.py")
@@ -169,7 +156,6 @@ def test_the_tomography_of_horkheim_passes_the_checks():
 
 D, V = 0.15, 2.5
 ONE = lp.Normal(1.0, 1.0)
-CASE = Path(__file__).parents[1] / "cases" / "soil_column.toml"
 SHARE = lp.LogitNormal(0.5, 0.2, bounds=(0.0, 1.0))
 
 
@@ -259,21 +245,3 @@ def test_what_is_refused():
         advection_dispersion(mesh, ONE, ONE, inlet="open")
     with pytest.raises(lp.errors.ModelError, match="R must be at least 1"):
         advection_dispersion(mesh, ONE, ONE, R=0.0)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize(
-    ("curve", "depth", "v", "dispersion"),
-    [(0, 11.0, 2.45, 0.154), (1, 17.0, 2.51, 0.126), (2, 23.0, 2.51, 0.110)],
-)
-def test_soil_columns_find_what_the_other_code_finds(
-    curve, depth, v, dispersion, data_dir, monkeypatch
-):
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    place = {"data.options.curve": curve, "channels.c.at": depth}
-    prepared = cases.load(CASE, allow_code=True, settings=place).prepare()
-    prepared.identifier.run(prepared.stream)
-    estimate = prepared.identifier.estimate()
-    found = {label: value for label, (value, _) in estimate.parameters.items()}
-    assert found["v"] == pytest.approx(v, rel=0.03)
-    assert found["D"] == pytest.approx(dispersion, rel=0.25)

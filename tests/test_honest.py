@@ -1,14 +1,11 @@
 """Honest twins: their truths against closed forms and against livepde refined, and their scores."""
 
-import json
-
 import numpy as np
 import pytest
-from commands import bench
 from factories import observe
 
 import livepde as lp
-from benchmarks.honest import KINDS, PROBLEMS, honest
+from benchmarks.honest import PROBLEMS
 from benchmarks.honest.batch import Batch
 from benchmarks.honest.linear import Chebyshev, Linear, fine_times
 from benchmarks.honest.noise import disturbed
@@ -17,7 +14,6 @@ from benchmarks.honest.problems.flux import NonlinearFlux, RodFlux
 from benchmarks.honest.problems.warm import WarmRod
 from benchmarks.honest.report import outcome
 from benchmarks.honest.twin import SHARES, Run
-from livepde.errors import ConfigurationError
 from livepde.fem import Inputs, Moment
 
 SMALL = 0.15  # of the noise, root mean square: that much truth and refined livepde may differ
@@ -271,34 +267,3 @@ def test_checks_find_what_is_wrong():
     good[0].failure = "StepFailed: at t = 1"
     assert failed(good) == {"rod, spike: runs that ended early"}
     assert outcome(good).notes[-1] == "rod, spike, seed 0: StepFailed: at t = 1"
-
-
-@pytest.mark.study
-def test_twins_are_scored_in_every_kind():
-    found = honest(["borehole"], seeds=1, workers=1)
-    overview, details = found.tables
-    assert [row[1] for row in overview.rows] == list(KINDS)
-    assert {(row[0], row[2]) for row in details.rows} == {("borehole", "k"), ("borehole", "R_b")}
-    assert len(details.rows) == 2 * len(KINDS)
-    names = [check.name for check in found.checks]
-    assert len(set(names)) == len(names)
-    for kind, about in KINDS.items():
-        assert (f"borehole, {kind}: coverage" in names) == (about.coverage is not None)
-        assert f"borehole, {kind}: widest interval / prior" in names
-    assert "borehole, spike: largest shift by the spike, in standard deviations" in names
-    again = honest(["borehole"], ["white"], seeds=1, workers=1)
-    white = [row for row in overview.rows if row[1] == "white"]
-    assert [row[:10] for row in again.tables[0].rows] == [row[:10] for row in white]
-
-
-@pytest.mark.long
-def test_command():
-    given = ["--quick", "--only", "rod", "--kind", "white", "--seeds", "2", "--workers", "1"]
-    code, output = bench("honest", *given, "--json")
-    shown = json.loads(output)
-    assert code == (0 if all(check["ok"] for check in shown["checks"]) else 1)
-    assert {row[0] for row in shown["tables"][0]["rows"]} == {"rod"}
-    assert set(shown["checks"][0]) == {"name", "value", "bound", "sense", "ok"}
-    for option, wrong, what in (("--only", "rood", "problem"), ("--kind", "whit", "kind of data")):
-        with pytest.raises(ConfigurationError, match=f"there is no {what} '{wrong}'; did you mean"):
-            bench("honest", option, wrong)

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from factories import observe
+from factories import few, observe
 from skfem import ElementLineP1, ElementLineP2
 
 import livepde as lp
@@ -112,13 +112,12 @@ def unscaled(options: tuple[tuple[str, float], ...]) -> tuple[np.ndarray, dict[s
     return run(*rod(), **dict(options))[1:]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "options", [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
-)
-@pytest.mark.parametrize(
-    "units", [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
-)
+OPTIONS = [{}, {"noise": 0.02}, {"noise": 0.02, "told": 1.0}, {"noise": 0.02, "own": False}]
+UNITS = [{"q": 1e3}, {"u": 1e-4}, {"x": 50.0}, {"t": 3600.0}, dict(q=7, u=20, x=0.1, t=1e-3)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "units"), few(5, OPTIONS, UNITS))
 def test_units_scale_out(units: dict[str, float], options: dict[str, float]) -> None:
     plain, before = unscaled(tuple(options.items()))
     _, scaled, found = run(*rod(**units), **options)
@@ -179,27 +178,6 @@ def test_the_weight_of_noisy_data_does_not_depend_on_the_mesh() -> None:
         run(*rod(cells=n), noise=0.02, own=False)[2].information / n for n in (20, 40, 80)
     ]
     assert max(information) <= 1.5 * min(information)
-
-
-@pytest.mark.study
-def test_smoothing_finds_the_same_q_at_every_sampling_rate_and_mesh() -> None:
-    # Noise of each sensor by itself, of one spectral density.
-    rates, meshes = (0.1, 0.05, 0.025), (20, 40, 80)
-    found = [run(*rod(dt=dt), noise=0.01 * np.sqrt(0.1 / dt), told=1.0) for dt in rates]
-    found += [run(*rod(cells=n), noise=0.01 * np.sqrt(n / 20), told=1.0) for n in meshes]
-    assert max(error for error, _, _ in found) <= 0.15
-    alphas = [last.alpha for _, _, last in found[len(rates) :]]
-    assert max(alphas) <= 1.2 * min(alphas)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("noise", [0.01, 0.03, 0.1])
-def test_smoothing_that_balances_its_biases_beats_the_discrepancy_principle(noise: float) -> None:
-    untold = run(*rod(), noise=noise)[0]
-    assert untold <= 0.5 * run(*rod(), noise=noise, own=False)[0]
-    # What is stated is an upper bound; the samples show how large the noise is.
-    for told in (1.0, 2.0):
-        assert run(*rod(), noise=noise, told=told)[0] <= 1.2 * untold
 
 
 @pytest.mark.slow

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from benchmarks import coverage
-from benchmarks.__main__ import app
 from benchmarks.coverage import PROBLEMS, twin
 
 pytestmark = pytest.mark.study
@@ -36,48 +31,3 @@ def test_true_values_are_drawn_from_the_prior_and_move_as_it_says():
     draws = np.array([coverage._path(field, times[:2], rng)[0] for _ in range(400)])
     expected = np.sqrt(np.diag(np.linalg.inv(field.Q.gram.toarray())))
     assert draws.std(axis=0) == pytest.approx(expected, rel=0.2)
-
-
-def test_intervals_hold_what_they_promise():
-    several = [twin(PROBLEMS["two numbers"], seed) for seed in range(40)]
-    assert np.mean([one.inside[0.95] for one in several]) > 0.87
-    assert 0.5 < np.mean([one.inside[0.68] for one in several]) < 0.85
-    assert not any(one.doubted for one in several)
-
-
-@pytest.mark.parametrize(
-    ("name", "flaw"), [("missing loss", {"loss": 1.0}), ("missing layer", {"contrast": 0.8})]
-)
-def test_a_wrong_model_is_doubted_or_its_interval_is_wide_enough(name: str, flaw: dict[str, float]):
-    large = {key: lambda rng, value=value: value for key, value in flaw.items()}
-    doubted = twin(replace(PROBLEMS[name], **large), 0)
-    assert doubted.doubted
-    assert doubted.white == (False, False)
-    assert not PROBLEMS[name].right
-    several = [twin(PROBLEMS[name], seed) for seed in range(12)]
-    assert np.mean([one.doubted or one.inside[0.95] == 1.0 for one in several]) > 0.8
-
-
-def test_innovations_are_white_if_the_model_is_right():
-    right = PROBLEMS["short run"]
-    square, correlation = np.mean([twin(right, seed).white for seed in range(40)], axis=0)
-    assert min(square, correlation) > 0.8  # 0.95 less four standard errors
-    lossy = replace(right, unknowns={"a": right.unknowns["a"]}, loss=lambda rng: 9.0)
-    assert twin(lossy, 0).white == (False, False)
-
-
-def test_a_field_seen_in_part_is_covered_outside_too():
-    several = [twin(PROBLEMS["field, seen in part"], seed) for seed in range(20)]
-    assert np.mean([one.inside[0.95] for one in several]) > 0.87
-    assert 0.7 < np.sqrt(np.mean([one.error for one in several])) < 1.3
-
-
-def test_the_command_prints_checks(monkeypatch: pytest.MonkeyPatch):
-    short = {name: replace(item, samples=20) for name, item in PROBLEMS.items()}
-    monkeypatch.setattr(coverage, "PROBLEMS", short)
-    done = CliRunner().invoke(app, ["coverage", "--twins", "2", "--json"])
-    found = json.loads(done.stdout)
-    assert done.exit_code == (0 if all(item["ok"] for item in found["checks"]) else 1)
-    assert len(found["tables"][0]["rows"]) == len(PROBLEMS)
-    bounds = {item["name"]: item["bound"] for item in found["checks"]}
-    assert bounds["two numbers: in the 95% interval"] == [0.9, 0.98]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from factories import truth
-from skfem import ElementLineP1, ElementLineP2
+from skfem import ElementLineP1
 
 import livepde as lp
 from livepde.laws import iterated_smoother
@@ -25,18 +25,6 @@ def sourced(evolution=None):
         {"s": strength},
         A=lambda q, u, v, x: -q.s * v,
         B=lambda u, v, x: 0.3 * lp.dot(lp.grad(u), lp.grad(v)),
-    )
-
-
-def logistic(evolution):
-    """Return growth with a rate that moves beside a diffusivity that stays."""
-    return lp.Model(
-        lp.Field(lp.interval(0.0, 1.0, 12), ElementLineP2(), quadrature=6),
-        {
-            "D": lp.LogNormal(0.02, 0.02),
-            "r": lp.Scalar(lp.Normal(1.0, 1.0), evolution=evolution),
-        },
-        A=lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) - q.r * u * (1.0 - u) * v,
     )
 
 
@@ -64,25 +52,6 @@ def test_nothing_changes_where_all_is_linear(evolution):
         np.testing.assert_allclose(other.q, one.q, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(other.q_std, one.q_std, rtol=1e-8)
         np.testing.assert_allclose(other.u, one.u, rtol=1e-8, atol=1e-10)
-
-
-@pytest.mark.long
-def test_each_step_makes_samples_and_prior_more_probable(monkeypatch):
-    begun, descended = [], iterated_smoother._descended
-
-    def watched(samples, best):
-        end = descended(samples, best)
-        begun.append((best.misfit, end.misfit))
-        return end
-
-    monkeypatch.setattr(iterated_smoother, "_descended", watched)
-    model = logistic(lp.RandomWalk(0.3))
-    start = lambda x: 0.05 + 0.3 * np.exp(-(((x[0] - 0.3) / 0.15) ** 2))  # noqa: E731
-    samples = readings(model, model.latent.prior + np.array([0.5, 1.0]), start)
-    ends(model, lp.SensitivityLaw(), samples, start)
-    assert len(begun) >= 6
-    assert all(end <= first for first, end in begun)
-    assert any(end < first - 1.0 for first, end in begun)
 
 
 @pytest.mark.slow

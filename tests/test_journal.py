@@ -111,6 +111,19 @@ class Crash(BaseException):
     """As good as a kill, within the process."""
 
 
+class Listens:
+    """A sink that keeps the times of estimates."""
+
+    def __init__(self) -> None:
+        self.times: list[float] = []
+
+    def put(self, estimate) -> None:
+        self.times.append(estimate.t)
+
+    def close(self) -> None:
+        pass
+
+
 class Breaks:
     """A sink that breaks the run after so many estimates."""
 
@@ -158,29 +171,6 @@ def test_whatever_breaks_within_a_step_the_run_goes_on_bit_by_bit(
     with Journal.open(whole / NAME) as one, Journal.open(broken / NAME) as other:
         same(other, one)
         assert other.accepted == count
-
-
-@pytest.mark.long
-def test_what_is_found_again_does_not_change_what_is_there(tmp_path):
-    path = tmp_path / NAME
-    run = started(tmp_path, 60, sinks=[Breaks(37)])
-    with pytest.raises(Crash):
-        run.run()
-    run.journal.note(Event(1.0, "odd", "", "something"))
-    run.journal.close()
-    before = content(path)
-    run = started(tmp_path, 60)
-    run.resume()
-    run.journal.note(Event(1.0, "odd", "", "something"))
-    run.run()
-    run.journal.close()
-    after = content(path)
-    for table, kept in before.items():
-        if table == "fields":  # those of the last sample are there only while it is the last
-            kept = {key: row for key, row in kept.items() if not row[1]}
-        assert kept.items() <= after[table].items()
-    assert [event[2] for event in after["events"].values()].count("odd") == 1
-    assert len(after["estimates"]) == 60
 
 
 @pytest.mark.long
@@ -270,16 +260,8 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
     for name, source in (("one", Rows), ("group", AtHand)):
         folder = tmp_path / name
         folder.mkdir()
-        told = []
-
-        class Sink:
-            def put(self, estimate, told=told):
-                told.append(estimate.t)
-
-            def close(self):
-                pass
-
-        run = live(folder, source(rows(40)), sinks=[Sink()])
+        sink = Listens()
+        run = live(folder, source(rows(40)), sinks=[sink])
         step = run.identifier.step
 
         def unreadable(t, z, inputs=None, step=step):
@@ -297,7 +279,7 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
         run.run()
         times = [record.t for record in run.journal]
         assert len(times) == 39
-        assert told == times
+        assert sink.times == times
         events = [(event.kind, event.message) for event in run.journal.events]
         found.append((list(run.journal), run.journal.counts, events))
         run.journal.close()
@@ -310,41 +292,12 @@ def test_an_estimate_of_a_group_that_cannot_be_computed_is_that_of_its_sample(
 # --- a journal that cannot be written ------------------------------------------------------------
 
 
-def limit_pages(kept: Journal, more: int) -> None:
-    (pages,) = kept._db.execute("PRAGMA page_count").fetchone()
-    kept._db.execute(f"PRAGMA max_page_count = {pages + more}")
-
-
-@pytest.mark.long
-def test_a_full_journal_is_one_sentence_and_goes_on_when_there_is_room(tmp_path):
-    whole, full = folders(tmp_path)
-    finished(whole, 150)
-    run = started(full, 150)
-    limit_pages(run.journal, 20)
-    with pytest.raises(
-        lp.errors.RunError, match=r"full.*Earlier results are safe. To continue, free disk space"
-    ):
-        run.run()
-    with pytest.raises(lp.errors.RunError, match="full"):  # it takes nothing more
-        run.journal.commit()
-    kept = len(run.journal)
-    run.journal.close()
-    assert 0 < kept < 150
-    with closing(sqlite3.connect(full / NAME)) as raw:
-        assert raw.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    again = started(full, 150)
-    again.resume()
-    again.run()
-    again.journal.close()
-    with Journal.open(whole / NAME) as one, Journal.open(full / NAME) as other:
-        same(other, one)
-        assert other.accepted == 150
-
-
-@pytest.mark.long
+@pytest.mark.slow
 def test_after_a_failed_write_no_checkpoint_passes_over_what_was_lost(tmp_path):
     run = started(tmp_path, 100)
-    limit_pages(run.journal, 10)
+    with closing(sqlite3.connect(tmp_path / NAME)) as raw:
+        (pages,) = raw.execute("PRAGMA page_count").fetchone()
+    run.journal._db.execute(f"PRAGMA max_page_count = {pages + 10}")
     with pytest.raises(lp.errors.RunError):
         run.run()
     run.journal._db.execute("PRAGMA max_page_count = 100000")  # room again, too late
@@ -391,26 +344,20 @@ def test_a_run_that_waits_for_its_disk_is_the_same_in_the_end(tmp_path, monkeypa
     calm = live(whole, source(broken))
     calm.run()
     calm.journal.close()
-    writes, seen = itertools.count(1), []
+    writes = itertools.count(1)
     bad = {first, first + 1, first + 9, first + 80}  # also while it is mended
     monkeypatch.setattr("livepde.runs.live_loop.LOOK", 0.0)
     monkeypatch.setattr(
         "livepde.runs.journal.writer", lambda path: Failing(path, lambda: next(writes) in bad)
     )
 
-    class Sink:
-        def put(self, estimate):
-            seen.append(estimate.t)
-
-        def close(self):
-            pass
-
-    run = live(failing, source(broken), patient=True, sinks=[Sink()])
+    sink = Listens()
+    run = live(failing, source(broken), patient=True, sinks=[sink])
     run.run()
     assert run.health["ok"]
     assert run.journal.health == ""
     run.journal.close()
-    assert seen == [0.1 * k for k in range(40)]
+    assert sink.times == [0.1 * k for k in range(40)]
     with Journal.open(whole / NAME) as one, Journal.open(failing / NAME) as other:
         same(other, one)
         assert other.counts == one.counts
@@ -717,6 +664,8 @@ HOSTILE = [
     "SELECT number + 1 FROM n) SELECT 'a' AS kind, 'b' AS channel, number FROM n",
     "CREATE TRIGGER x AFTER INSERT ON samples BEGIN DELETE FROM estimates; END",
     "ALTER TABLE samples ADD COLUMN more TEXT",
+    "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
+    "INSERT INTO counts VALUES ('a', 'b', 'many', 0)",
 ]
 
 
@@ -747,21 +696,6 @@ def signed(path: Path) -> None:
                 total = database.checksum(table, *values)
                 raw.execute(f"UPDATE {table} SET crc = ? WHERE {key}", (total, *row))
     raw.close()
-
-
-@pytest.mark.long
-def test_events_and_counts_of_wrong_types_are_one_sentence(tmp_path):
-    for command in (
-        "INSERT INTO events (t, kind, channel, message, crc) VALUES ('x', 1, 2, 3, 4)",
-        "INSERT INTO counts VALUES ('a', 'b', 'many', 0)",
-    ):
-        (tmp_path / NAME).unlink(missing_ok=True)
-        path = finished(tmp_path)
-        with sqlite3.connect(path) as raw:
-            raw.execute(command)
-        raw.close()
-        signed(path)
-        refused(path)
 
 
 @pytest.mark.long

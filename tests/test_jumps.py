@@ -124,16 +124,6 @@ def test_the_onset_of_a_jump_is_where_the_innovations_became_too_large():
     assert hits >= 72  # of 80
 
 
-@pytest.mark.study
-def test_the_rate_of_false_alarms_is_about_the_stated_one():
-    rng, jumps = np.random.default_rng(1), Jumps(probability=2e-3, settle=0)
-    watch, alarms = jumps.start(2), 0
-    for _ in range(20_000):
-        watch, alarm = jumps.add(watch, rng.standard_normal((1, 2)))
-        alarms += alarm
-    assert 4 <= alarms <= 40  # of each sample; windows overlap, so fewer than stated
-
-
 @pytest.mark.parametrize("options", [{"probability": 0.0}, {"window": 3}, {"size": 0.0}])
 def test_settings_that_cannot_be_meant_are_refused(options: Any):
     with pytest.raises(lp.errors.LawError, match=next(iter(options))):

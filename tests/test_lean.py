@@ -9,10 +9,10 @@ import pytest
 from scipy.linalg import sqrtm
 
 import livepde as lp
-from benchmarks import earlier, lean
+from benchmarks import lean
 from benchmarks import rods as costs
 from benchmarks.layered import ENDS, STEP, rod
-from benchmarks.peers import arrays, table
+from benchmarks.peers import arrays
 from benchmarks.peers.augmented import Augmented
 from benchmarks.problems import PROBLEMS
 from benchmarks.problems.rod import ROD
@@ -200,49 +200,7 @@ def full(augmented, columns, order):
     return whole[order]
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("row", ["EnKF as arrays, 20 members", "unscented filter as arrays"])
-def test_filters_as_arrays_find_the_parameter(row):
-    score = table.run_row(ROD, 0.01, 0, row)
-    assert score is not None
-    assert score.error < 0.02
-    assert score.whole > 0.0
-    assert score.median > 0.0
-
-
-@pytest.mark.study
-def test_what_cannot_be_stepped_as_arrays_says_why():
-    score = table.run_row(PROBLEMS["burgers-varying"], 0.01, 0, "unscented filter as arrays")
-    assert score is not None
-    assert score.note == "not run: constant unknowns and linear sensors only"
-
-
-@pytest.mark.long
-def test_the_lean_reference_is_a_row_where_it_applies():
-    score = table.run_row(ROD, 0.01, 0, "lean reference")
-    ours = table.run_row(ROD, 0.01, 0, "sensitivity")
-    assert score is not None
-    assert ours is not None
-    assert score.error == pytest.approx(ours.error, rel=0.1)  # ours has safeguards
-    other = table.run_row(PROBLEMS["heat2d"], 0.01, 0, "lean reference")
-    assert other is not None
-    assert "linear unknowns" in other.note
-
-
 # --- the tables, at the smallest size ------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_costs_of_a_small_rod():
-    given = costs.Rod(31, 2, "source")
-    outcome = costs.rods([given], runs=1, first=4)
-    (found,) = outcome.tables
-    rows = [dict(zip(found.columns, row, strict=True)) for row in found.rows]
-    laws = [row["law"] for row in rows]
-    assert laws == ["SensitivityLaw", "lean reference"]
-    assert all(row["median"] > 0.0 and row["mean"] > 0.0 for row in rows)
-    assert [row["bound"] for row in rows] == [5.0, None]
-    assert [check.value for check in outcome.checks] == [row["over 51ef98c"] for row in rows[:1]]
 
 
 def test_a_row_without_a_bound_has_no_check():
@@ -252,38 +210,7 @@ def test_a_row_without_a_bound_has_no_check():
     assert [row[6] for row in outcome.tables[0].rows] == [None, None]
 
 
-@pytest.mark.slow
-def test_costs_of_a_fleet():
-    outcome = costs.fleet(members=2, runs=1, first=4)
-    assert [row[0] for row in outcome.tables[0].rows] == list(ENDS)
-    ratios, differences = outcome.checks[::2], outcome.checks[1::2]
-    assert all(check.value > 0.0 for check in ratios)
-    assert all(check.ok for check in differences)
-
-
 def test_every_bound_is_of_a_process_that_is_timed():
     timed = {(given.nodes, given.unknowns) for given in costs.RODS if given.ends == ENDS[0]}
     assert set(costs.BOUNDS) <= timed
     assert {(given.nodes, given.ends) for given in costs.RODS} == set(costs.EARLIER)
-
-
-@pytest.mark.long
-def test_the_earlier_forward_step_is_asked_in_turns(monkeypatch, capsys):
-    monkeypatch.setattr(earlier, "SIZES", ((12, 2), (31, 2)))
-    earlier.compare(earlier.ROOT / "src", "HEAD", 2)
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 + 2 + 1
-    assert all(float(cell) > 0.0 for cell in lines[2].split("|")[3:6])
-
-
-@pytest.mark.study
-def test_peers_are_divided_by_the_prior():
-    outcome = table.peers(["rod"], 2, rows=["lean reference"])
-    (found,) = outcome.tables
-    lines = {row[1]: dict(zip(found.columns, row, strict=True)) for row in found.rows}
-    assert list(lines) == ["prior", "lean reference"]
-    assert lines["prior"]["error"] == 1.0
-    assert lines["prior"]["spread"] == 0.0
-    assert 0.0 < lines["lean reference"]["error"] < 0.5
-    assert lines["lean reference"]["spread"] > 0.0
-    assert found.title == "rod, 2 seeds"

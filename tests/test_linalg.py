@@ -170,10 +170,9 @@ def test_whether_a_matrix_is_symmetric_may_be_told_by_numpy():
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.long
-def test_engines_agree_with_dense_algebra(engine, seed):
-    rng = np.random.default_rng(seed)
+@pytest.mark.slow
+def test_engines_agree_with_dense_algebra(engine):
+    rng = np.random.default_rng(0)
     matrix = regular(25, rng, spd=engine in DEFINITE)
     pattern = Pattern.of(matrix)
     solver = BUILD[engine](pattern)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 import re
@@ -19,12 +18,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import xarray as xr
-from live_rod import CLOCK, COLUMNS, OPENED, identifier, journal, live, rows, same, write
+from live_rod import CLOCK, COLUMNS, OPENED, identifier, live, rows, same, write
 from patience import PATIENCE
 
 import livepde as lp
-from livepde.runs.feeds import SampleFeed
 from livepde.runs.journal import Event, Journal
 from livepde.runs.live_loop import JUDGED, Backlog, Live
 from livepde.runs.monitor import Metrics, Monitor
@@ -41,48 +38,6 @@ def closed():
     yield
     while OPENED:
         OPENED.pop().close()
-
-
-@pytest.mark.long
-def test_a_run_from_a_file_is_that_of_its_samples(tmp_path):
-    write(tmp_path, 60)
-    run = live(tmp_path)
-    run.run()
-    result = identifier().run(
-        [(row["t"], {k: row[k] for k in ("a", "b", "left")}) for row in rows(60)]
-    )
-    found = run.result.to_xarray()
-    assert np.array_equal(found["k"], result.to_xarray()["k"])
-    assert np.array_equal(found["innovation"], result.to_xarray()["innovation"], equal_nan=True)
-    assert found.sizes["snapshot"] == 7
-    run.journal.close()
-    with Journal.open(tmp_path / "journal.sqlite") as reader:
-        kept = reader.layout.dataset(list(reader))
-    # The last estimate of the result is that of the final fit; the journal has its fields.
-    kept, told = (data.isel(time=slice(-1)) for data in (kept, found))
-    told = told[list(kept)]  # without what is computed from these
-    xr.testing.assert_identical(kept.drop_attrs(), told.drop_attrs())
-
-
-@pytest.mark.long
-def test_samples_in_order_go_on_after_the_last_one(tmp_path):
-    def samples():
-        return (lp.Sample(row.pop("t"), row) for row in rows(20))
-
-    with journal(tmp_path / "one.sqlite") as kept:
-        run = Live(identifier(), SampleFeed(samples()), kept)
-        run.run()
-        whole = list(kept)
-    path = tmp_path / "two.sqlite"
-    with journal(path) as kept:
-        run = Live(identifier(), SampleFeed(itertools.islice(samples(), 8)), kept)
-        run.run()
-    with Journal.open(path, write=True) as kept:
-        run = Live(identifier(), SampleFeed(samples(), after=kept.last), kept)
-        assert run.resume() == 0
-        run.run()
-        assert [record.t for record in kept] == [record.t for record in whole]
-        assert np.array_equal(list(kept)[-1].numbers, whole[-1].numbers)
 
 
 CHILD = """

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from factories import broad, last_state, observe
-from skfem import ElementLineP1, ElementLineP2
+from skfem import ElementLineP2
 
 import livepde as lp
-from livepde import cases
 from livepde.cases import load
 from livepde.errors import CaseError, ModelError
 from livepde.models import (
@@ -370,30 +367,7 @@ def test_speed_and_damping_from_two_points():
     assert abs(d - 0.5) < 4 * d_std
 
 
-@pytest.mark.long
-def test_the_speed_as_a_field():
-    field = lp.Field(STRING, ElementLineP1(), inner="H1", prior=lp.Normal(1.0, std=0.3))
-    model = wave(STRING, field, 0.1, FIXED)
-    sensors = lp.Points([0.2, 0.4, 0.6, 0.8], of="w", noise=0.005)
-    exact = lambda x: 1.0 + 0.3 * np.sin(2 * np.pi * x[0])  # noqa: E731
-    twin = Twin(
-        model=model,
-        observation=sensors,
-        q_true={"c2": exact},
-        u0={"w": pluck, "p": 0.0},
-        times=TIMES,
-        scheme=Alexander2(),
-        noise=AbsoluteNoise(0.005),
-    )
-    law = lp.SensitivityLaw(modes=8)
-    ident = lp.Identifier(model, sensors, law, u0={"w": pluck, "p": 0.0}, scheme=Alexander2())
-    result = ident.run(twin)
-    assert twin.error(result.last.q) < 0.25 * twin.baseline()
-    assert twin.error(result.last.q) < 0.05
-
-
 ONE = lp.Normal(1.0, 1.0)
-ASSAY = Path(__file__).parents[1] / "cases" / "scratch_assay.toml"
 
 
 def kpp_wave(x, t):
@@ -436,17 +410,3 @@ def test_what_is_refused():
         fisher_kpp(mesh, ONE, ONE, K=0.0)
     with pytest.raises(lp.errors.ModelError, match="m must be at least 1"):
         porous_fisher(mesh, ONE, ONE, m=0.5)
-
-
-@pytest.mark.study
-@pytest.mark.parametrize(
-    ("density", "D", "r"), [(10, 0.0074, 1.05), (14, 0.0164, 1.16), (18, 0.0177, 1.30)]
-)
-@pytest.mark.parametrize("prior", [0.003, 0.05])
-def test_scratch_assays_find_the_published_values(density, D, r, prior, data_dir, monkeypatch):
-    """Whatever the prior of D; Lagergren et al. (2020)."""
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    wide = {"unknowns.D": {"prior": prior, "std": prior}, "data.options.density": density}
-    prepared = cases.load(ASSAY, allow_code=True, settings=wide).prepare()
-    prepared.identifier.run(prepared.stream)
-    assert prepared.identifier.estimate().q == pytest.approx([D, r], rel=0.15)

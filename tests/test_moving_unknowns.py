@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,24 +13,16 @@ from scipy.optimize import least_squares
 from skfem import ElementLineP1
 
 import livepde as lp
-from benchmarks.silent.exact_walk import mean_and_end
 from livepde import cases
 from livepde.cases.new_case import write_template
 from livepde.cases.preview import preview
-from livepde.diagnostics import Excitation, Spaces, check_law, theory_report
-from livepde.fem.priors import CONSTANT
+from livepde.diagnostics import Excitation, Spaces, theory_report
 from livepde.linalg import Array
 from livepde.stepping import ForwardStage
 from livepde.streams import AbsoluteNoise, Twin
 
 NOISE = 0.02
 SENSORS = {"a": 0.3, "b": 0.55, "c": 0.8}
-EVOLUTIONS = {
-    "constant": CONSTANT,
-    "walk": lp.RandomWalk(0.4),
-    "reverting": lp.MeanReverting(0.8),
-    "periodic": lp.fem.Periodic(2.0, 2),
-}
 REVERTING = lp.MeanReverting(1.5)
 mesh = lp.interval(0.0, 1.0, 6)
 
@@ -72,111 +63,6 @@ def samples(count: int = 30, missing: bool = True) -> list[tuple[float, Array]]:
     return list(zip(times.tolist(), z, strict=True))
 
 
-class Dense:
-    """The Kalman filter of (u, latent) with dense matrices, for models linear in both."""
-
-    def __init__(self, model: lp.Model, observed: Any) -> None:
-        self.model, n, k = model, model.X.dim, model.latent.dim
-        self.n, self.k = n, k
-        q = model.initial_parameter()
-        self.x = np.concatenate([model.initial_state(q), q])
-        self.prior = np.linalg.inv(model.Q.gram.toarray())
-        J = np.vstack([model.initial_directions(q, np.eye(k)), np.eye(k)])
-        self.P = J @ self.prior @ J.T
-        H_u, H_q = observed.jacobian(self.x[:n], model.latent.value(q), lp.fem.Moment(0.0))
-        self.H = np.hstack([H_u.toarray(), H_q @ model.latent.V.toarray()])
-
-    def predict(self, t0: float, t1: float, substeps: int) -> None:
-        model, n, k = self.model, self.n, self.k
-        M, zero = model.mass.toarray(), np.zeros(n)
-        B, A = model.form_B.matrix("v", "u", u=zero).toarray(), model.A(zero).matrix.toarray()
-        free, h = model.X.free.astype(bool), (t1 - t0) / substeps
-        for t in t0 + h * np.arange(1, substeps + 1):
-            F, gained = np.zeros((k, k)), np.zeros((2 * k, 2 * k))
-            for p in model.latent.parts.values():
-                F[p.part, p.part] = np.kron(p.evolution.transition(h), np.eye(p.size))
-                grown = p.evolution.growth(h, p.unknown.prior.latent_std)
-                rates, own = -np.diag(p.evolution.generator), np.arange(k)[p.part]
-                pairs = [mean_and_end(*each) for each in zip(rates, itertools.repeat(h), grown)]
-                for row, column in np.ndindex(2, 2):
-                    variance = np.repeat([pair[row, column] for pair in pairs], p.size)
-                    here = np.ix_(own + row * k, own + column * k)
-                    gained[here] = variance[:, None] * self.prior[p.part, p.part]
-            prior = model.latent.prior
-            a = prior + F @ (self.x[n:] - prior)
-            S, u = M / h + B, model.impose(self.x[:n], lp.fem.Moment(t))
-            load = M @ self.x[:n] / h - A @ a + model.F(lp.fem.Moment(t)) - S @ u
-            step = np.zeros((n, n))
-            step[np.ix_(free, free)] = np.linalg.inv(S[np.ix_(free, free)])
-            J = np.block([[step @ M / h, -step @ A @ F], [np.zeros((k, n)), F]])
-            # The one stage of the scheme sees the mean of the noise over the step.
-            N = np.block([[-step @ A, np.zeros((n, k))], [np.zeros((k, k)), np.eye(k)]])
-            self.x = np.concatenate([u + step @ load, a])
-            self.P = J @ self.P @ J.T + N @ gained @ N.T
-
-    def update(self, z: Array) -> None:
-        seen = np.isfinite(z)
-        H = self.H[seen]
-        K = self.P @ H.T @ np.linalg.inv(H @ self.P @ H.T + NOISE**2 * np.eye(len(H)))
-        self.x = self.x + K @ (z[seen] - H @ self.x)
-        self.P = self.P - K @ H @ self.P
-
-    def parameter(self) -> tuple[Array, Array]:
-        V = self.model.latent.V.toarray()
-        variance = np.diag(V @ self.P[self.n :, self.n :] @ V.T)
-        return V @ self.x[self.n :], np.sqrt(variance)
-
-
-class Still(lp.SensitivityLaw):
-    """The law with one reference that stays, as in a preview."""
-
-    relinearises = False
-
-
-LAWS = {
-    "plain": lambda **options: lp.SensitivityLaw(refit=None, **options),
-    "still": lambda **options: Still(refit=None, **options),
-    "refit": lp.SensitivityLaw,
-    "window": lambda **options: lp.SensitivityLaw(refit=lp.Refit(start=4, window=11), **options),
-}
-
-
-def fitted(name: str, law: str) -> lp.Model:
-    """Return the linear model for a law, with offsets that stay where samples are fitted."""
-    stays = law in ("refit", "window")
-    return linear_model(EVOLUTIONS[name], CONSTANT if stays else REVERTING)
-
-
-# Each evolution with each law, and each of both with one substep and with several.
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "kind", "substeps"),
-    [(*pair, (1, 4)[k % 2]) for k, pair in enumerate(itertools.product(EVOLUTIONS, LAWS))],
-)
-def test_a_linear_problem_gives_the_kalman_filter(name: str, kind: str, substeps: int):
-    model = fitted(name, kind)
-    # Unknowns that stay do not explain these data: a gate would refuse some of them.
-    law = LAWS[kind](modes=7, rank=30, gate=np.inf, shadows=None)
-    # Samples at equal distances: dt_max then divides each step alike.
-    stream = [(0.1 * k, z) for k, (_, z) in enumerate(samples())]
-    scheme = lp.ImplicitEuler()  # as in the dense filter
-    steps = {"scheme": scheme, "dt_max": 0.1 / substeps, "halvings": 0}
-    identifier = lp.Identifier(model, sensors(), law, **steps)
-    dense, before = Dense(model, identifier.observed), 0.0
-    directions = model.latent.V @ identifier._work.filter.reduction.Phi
-    for t, z in stream:
-        estimate = identifier.step(t, z)
-        if t > before:
-            dense.predict(before, t, substeps)
-        dense.update(z)
-        before, (q, std) = t, dense.parameter()
-        np.testing.assert_allclose(estimate.q, q, atol=1e-9)
-        np.testing.assert_allclose(estimate.u, dense.x[: dense.n], atol=1e-9)
-        # What is reported is wider, as the innovations are larger than expected here.
-        factor = directions @ identifier._state.now.C[0].T
-        np.testing.assert_allclose(np.sqrt((factor**2).sum(axis=1)), std, atol=1e-9)
-
-
 MOVING = {
     "walk": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.RandomWalk(0.4)), 0.0),
     "reverting": (lp.Scalar(lp.Normal(1.0, 0.5), evolution=lp.MeanReverting(0.4)), 0.0),
@@ -199,18 +85,6 @@ def test_unknowns_that_move_are_not_fitted(name: str):
     result = identifier.run(stream)
     assert result.last.fit is None
     assert abs(result.last.parameters["k"][0] - 1.0) < 2.0 * result.last.parameters["k"][1]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("walk", "refit"), ("reverting", "plain"), ("constant", "window"), ("periodic", "window")],
-)
-def test_the_law_keeps_its_contract_while_unknowns_move(name: str, kind: str):
-    model = fitted(name, kind)
-    law = LAWS[kind](modes=3, gate=4.0, shadows=None)
-    stream = samples(8, missing=False)
-    check_law(law, lambda law: lp.Identifier(model, sensors(), law), stream).raise_if_failed()
 
 
 @pytest.mark.slow

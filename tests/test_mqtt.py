@@ -11,12 +11,11 @@ import sys
 import threading
 import time
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from broker import MOSQUITTO, Server
+from certificates import certificate
 from live_rod import COLUMNS, live, rows, same
 from patience import PATIENCE
 
@@ -492,45 +491,10 @@ def test_topics_that_bring_a_message_twice(one, other, overlap):
             MqttSource(Broker(), topics, "t")
 
 
-def certificate(folder: Path) -> tuple[Path, Path]:
-    """Return a certificate of this machine, signed by itself, and its key."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-    from cryptography.x509.oid import NameOID
-
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "localhost")])
-    now = datetime.now(UTC)
-    signed = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName([x509.DNSName("localhost")]), critical=False)
-        .add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
-        .sign(key, hashes.SHA256())
-    )
-    paths = folder / "certificate.pem", folder / "key.pem"
-    paths[0].write_bytes(signed.public_bytes(serialization.Encoding.PEM))
-    paths[1].write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
-        )
-    )
-    return paths
-
-
 # paho-mqtt leaves the socket of a failed handshake to the garbage collector.
 @pytest.mark.filterwarnings("ignore:.*ssl.SSLSocket:pytest.PytestUnraisableExceptionWarning")
 def test_a_connection_is_encrypted_with_a_certificate_of_ones_own(server, tmp_path):
-    pytest.importorskip("cryptography")
-    signed, key = certificate(server.folder)
+    signed, key = certificate(server.folder, "localhost")
     server.stop()
     text = server.config.read_text()
     server.config.write_text(f"{text}certfile {signed}\nkeyfile {key}\n")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from commands import call
 from factories import INTERPOLATED_ROD_CASE
-from skfem import ElementLineP1
 
 import livepde as lp
 from livepde import cases
@@ -71,41 +70,6 @@ def test_a_reading_counts_with_its_own_noise_as_with_that_of_its_sensor(law):
         one = stated.step(t, z)
         two = own.step(t, {"a": (float(z[0]), 0.02), "b": float(z[1])})
     assert same(one, two)
-
-
-@pytest.mark.slow
-def test_readings_of_any_noise_give_the_weighted_least_squares():
-    """The amplitude of a source, in which the readings are linear."""
-    model = lp.Model(
-        state=lp.Field(lp.interval(0.0, 1.0, 16), ElementLineP1(), dirichlet={"left": 0.0}),
-        parameter={"s": lp.Normal(0.0, std=10.0)},
-        A=lambda q, u, v, x: lp.dot(lp.grad(u), lp.grad(v)) - q.s * v,
-    )
-    one, unit = identifier(model=model), {}
-    # The forecasts take the same steps as the run.
-    stated = lp.laws.Shadows(parts=1)
-    law = lp.SensitivityLaw(gate=np.inf, shadows=stated)
-    q1, q0 = (
-        lp.Identifier(model, one.observed.observation, law, q0={"s": s}, u0=0.0).forecast(
-            H * np.arange(1, STEPS + 1)
-        )
-        for s in (1.0, 0.0)
-    )
-    for name in ("a", "b"):
-        unit[name] = np.asarray(q1[name]) - np.asarray(q0[name])
-    rows = np.column_stack([unit["a"], unit["b"]])
-    rng = np.random.default_rng(0)
-    std = rng.choice([0.001, 0.01, 0.1], size=rows.shape)
-    z = 2.0 * rows + std * rng.standard_normal(rows.shape)
-    one = lp.Identifier(model, lp.Points({"a": 0.3, "b": 0.6}, noise=1.0), law, u0=0.0)
-    for k in range(STEPS):
-        one.step(H * (k + 1), np.column_stack([z[k], std[k]]))
-    information = 1.0 / 10.0**2 + ((rows / std) ** 2).sum()
-    expected = ((rows / std**2) * z).sum() / information
-    latent = one.law.member_belief(one._work, one._state.now, 0)
-    assert latent.q == pytest.approx([expected], rel=1e-6)
-    C = one._state.now.C[0]
-    assert 10.0 * np.linalg.norm(C) == pytest.approx(information**-0.5, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -199,31 +163,6 @@ def test_a_journal_keeps_noise_and_a_run_goes_on_with_it(tmp_path):
         driven = drive(identifier(), samples, journal=journal)
         assert driven.status == "finished"
         assert same(driven.result.last, whole)
-
-
-@pytest.mark.slow
-def test_members_of_a_fleet_have_noise_of_their_own():
-    fleet = lp.Fleet(
-        rod(),
-        lp.Points({"a": 0.3, "b": 0.6}, noise=0.05),
-        lp.SensitivityLaw(),
-        2,
-        u0=lambda x: np.sin(np.pi * x[0]),
-    )
-    ones = [identifier(), identifier()]
-    assert fleet.together
-    for t, z, std in stream():
-        other = np.array([NAN, 0.1])
-        z_all, noise = np.array([z, z + 0.01]), np.array([std, other])
-        if t < 10 * H:
-            found = fleet.step(t, np.stack([z_all, noise], axis=2))
-        else:
-            columns = {noise_channel("a"): noise[:, 0], noise_channel("b"): noise[:, 1]}
-            found = fleet.step(t, {"a": z_all[:, 0], "b": z_all[:, 1], **columns})
-        each = [one.step(t, np.column_stack([z_all[j], noise[j]])) for j, one in enumerate(ones)]
-    assert found.q[:, 0] == pytest.approx([one.belief.q[0] for one in each], rel=1e-9)
-    with pytest.raises(SampleError, match="noise of b: got 0"):
-        fleet.step(t + H, np.ones((2, 2, 2)) * [[1.0, 1.0], [1.0, 0.0]])
 
 
 def test_a_reading_that_the_start_is_made_of_brings_its_noise():

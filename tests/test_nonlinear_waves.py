@@ -10,8 +10,6 @@ import pytest
 from skfem import ElementLineHermite
 
 import livepde as lp
-from benchmarks.cases import jobs_of, run_job
-from livepde.cases import load
 from livepde.models import allen_cahn, burgers, kdv, kuramoto_sivashinsky
 from livepde.stepping import Advance, Alexander2, simulate
 
@@ -144,46 +142,3 @@ def test_the_reader_adds_noise_to_all_and_hides_some(data_dir):
     rare = np.array(list(field(data_dir, "pde_find/burgers.mat", share=0.2)[1].values()))
     assert np.isfinite(rare).mean() == pytest.approx(0.2, rel=0.05)
     assert np.nanmax(np.abs(rare - u)) == 0.0
-
-
-@pytest.mark.study
-@pytest.mark.parametrize(
-    ("noise", "share", "bound"), [(0, 1, 1e-3), (0.1, 1, 0.029), (0.05, 0.2, 0.032)]
-)
-def test_burgers_from_a_published_field(data_dir, noise, share, bound):
-    """Every other column and the first half of what the case takes in full."""
-    t, columns = reader()(data_dir, "pde_find/burgers.mat", noise=noise, share=share)
-    z = np.array(list(columns.values())).T[:, ::2]
-    mesh = lp.interval(-8.0, 8.0, 80)
-    start = lp.Field(mesh, ElementLineHermite(), inner="H1", prior=lp.Normal(std=1.0))
-    model = burgers(mesh, lp.LogNormal(0.3, 0.3), lp.Normal(0.5, 0.5), start)
-    sensors = lp.Points(list(np.arange(-8.0, 8.0, 0.125)), noise=max(0.1814 * noise, 2e-4))
-    law = lp.SensitivityLaw(modes=40)
-    identifier = lp.Identifier(model, sensors, law, scheme=Alexander2(), dt_max=0.05)
-    found = identifier.run(zip(t[:51], z[:51], strict=True)).last.parameters
-    assert abs(found["nu"][0] / 0.1 - 1) < bound
-    assert abs(found["advection"][0] - 1) < bound
-
-
-CASES = ("burgers", "burgers_shock", "kdv", "kdv_pde_find", "allen_cahn")
-
-
-@pytest.mark.study
-@pytest.mark.parametrize("name", CASES)
-def test_cases_are_short_and_fit_their_equations(name):
-    path = Path(__file__).parents[1] / "cases" / f"{name}.toml"
-    assert len(path.read_text().splitlines()) <= 60
-    assert len(load(path, allow_code=True).references) == 2
-    for job in jobs_of(path):
-        load(path, allow_code=True, settings=job.settings)
-
-
-@pytest.mark.study
-def test_a_shock_from_few_noisy_points(data_dir, monkeypatch):
-    """The hardest variant of the case: 10 % noise on 2000 of the 25600 points."""
-    monkeypatch.setenv("LIVEPDE_DATA", str(data_dir))
-    *_, job = jobs_of(Path(__file__).parents[1] / "cases" / "burgers_shock.toml")
-    found = run_job(job)
-    assert not found.error
-    assert found.numbers["nu.error"] < 0.06391
-    assert found.numbers["advection.error"] < 0.02

@@ -6,11 +6,12 @@ import asyncio
 import logging
 import threading
 import time
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from certificates import certificate
 from live_rod import live, rows
 from patience import PATIENCE
 from ports import kept_port
@@ -356,40 +357,6 @@ def test_what_cannot_be_written_is_one_sentence(server, tmp_path):
 
 
 # --- encrypted messages --------------------------------------------------------------------------
-
-
-def certificate(folder: Path, name: str, uri: str) -> tuple[Path, Path]:
-    """Write a certificate that signs itself, and its key."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import rsa
-    from cryptography.x509.oid import NameOID
-
-    key = rsa.generate_private_key(65537, 2048)
-    who = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
-    names = [x509.UniformResourceIdentifier(uri) if uri else x509.DNSName("localhost")]
-    now = datetime.now(UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(who)
-        .issuer_name(who)
-        .public_key(key.public_key())
-        .serial_number(x509.random_serial_number())
-        .not_valid_before(now - timedelta(days=1))
-        .not_valid_after(now + timedelta(days=1))
-        .add_extension(x509.SubjectAlternativeName(names), critical=False)
-        .sign(key, hashes.SHA256())
-    )
-    cert, secret = folder / f"{name}.pem", folder / f"{name}-key.pem"
-    cert.write_bytes(made.public_bytes(serialization.Encoding.PEM))
-    secret.write_bytes(
-        key.private_bytes(
-            serialization.Encoding.PEM,
-            serialization.PrivateFormat.PKCS8,
-            serialization.NoEncryption(),
-        )
-    )
-    return cert, secret
 
 
 def test_certificates_are_next_to_the_case(tmp_path, monkeypatch):

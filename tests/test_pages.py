@@ -59,9 +59,11 @@ ELSEWHERE = {
     "test_pages.py": ["make", "python3 -m venv .venv", ". .venv/bin/activate", "pip install"],
     "test_cli.py": ["python -m benchmarks step"],
     "test_block_solver.py": ["python -m benchmarks scale"],
-    "test_public.py::test_the_benchmark_of_the_import": ["python -m benchmarks import"],
-    "test_lean.py::test_peers_are_divided_by_the_prior": ["python -m benchmarks peers"],
-    "test_fleet.py::test_the_benchmark_compares_equal_estimates": ["python -m benchmarks fleet"],
+    "test_benchmarks.py::test_a_quick_run_ends_with_its_checks": [
+        "python -m benchmarks fleet",
+        "python -m benchmarks import",
+        "python -m benchmarks peers",
+    ],
     "test_benchmarks.py::test_steps_are_ratios": ["python -m benchmarks.suite.costs"],
     "test_compare.py::test_the_program_finds_the_fault_from_a_case_and_from_a_run": [
         "livepde compare"

@@ -14,7 +14,7 @@ import pytest
 
 import livepde
 from benchmarks.overhead import rod
-from benchmarks.startup import BASE, SCRIPT, startup
+from benchmarks.startup import BASE, SCRIPT
 from livepde import errors
 
 DOCUMENTED = (
@@ -144,15 +144,6 @@ def test_the_command_line_comes_lightly_to_its_first_estimates(tmp_path):
     slow = {"matplotlib", "pandas", "pyarrow", "xarray"}
     slow |= {f"scipy.{part}" for part in ("interpolate", "ndimage", "optimize", "special", "stats")}
     assert not slow & more
-
-
-@pytest.mark.study
-def test_the_benchmark_of_the_import():
-    outcome = startup(rounds=1)
-    assert [check.name for check in outcome.checks] == ["import livepde", SCRIPT]
-    nothing, used = (check.value for check in outcome.checks)
-    assert 0.0 < nothing < 1.0 < used  # one loads no library, the other the same and more
-    assert [check.bound for check in outcome.checks] == [1.5, 1.5]
 
 
 def test_the_tree_of_exceptions_is_as_drawn():

@@ -216,18 +216,6 @@ def test_a_sensor_that_was_set_aside_is_not_fitted():
     assert abs(value - broken_rod.ALPHA) < 4.0 * std
 
 
-@pytest.mark.slow
-def test_a_member_of_a_fleet_is_fitted_as_a_single_run():
-    who, z = rod(), broken_rod.readings(40)
-    fleet = lp.Fleet(who.model, who.observed.observation, who.law, ["a", "b"], u0=20.0)
-    for t, row in rows(z):
-        one = who.step(t, row)
-        found = fleet.step(t, {name: [value, value] for name, value in row.items()})
-        for name in ("a", "b"):
-            member, single = found.member(name).parameters["alpha"], one.parameters["alpha"]
-            assert member == pytest.approx(single, rel=1e-9)
-
-
 @pytest.mark.long
 def test_a_reading_whose_place_is_missing_is_not_fitted():
     model = heat(lp.interval(0.0, 1.0, 12), lp.Normal(0.2, 0.1), {"left": 1.0, "right": 0.0})

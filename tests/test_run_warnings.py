@@ -67,23 +67,6 @@ def test_a_process_that_is_missing_is_said():
     assert any("Model misfit" in text for text in found[:2])
 
 
-@pytest.mark.long
-def test_a_sensor_that_is_always_off_is_named():
-    model = rod(lp.Normal(0.2, 0.1))
-    found = doubts(run(model, model, shift=[0.0, 1.0, 0.0]))
-    misfit = next(text for text in found if "Model misfit" in text)
-    assert "B may read" in misfit
-    assert "too high" in misfit
-    assert "C may" not in misfit
-
-
-@pytest.mark.long
-def test_an_estimate_at_its_bound_is_said():
-    narrow = rod(lp.Normal(0.2, 0.1, bounds=(0.0, 0.25)))
-    found = doubts(run(narrow, rod(lp.Normal(0.2))))
-    assert any("`a` is at its bound 0.25" in sentence for sentence in found)
-
-
 @pytest.mark.slow
 def test_an_unknown_that_nothing_shows_is_said():
     unseen = {"a": lp.Normal(0.2, 0.1), "b": lp.Normal(1.0, 0.5)}

@@ -386,20 +386,6 @@ def test_a_moving_sensor_finds_the_conductivity():
     identified(heated(), lp.observation.Moving({"T": "x"}, noise=0.01), {"k": 0.6}, 0.01, inputs)
 
 
-@pytest.mark.long
-def test_offsets_by_direct_and_gain_by_calibration():
-    model = heated(a=lp.Normal(0.0, std=0.3), b=lp.Normal(0.0, std=0.3))
-    direct = {"A": lambda q, x: q.a, "B": lambda q, x: q.b}
-    offsets = lp.Points({"A": 0.2, "B": 0.5, "C": 0.8}, direct, noise=0.005)
-    identified(model, offsets, {"k": 0.6, "a": 0.2, "b": -0.1}, 0.005)
-    gains = lp.observation.Calibrated(
-        lp.Points({"A": 0.2, "B": 0.6}),
-        lambda y, q, x: y * np.array([q.gain, 1.0]),
-        noise=0.005,
-    )
-    identified(heated(gain=lp.Normal(1.0, std=0.2)), gains, {"k": 0.6, "gain": 1.15}, 0.005)
-
-
 @pytest.mark.slow
 def test_positions_are_inputs_that_may_be_missing(tmp_path):
     model, law = heated(), lp.SensitivityLaw()

@@ -12,7 +12,6 @@ from factories import driven_rod, readings
 import livepde as lp
 from livepde.laws.member_arrays import changed
 from livepde.models import heat
-from livepde.runs.run_verdict import doubts
 from livepde.stepping import ImplicitEuler
 from livepde.streams import AbsoluteNoise, Twin
 
@@ -338,17 +337,6 @@ def test_a_mesh_whose_initial_state_is_not_finite_is_followed_later() -> None:
     assert len(spoiled) == 1
     assert estimates[2].diagnostics.shifts.sizes["mesh"] != 0.0
     assert estimates[1].diagnostics.shadow_failed == estimates[-1].diagnostics.shadow_failed > 0.0
-
-
-@pytest.mark.long
-def test_speaks_and_names_the_cause() -> None:
-    def said(cells: int, **k: Any) -> list[str]:
-        data = identifier(cells, **k).run(samples()).to_xarray()
-        return [text for text in doubts(data) if "Discretisation" in text]
-
-    assert "the mesh" in said(5)[0]
-    assert "the time step" in said(160, scheme=ImplicitEuler())[0]
-    assert not said(160, dt_max=WIDTH / 8)
 
 
 def test_refuses_shadows_of_nothing() -> None:

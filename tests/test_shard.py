@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import runpy
 import signal
@@ -14,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import bench
 from patience import PATIENCE
 from test_fleet import LAWS, MODELS, SENSORS, law, rod, samples
 
@@ -396,14 +394,3 @@ def test_the_recipe_for_an_engine_survives_workers_that_are_killed(engine, scrip
         tables = [parquet.read_table(path) for path in sorted((tmp_path / "out").glob(f"{name}-*"))]
         assert [k for table in tables for k in table["offset"].to_pylist()] == list(range(600))
         assert [x for table in tables for x in table["alpha"].to_pylist()] == wanted
-
-
-@pytest.mark.study
-def test_the_benchmark_kills_workers():
-    """With few members: their memory and time are those of the start."""
-    _, output = bench("shard", "--members", "20", "--kills", "2", "--json")
-    found = json.loads(output)
-    checks = {check["name"].removeprefix("shard: "): check for check in found["checks"]}
-    for name in ("estimates that differ after kills", "estimates lost after kills", "kills"):
-        assert checks[name]["ok"], name
-    assert checks["kills"]["value"] == 2

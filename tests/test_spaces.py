@@ -11,7 +11,7 @@ from factories import (
     excited,
     excited_q,
     excited_u,
-    filter_alone,
+    few,
     laplace,
     line,
     product,
@@ -305,10 +305,11 @@ def test_balakrishnan(sigma, largest):
     np.testing.assert_allclose(power, x**sigma, rtol=1e-3)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"])
-@pytest.mark.parametrize("zero", [False, True])
-@pytest.mark.parametrize("s", ORDERS)
+ELEMENTS = ["line P1", "line P2 / P1", "triangles P1", "quads Q1", "tets P1"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "zero", "s"), few(14, ELEMENTS, [False, True], ORDERS))
 def test_gram_is_the_spectral_power(name, zero, s):
     """G = M (M^-1 K)^s on the free coefficients: exact for whole s, to 1e-3 for others."""
     options = {"q_dirichlet": {"boundary": 0.0}} if zero else {}
@@ -323,9 +324,8 @@ def test_gram_is_the_spectral_power(name, zero, s):
     np.testing.assert_allclose(ratios, 1.0, rtol=1e-7 if s == int(s) else 1e-3)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("s", [0.0, 0.75, 1.0, 1.75, 2.0])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "s"), few(14, CASES, [0.0, 0.75, 1.0, 1.75, 2.0]))
 def test_spaces_pass_their_check(name, s):
     for zero in ({}, {"boundary": 0.0}):
         model = CASES[name].model(inner=lp.Sobolev(s, LENGTH), q_dirichlet=zero)
@@ -458,33 +458,6 @@ def test_the_coupled_stage_with_a_border_is_that_with_the_gram_written_out(s):
         found.append(lp.Identifier(one, lp.Full(), law, **start).run(twin).last)
     np.testing.assert_allclose(found[0].q, found[1].q, rtol=1e-6, atol=1e-7)
     np.testing.assert_allclose(found[0].u, found[1].u, atol=1e-7)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    ("law", "inner"),
-    [
-        (lp.GradientLaw(gain=1e3), lp.Sobolev(0.75, 0.2)),
-        (lp.GradientLaw(gain=1e3), lp.Sobolev(2, 0.2)),
-        (filter_alone(noise=1e-3), lp.Sobolev(0.75, 0.2)),
-        (filter_alone(noise=1e-3), lp.Sobolev(1.5, 0.2)),
-    ],
-)
-def test_both_laws_identify(law, inner):
-    model = excited(16, ElementLineP1(), inner=inner)
-    times = 0.05 * np.arange(101)
-    twin = Twin(
-        scheme=lp.ImplicitEuler(),
-        model=model,
-        observation=lp.Full(),
-        q_true=excited_q,
-        u_true=excited_u,
-        times=times,
-    )
-    start = {"q0": 0.0, "u0": lambda x: excited_u(x, 0.0)}
-    last = lp.Identifier(model, lp.Full(), law, **start).run(twin).last
-    assert last.status.ok
-    assert twin.error(last.q) < 0.05
 
 
 def test_bad_orders():

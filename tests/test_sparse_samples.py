@@ -80,22 +80,6 @@ def test_empty_rows_between_samples_change_nothing(kind: str, decay: float):
         assert float(one["s"].mean) == pytest.approx(float(other["s"].mean), abs=0.05 * std)
 
 
-# 12 paths of 100 samples: a correct share of 0.95 is off by more than 0.02 once in 700 times.
-@pytest.mark.study
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("decay", "h"), [(0.0, 0.15), (0.0, 6.0), (20.0, 0.15), (20.0, 6.0)])
-def test_coverage(kind: str, decay: float, h: float):
-    exact, inside = exact_of(kind, decay, 0.1), []
-    for seed in range(12):
-        rng = np.random.default_rng([seed, 7])
-        path = exact.drawn(h, 100, rng)
-        who = identifier(exact, refit=None)
-        for k, value in enumerate(exact.read(path, rng)):
-            mean = float(who.step(k * h, {"a": value})["s"].mean)
-            inside.append(abs(mean - path[k, 1]) <= 1.96 * spread(who, exact))
-    assert 0.93 <= np.mean(inside) <= 0.97
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_smoother_is_the_exact_one(kind: str):
     exact, h = exact_of(kind, 0.0, 0.1), 2.0

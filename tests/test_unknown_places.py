@@ -157,23 +157,3 @@ def test_an_unknown_in_a_sensor_is_found_with_one_in_the_process(what: str):
     for k, (label, (value, std)) in enumerate(estimate.parameters.items()):
         assert abs(value - exact[k]) < 4 * std, label
         assert std < 0.1, label
-
-
-@pytest.mark.long
-def test_a_scalar_and_a_field_are_found_together():
-    field = lp.Field(MESH, ElementLineP1(), inner="H1", prior=lp.LogNormal(0.2, std=0.1), name="D")
-    model = lp.Model(
-        lp.Field(MESH, ElementLineP1()),
-        {"D": field, "r": lp.Normal(0.0, 1.0)},
-        A=[
-            lambda q, u, v, x: q.D * lp.dot(lp.grad(u), lp.grad(v)) + q.r * u * v,
-            lp.On("left", lambda q, u, v, x: -swing(x) * v),
-        ],
-    )
-    truth = {"D": lambda x: 0.2 + 0.1 * x[0], "r": 0.7}
-    estimate = found(model, lp.Points(np.linspace(0.05, 0.95, 7), noise=NOISE), truth, modes=6)
-    value, std = estimate.parameters["r"]
-    assert abs(value - 0.7) < 4 * std < 0.2
-    D_found = estimate.q[model.parameter_space.part("D")]
-    exact = 0.2 + 0.1 * MESH.p[0]
-    assert np.linalg.norm(D_found - exact) < 0.3 * np.linalg.norm(0.2 - exact)

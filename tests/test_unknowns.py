@@ -285,19 +285,6 @@ def test_a_periodic_unknown_is_followed_without_delay():
 
 
 @pytest.mark.long
-def test_a_random_walk_is_followed_with_an_honest_deviation():
-    times, rate = np.arange(0.0, 40.0, 0.05), 0.02
-    rng = np.random.default_rng(3)
-    walk = 0.4 + rate * np.sqrt(0.05) * np.cumsum(rng.standard_normal(len(times)))
-    samples = data(lambda t: float(np.interp(t, times, walk)), times)
-    model = rod({"a": lp.Scalar(lp.Normal(0.4, 0.2), evolution=lp.RandomWalk(rate))})
-    found = estimates(model, BARE, samples)
-    error, deviations = rms(found, lambda t: float(np.interp(t, times, walk)), 5.0)
-    assert 0.7 < deviations < 1.3
-    assert error < 0.5 * np.sqrt(((walk - 0.4) ** 2).mean())
-
-
-@pytest.mark.long
 def test_the_gradient_law_rotates_a_periodic_unknown():
     def a(t: float) -> float:
         return float(0.3 + 0.1 * np.cos(2 * np.pi * t / 10.0 + 0.4))

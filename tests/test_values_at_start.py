@@ -99,15 +99,6 @@ def test_a_forecast_before_the_first_sample_begins_there_too(ahead: float):
     assert forecast[0] == pytest.approx(seen(who, ahead, {"T": 1.0}), abs=1e-12)
 
 
-def test_smoother_and_filter_agree_at_the_last_sample():
-    stream = [(0.1 * k, {"a": 0.1 * k, "T": 1.0 - 0.1 * k}) for k in range(1, 8)]
-    result = identifier(0.0).run(stream)
-    smoothed = result.smoothed()
-    last = result.to_xarray().isel(time=-1)
-    assert float(smoothed.s[-1]) == pytest.approx(float(last.s), abs=1e-12)
-    assert float(smoothed.s_std[-1]) == pytest.approx(float(last.s_std), rel=1e-9)
-
-
 def test_a_fleet_begins_as_its_members():
     u0s = [0.0, lambda x: 0.5 * x[0], None]
     fleet = Fleet(rod(), SENSORS, LAW, members=3, u0=u0s, q0={"s": 0.0})

@@ -213,36 +213,6 @@ def test_a_jump_is_named_and_turns_the_verdict_soon():
     assert ("jump", "k") in named(estimate.verdict)
 
 
-@pytest.mark.long
-def test_the_verdict_turns_back_when_a_fault_is_mended():
-    count, begin, end = 700, 150, 300
-    rng = np.random.default_rng(1)
-    z = shown(count=count) + NOISE * rng.standard_normal((count, len(PLACES)))
-    z[begin:end, 1] += 0.08
-    sensors = lp.Points(PLACES, noise=NOISE)
-    identifier = lp.Identifier(rod(), sensors, lp.SensitivityLaw(), u0=0.0)
-    levels = []
-    for k in range(count):
-        t = float(TIMES[1] * k)
-        estimate = identifier.step(t, z[k], {"T_left": driven(t)})
-        levels.append(estimate.verdict.level if k % 10 == 0 or k == count - 1 else "")
-    assert "trusted" not in levels[begin + 40 : end]
-    assert levels[-1] == "trusted"
-    assert estimate.verdict.findings[0].what == "past"
-    assert "Earlier data did not fit the model. The last" in estimate.verdict.sentences[0]
-
-
-@pytest.mark.slow
-def test_readings_that_the_gate_refuses_are_a_finding():
-    z = shown() + errors()
-    z[40::12, 0] += 50.0
-    found = [f for f in run(z)[1].verdict.findings if f.what == "refused"]
-    assert [finding.subject for finding in found] == ["A"]
-    assert "The gate rejected" in found[0].text
-    quiet = run(shown() + errors())[1].verdict
-    assert not [f for f in quiet.findings if f.what == "refused"]
-
-
 def test_each_share_of_a_shift_is_named_with_its_own_remedy():
     sizes = {"step": -4.0, "mesh": 2.5, "input": 0.4}
     shifts = Shifts(3.0, sizes, {("k", "step"): -0.2, ("k", "mesh"): 0.1, ("k", "input"): 0.0})
@@ -258,16 +228,6 @@ def test_each_share_of_a_shift_is_named_with_its_own_remedy():
     assert "the time step by 0.9." in found.text
     assert list(discretised(replace(shifts, largest=1.9))) == []
     assert list(discretised(Shifts())) == []
-
-
-@pytest.mark.slow
-def test_a_sensor_that_stands_still_is_named():
-    z = shown() + errors()
-    z[100:, 0] = z[100, 0]
-    # The gate sets it aside, so that its readings harm no estimate.
-    found = run(z)[1].verdict
-    assert ("sensor", "A") in named(found)
-    assert found.level == "caution"
 
 
 @pytest.mark.slow
