@@ -376,6 +376,15 @@ def test_certificates_are_next_to_the_case(tmp_path, monkeypatch):
             load(path)
 
 
+def test_a_node_for_a_number_that_no_run_has_is_refused_before_the_run(tmp_path):
+    path = tmp_path / "case.toml"
+    nodes = 'url = "opc.tcp://plant:4840", columns = { "ns=2;s=alpha" = "alfa_std" }'
+    path.write_text(f"{rod_case()}opcua = {{ {nodes} }}\n")
+    why = r"output.opcua.columns.'ns=2;s=alpha': a run has no number 'alfa_std'.*alpha_std"
+    with pytest.raises(lp.errors.CaseError, match=why):
+        load(path)
+
+
 @pytest.mark.slow
 def test_messages_are_encrypted_and_the_server_is_known_by_its_certificate(tmp_path):
     theirs = certificate(tmp_path, "plant", "urn:freeopcua:python:server")

@@ -238,6 +238,12 @@ class Case(CaseContent):
                 if name in taken:
                     text = f"'{name}' is another number in [expect]; give the "
                     raise self.error(f"{key}.{name}", f"{text}{kind} another name.")
+        labels = self.model.parameter_space.labels
+        written = [*labels, *(f"{label}_std" for label in labels), "verdict"]
+        nodes = self.spec.output.opcua
+        for node, name in nodes.columns.items() if nodes else ():
+            key = f"output.opcua.columns.'{node}'"
+            self.require(name, written, key, f"a run has no number '{name}'")
 
     @property
     def title(self) -> str:
