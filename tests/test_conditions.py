@@ -15,6 +15,7 @@ from livepde.cases import load
 from livepde.errors import CaseError, ModelError
 from livepde.models import Exchange, Flux, Source, conduction, heat, with_conditions
 from livepde.stepping import Advance, Alexander2, simulate
+from livepde.stepping.member_stage import BandedStage
 
 K, C, LENGTH = 2.0, 4.0, 1.0
 
@@ -416,3 +417,12 @@ def test_a_measured_flux_determines_it(tmp_path) -> None:
     path = tmp_path / "case.toml"
     path.write_text(WALL.replace("CONDITION", 'boundary.left = { flux = "q" }'))
     assert list(load(path).model.parameter_space.labels) == ["k", "C"]
+
+
+def test_a_measured_flux_leaves_the_matrices_constant() -> None:
+    ends = {"left": Flux(lp.Channel("J")), "right": Exchange(10.0, lp.Channel("T_air"))}
+    driven = with_conditions(slab(), ends)
+    assert driven.steady
+    assert not BandedStage.refuses(driven)
+    moving = with_conditions(slab(), {"right": Exchange(lp.Channel("h"), 20.0)})
+    assert not moving.steady

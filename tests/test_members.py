@@ -15,7 +15,8 @@ from livepde.laws.assimilation import absorb
 from livepde.laws.member_arrays import changed, join, put, put_each, take, where
 from livepde.linalg import Array
 from livepde.stepping import BandedStage, ForwardStage, KeptFactors, Moments, Span, StageOfMembers
-from livepde.stepping.member_stage import DrivenVector, SeparateStages
+from livepde.stepping.driven_vector import DrivenVector
+from livepde.stepping.member_stage import SeparateStages
 
 MESH = lp.interval(0.0, 1.0, 14)
 

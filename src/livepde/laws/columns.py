@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from livepde.fem import Channel
 from livepde.laws.filter_state import FilterState
 from livepde.laws.gate import Gate
 from livepde.laws.member_arrays import changed
@@ -163,7 +164,12 @@ class Columns:
         at = [self.places[name] for name in names]
         values = log[0][:, at]
         if error.kind == "exchange":
-            values = values[:, ::-1]
+            values = values[:, ::-1].copy()
+            for k in (k for k, name in enumerate(names) if name in self.inputs):
+                # A sensor has no reading where the stored samples begin; an input needs a value.
+                known = np.flatnonzero(np.isfinite(values[:, k]))
+                at_most = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+                values[:, k] = values[known[np.maximum(at_most, 0)], k]
             if not set(names) & set(self.inputs):  # the noise of a reading goes with it
                 noise = [place + len(self.work.filter.noise) for place in at]
                 log[0][:, noise] = log[0][:, noise[::-1]]
@@ -388,13 +394,16 @@ class _Trials:
         return replace(one, residuals=residuals, slopes=one.slopes * ratio[:, :, None])
 
     def _exchanged(self, base: _Fit) -> Iterator[tuple[float, Error]]:
-        columns = self.columns
+        columns, boundary = self.columns, self.columns.work.filter.problem.model.boundary_values
+        states = set(columns.places) - set(columns.inputs)
+        states |= {value.name for value in boundary if isinstance(value, Channel)}
         for pair in combinations(columns.places, 2):
             first, second = (columns.column(name) for name in pair)
             if not len(first) or not len(second):
                 continue
             # Columns of another kind have nothing in common.
-            if first.min() > second.max() or second.min() > first.max():
+            apart = first.min() > second.max() or second.min() > first.max()
+            if apart and not states.issuperset(pair):
                 continue
             error = Error("exchange", pair)
             if self._only_sensors(error):

@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from livepde.errors import ModelError
-from livepde.fem import Channel, On, Place, Unknown
+from livepde.fem import Channel, On, Place, Unknown, ignores
 from livepde.model import Model
 
 
@@ -160,11 +160,14 @@ class _Terms:
         def known(u: Any, v: Any, x: Place) -> Any:
             return term(None, u, v, x)
 
+        def driving(_: Any, v: Any, x: Place) -> Any:
+            return term(None, None, v, x)
+
         # B and f may not read q, so a term belongs to A as soon as one amount is an unknown.
         unknown = self.per is not None or any(
             isinstance(amount, str | Multiple) for amount in amounts
         )
-        form = term if unknown else known
+        form = term if unknown else driving if ignores(term, 1) else known
         (self.A if unknown else self.B).append(form if where is None else On(where, form))
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:

@@ -28,6 +28,7 @@ from livepde.linalg import (
     compact,
 )
 from livepde.model import Model
+from livepde.stepping.driven_vector import DrivenVector
 from livepde.stepping.interval import Interval
 from livepde.stepping.newton import TINY, At, Corrections, Kept, Newton, StepFailed, solved
 from livepde.stepping.schemes import Advance, advance
@@ -58,12 +59,13 @@ class ForwardStage:
         self._made: tuple[At, Factor] | None = None
         self._last: tuple[At, _System] | None = None
         self._rate: tuple[float, Array] | None = None
+        self._driving: tuple[Array, Array, Array] | None = None
 
     def twin(self) -> ForwardStage:
         """Return a stage with the same symbolic analysis and its own factors."""
         _ = self._dual_weights, self.engine  # common to both
         other = copy.copy(self)
-        other._made = other._last = other._rate = None
+        other._made = other._last = other._rate = other._driving = None
         return other
 
     @cached_property
@@ -246,11 +248,34 @@ class ForwardStage:
 
     def _known(self, c: Array, system: _System, q: Array, h: float, moment: Moment) -> Array:
         """Return the right-hand side of a stage of an affine model."""
-        offset = system.offset
-        if offset is None:
-            offset = self._at_zero(self.model.latent.value(q), moment)
-        known: Array = self._mass @ (c / h) - offset + self.model.F(moment)
-        return known
+        known: Array = self._mass @ (c / h)
+        if system.offset is not None:
+            return known - system.offset + self.model.F(moment)
+        if not self._driven_affinely:
+            physical = self.model.latent.value(q)
+            return known - self._at_zero(physical, moment) + self.model.F(moment)
+        driving = self._driving  # read once: copies of an identifier may step in other threads
+        if driving is None or not np.array_equal(driving[0], q):
+            self._driving = driving = (q, *self._load(self.model.latent.value(q)).assembled())
+        _, base, changes = driving
+        inputs = np.array([moment.inputs[name] for name in self.model.channels])
+        return known + base + inputs @ changes
+
+    def _load(self, q: Array) -> DrivenVector:
+        """Return F - B(0) - A(0) q of an affine model, as a function of time and inputs."""
+        model, forms = self.model, (self.model.form_F, self.model.form_B, self.form)
+
+        def load(moment: Moment) -> Array:
+            found: Array = model.F(moment) - self._at_zero(q, moment)
+            return found
+
+        return DrivenVector(load, model.channels, lambda: any("t" in form.uses for form in forms))
+
+    @cached_property
+    def _driven_affinely(self) -> bool:
+        """True if inputs drive the state affinely and time does not, probed at the prior q."""
+        model = self.model
+        return self._load(model.latent.value(model.latent.prior)).responses is not None
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
         """Return the state at the end of a stage; raise `StepFailed` without a solution."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,6 +27,7 @@ from livepde.linalg import (
     row_product,
 )
 from livepde.model import Model
+from livepde.stepping.driven_vector import DrivenVector
 from livepde.stepping.forward import ForwardStage
 from livepde.stepping.interval import Moments
 from livepde.stepping.newton import Kept, StepFailed
@@ -176,15 +176,6 @@ class SeparateStages(MemberStage):
 # Largest number of unknowns with an assembled matrix A_j each: the cost of summing them grows
 # linearly.
 MOST_UNKNOWNS = 64
-
-# Magnitudes of the random inputs with which affinity is tested: a kink or saturation may lie far
-# from one.
-SCALES = (1e-3, 1.0, 1e3, 1e6)
-# Relative deviation from affinity that is attributed to rounding in the assembly.
-ROUNDING = 1e-11
-# Inputs at which responses are measured: so large that subtracting the vector without inputs
-# cancels no digits, and a power of two so that the division is exact.
-LARGE = 2.0**20
 
 NO_RESPONSE = np.zeros((0, 0))  # of a stage that does not depend on inputs
 
@@ -391,87 +382,3 @@ def member_stage(model: Model) -> MemberStage:
     if BandedStage.refuses(model):
         return SeparateStages(model)
     return BandedStage(model)
-
-
-class DrivenVector:
-    """A vector v(t, inputs), (n,), usually affine in the inputs and independent of time.
-
-    In that case it is assembled once, and its evaluation is one small matrix product. `timed`
-    returns True if the vector has read the time so far.
-    """
-
-    def __init__(
-        self,
-        vector: Callable[[Moment], Array],
-        channels: tuple[str, ...],
-        timed: Callable[[], bool],
-    ) -> None:
-        self.vector = vector
-        self.channels = channels
-        self._timed = timed
-
-    def _at(self, t: float, inputs: Array) -> Array:
-        named = dict(zip(self.channels, inputs.tolist(), strict=True))
-        return self.vector(Moment(t, Inputs(named)))
-
-    @cached_property
-    def affine(self) -> bool:
-        """True if the vector is affine in the inputs, probed at several magnitudes."""
-        if not self.channels:
-            return True
-        # A fixed seed: whether a model counts as affine must not differ between two runs. Several
-        # magnitudes, since a kink or a saturation may lie far from one.
-        rng = np.random.default_rng(2)
-        for scale in SCALES:
-            a, b = scale * rng.standard_normal((2, len(self.channels)))
-            with np.errstate(all="ignore"):
-                parts = [self._at(0.3, x) for x in (a, b, a + b, 0.0 * a)]
-            change = parts[0] + parts[1] - parts[2] - parts[3]
-            size = max(np.abs(part).max(initial=0.0) for part in parts)
-            if not np.abs(change).max(initial=0.0) <= ROUNDING * size:
-                return False
-        return True
-
-    @cached_property
-    def responses(self) -> tuple[Array, Array] | None:
-        """Vector without inputs, (1, n), and its derivative by each input, (channels, n).
-
-        None if the vector reads the time or is not affine.
-        """
-        if not self.affine:
-            return None
-        zero = np.zeros(len(self.channels))
-        base = self._at(0.0, zero)
-        units = LARGE * np.eye(len(zero))
-        changes = [(self._at(0.0, unit) - base) / LARGE for unit in units]
-        if self._timed():
-            return None
-        return base[None], np.reshape(changes, (len(zero), len(base)))
-
-    @cached_property
-    def zero(self) -> bool:
-        """True if the vector is always zero."""
-        return self.responses is not None and not any(part.any() for part in self.responses)
-
-    @cached_property
-    def constant(self) -> bool:
-        """True if neither time nor inputs change the vector."""
-        return self.responses is not None and not self.responses[1].any()
-
-    def __call__(self, at: Moments) -> Array:
-        """Return the vector of each member, shape (members, n); (1, n) if the same for all."""
-        if self.responses is not None:
-            base, changes = self.responses
-            return base if self.constant else base + at.inputs[:, : len(changes)].dot(changes)
-        if len(at.inputs) == 1:
-            return self.vector(at.member(0))[None]
-        base = self._at(at.t, np.zeros(len(self.channels)))
-        total = base[None]
-        # Affine in the inputs, but time-dependent: one evaluation per channel serves all members.
-        largest_inputs = np.abs(at.inputs[:, : len(self.channels)]).max(axis=0)
-        for c, largest in enumerate(largest_inputs):
-            if largest > 0.0:  # a difference at the size of the values: no digits are lost
-                unit = np.zeros(len(self.channels))
-                unit[c] = largest
-                total = total + (at.inputs[:, c] / largest)[:, None] * (self._at(at.t, unit) - base)
-        return total
