@@ -67,6 +67,13 @@ def scaled(columns: dict[str, Any], name: str, factor: float, more: float = 0.0)
     return {**columns, name: factor * columns[name] + more}
 
 
+def tilted(columns: dict[str, Any]) -> dict[str, Any]:
+    """Add a steady slope of 200 K, so that no two columns have values in common."""
+    places = {"TC1": 0.0, **PLACES, "TC5": LENGTH}
+    more = {name: columns[name] + 200.0 * x / LENGTH for name, x in places.items()}
+    return columns | more
+
+
 FAULTS: dict[str, tuple[Any, str, str]] = {
     "input late": (lambda c: {**c, "TC5": late(c["TC5"], 60.0)}, "TC5", "TC5 may be 60 late"),
     "sensor late": (lambda c: {**c, "TC3": late(c["TC3"], 60.0)}, "TC3", "TC3 may be 60 late"),
@@ -133,7 +140,7 @@ def test_the_wrong_column_is_named_first(fault: str):
     ("change", "words"),
     [
         (lambda c: scaled(c, "TC5", 1.8, 32.0), "TC5 may be in degF"),
-        (lambda c: exchanged(c, "TC2", "TC5"), "the columns TC2 and TC5 may be exchanged"),
+        (lambda c: exchanged(tilted(c), "TC2", "TC5"), "TC2 and TC5 may be exchanged"),
     ],
 )
 def test_a_wrong_input_with_noise_is_named_and_the_initial_state_is_made_of_it(change, words):
