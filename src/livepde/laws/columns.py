@@ -43,6 +43,7 @@ RIVAL = 0.8
 STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
 LONGEST = 0.2  # of the samples, by which a column may be late
 PLAIN = 0.02  # range of a column over its size below which it is constant
+SAME = 1e-6  # of an interval: times that are the same but for rounding
 SETTLED = 0.02  # relative change of a size that is none
 # Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
 # with fewer numbers is likelier.
@@ -197,10 +198,11 @@ class Columns:
         t, held = self.state.log[0, :, 0], self.work.filter.problem.control.held
         seen = np.isfinite(values)
         known, times, asked = values[seen], t[seen], t + by
+        near = SAME * self.interval  # late by whole samples, a row is met but for rounding
         if name in held.last:
-            place = np.searchsorted(times, asked, side="right") - 1
+            place = np.searchsorted(times, asked + near, side="right") - 1
         elif name in held.next:
-            place = np.searchsorted(times, asked, side="left")
+            place = np.searchsorted(times, asked - near, side="left")
         else:
             return np.where(seen, np.interp(asked, times, known), np.nan)
         return np.where(seen, known[np.clip(place, 0, len(known) - 1)], np.nan)
