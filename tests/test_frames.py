@@ -1,4 +1,4 @@
-"""A body in other axes, seen from the other side, or at another time: verdict and intervals agree.
+"""A body in other axes, from the other side, or at another time: verdict and intervals agree.
 
 Data are those of a line; a sheet has them, too, as its sides are closed.
 """
@@ -28,6 +28,7 @@ class Frame:
     origin: float = 0.0  # of time
     unit: float = 1.0  # of time
     scale: float = 1.0  # of readings
+    split: bool = False  # the sensors are in two groups
 
 
 def driven(t: float) -> dict[str, float]:
@@ -54,13 +55,17 @@ def process(frame: Frame) -> lp.Model:
     )
 
 
-def sensors(frame: Frame) -> lp.Points:
+def sensors(frame: Frame) -> lp.observation.Observation:
     found: dict[str, Any] = {}
     for name, (x, y) in PLACES.items():
         along, across = 1.0 - x if frame.mirrored else x, WIDTH * y
         place = (across, along) if frame.swapped else (along, across)
         found[name] = place if frame.flat else along
-    return lp.Points(found, noise=0.05 * frame.scale)
+    names, noise = list(found), 0.05 * frame.scale
+    if not frame.split:
+        return lp.Points(found, noise=noise)
+    groups = [{name: found[name] for name in some} for some in (names[:3], names[3:])]
+    return lp.Combined([lp.Points(group, noise=noise) for group in groups])
 
 
 @cache
@@ -107,6 +112,7 @@ SHEET = Frame(flat=True)
         pytest.param(Frame(), Frame(mirrored=True), id="mirrored"),
         pytest.param(Frame(), Frame(origin=500.0), id="later"),
         pytest.param(Frame(), Frame(unit=3600.0), id="seconds"),
+        pytest.param(Frame(), Frame(split=True), id="groups"),
         pytest.param(SHEET, replace(SHEET, swapped=True), id="axes"),
         pytest.param(SHEET, replace(SHEET, swapped=True, mirrored=True), id="turned"),
         pytest.param(SHEET, replace(SHEET, scale=1.0 + 1e-12), id="rounding"),

@@ -21,8 +21,7 @@ from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
-from livepde.observation import Points
-from livepde.verdict.directions import sensor_shifts
+from livepde.verdict.directions import sensor_shifts, stated_positions
 from livepde.verdict.evidence import Causes, Family, LinearModel, Mixture, averaged
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
@@ -71,9 +70,9 @@ def _sensor_columns(
         (-rate, math.inf),
     ]
     common = [(change, MOST_GAIN), (-rate, math.inf)]
-    observation = problem.observed.observation
+    positions = stated_positions(problem.observed)
     shifts, step = sensor_shifts(problem.model, problem.observed)
-    for axis, matrix in enumerate(shifts if isinstance(observation, Points) else ()):
+    for axis, matrix in enumerate(shifts):
         size = abs(matrix)
         slope = np.array([matrix @ u for u in states]) / step
         terms = np.array([size @ np.abs(u) for u in states]) / step
@@ -82,7 +81,7 @@ def _sensor_columns(
         vertices = np.asarray(problem.model.mesh.p)[axis]
         low, high = float(vertices.min()), float(vertices.max())
         each.append((slope, FARTHEST * (high - low)))
-        at = observation.positions[:, axis]  # type: ignore[attr-defined]
+        at = np.zeros(sensors) if positions is None else np.nan_to_num(positions[:, axis])
         common += [(slope * (at - end), FARTHEST) for end in (low, high)]  # depths from either
     for effect, most in each:
         for k in range(sensors):
