@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 import livepde as lp
+from livepde.models import heat
 
 PLACES = {"a": (0.15, 0.25), "b": (0.3, 0.5), "c": (0.55, 0.75), "d": (0.8, 0.375)}
 TIMES = 0.1 * np.arange(1, 61)
 WIDTH = 0.5
+LAYERS: Any = {"one": lambda x: x[0] < 0.5, "two": lambda x: x[0] > 0.5}
 RATE = 0.3  # of the loss to the surroundings at 15 degrees
 
 
@@ -138,3 +140,21 @@ def test_verdict_and_intervals_do_not_depend_on_the_frame(frame: Frame, other: F
     for name in ("alpha", "loss"):
         ends = [(each[name].low, each[name].high, each[name].wider) for each in errors]
         assert ends[0] == pytest.approx(ends[1], rel=1e-5)
+
+
+def test_layers_are_the_same_by_name_and_by_place():
+    """Names of cells and of their halves, on which the discretisation is judged, agree."""
+
+    def stds(**regions: Any) -> Any:
+        mesh = lp.interval(0.0, 1.0, 12, regions={name: LAYERS[name] for name in LAYERS})
+        k = lp.Piecewise(regions, lp.LogNormal(0.1, 0.05))
+        ends = {"left": lp.Channel("T_0"), "right": lp.Channel("T_1")}
+        places = lp.Points({name: x for name, (x, _) in PLACES.items()}, noise=0.05)
+        identifier = lp.Identifier(heat(mesh, k, ends), places, u0=20.0)
+        rows = zip(TIMES.tolist(), readings(), strict=True)
+        last = identifier.run([(t, row, driven(t)) for t, row in rows]).last
+        assert last is not None
+        return last.q_std
+
+    by_name, by_place = stds(**{name: name for name in LAYERS}), stds(**LAYERS)
+    np.testing.assert_allclose(by_name, by_place, rtol=1e-9)
