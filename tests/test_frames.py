@@ -158,3 +158,20 @@ def test_layers_are_the_same_by_name_and_by_place():
 
     by_name, by_place = stds(**{name: name for name in LAYERS}), stds(**LAYERS)
     np.testing.assert_allclose(by_name, by_place, rtol=1e-9)
+
+
+def test_the_offset_that_is_proposed_is_twice_the_one_that_is_named():
+    """Both are those of the fit, and not one of a fit and one of a linear model."""
+    rows = [{**row, "b": row["b"] + 2.0} for row in readings()]
+    places = lp.Points({name: x for name, (x, _) in PLACES.items() if name != "c"}, noise=0.05)
+    identifier = lp.Identifier(process(Frame()), places, u0=20.0)
+    samples = [
+        (t, {name: row[name] for name in row if name != "c"}, driven(t))
+        for t, row in zip(TIMES.tolist(), rows, strict=True)
+    ]
+    verdict = identifier.run(samples).verdict
+    cause = next(one for one in verdict.findings if one.what == "misfit").causes[0]
+    assert (cause.kind, cause.subject) == ("offset", "b")
+    assert cause.size == pytest.approx(2.0, abs=0.05)
+    assert cause.setting == f"channels.b.offset={2.0 * cause.size:.2g}"
+    assert f"`offset = {2.0 * cause.size:.2g}`" in cause.remedy

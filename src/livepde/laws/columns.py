@@ -29,7 +29,7 @@ from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
 from livepde.laws.stored_samples import Passed, StoredSamples
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
-from livepde.verdict.sentences import LIKELY, amount_of, table_of
+from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
 
 MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
 FEWEST_ROWS = 40
@@ -507,12 +507,18 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
             values |= {"factor": unit_of.times, "side": "large" if large else "small"}
             values |= {"correction": f"{factor:.6g}", "table": table_of(first)}
     text, remedy = LIKELY[kind].filled(**values)
+    wide = f"{2.0 * abs(size):.2g}"
+    if kind == "offset" and first in problem.observed.names:
+        unit = columns.unit(first).replace("degC", "K")
+        remedy = estimating(kind, first, f'"{wide} {unit}"' if unit else wide)
     late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
     keys = {
         "gain": ("factor", f"{factor:.6g}"),
         "lag": ("late", late),
         "unit": ("unit", f'"{unit_of.name}"') if unit_of.name else ("factor", f"{factor:.6g}"),
     }
+    if first in problem.observed.names:
+        keys["offset"] = ("offset", wide)
     setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
     if error.kind == "exchange":
         pairs = (error.names, error.names[::-1])
