@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import livepde as lp
+from livepde.laws.stored_samples import principal
 from livepde.models import heat
 
 PLACES = {"a": (0.15, 0.25), "b": (0.3, 0.5), "c": (0.55, 0.75), "d": (0.8, 0.375)}
@@ -175,3 +176,32 @@ def test_the_offset_that_is_proposed_is_twice_the_one_that_is_named():
     assert cause.size == pytest.approx(2.0, abs=0.05)
     assert cause.setting == f"channels.b.offset={2.0 * cause.size:.2g}"
     assert f"`offset = {2.0 * cause.size:.2g}`" in cause.remedy
+
+
+def test_members_that_are_stepped_apart_begin_as_single_runs_do():
+    """The discretisation is judged from the initial state of each member, and not of the first."""
+    places = lp.observation.Calibrated(
+        lp.Points({name: x for name, (x, _) in PLACES.items()}), lambda y, q, x: 1.0 * y, noise=0.05
+    )
+    starts = [20.0, lambda x: 20.0 + np.sin(9.0 * x[0]), lambda x: 20.0 - np.sin(11.0 * x[0])]
+    model, law = process(Frame()), lp.SensitivityLaw(verdict=False)
+    fleet = lp.Fleet(model, places, law, len(starts), u0=starts)
+    assert not fleet.together
+    singles = [lp.Identifier(model, places, law, u0=u0) for u0 in starts]
+    for t, row in zip(TIMES[:4].tolist(), readings(), strict=False):
+        found = fleet.step(t, row, driven(t))
+        for k, single in enumerate(singles):
+            one = single.step(t, row, driven(t))
+            np.testing.assert_allclose(found.member(k).q_std, one.q_std, rtol=1e-12)
+            np.testing.assert_allclose(found.member(k).u_std, one.u_std, rtol=1e-12)
+
+
+def test_what_rounding_takes_from_the_prior_is_put_back():
+    """Readings that tell one direction up to the last digit leave no negative or singular rest."""
+    J = 1e10 * np.array([[1.0, 1.0 / 3.0, 0.1], [3.0, 1.0, 0.3]])
+    H = np.eye(3) + J.T @ J
+    assert np.linalg.eigvalsh(H)[0] < 0.0  # as it is computed
+    sizes, axes = principal(H)
+    np.testing.assert_allclose(sizes[-1], np.trace(H), rtol=1e-12)
+    assert sizes[0] == 1.0
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)

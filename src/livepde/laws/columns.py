@@ -26,7 +26,7 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
 from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
@@ -244,7 +244,8 @@ class _Fit:
     def about(cls, one: Passed) -> _Fit:
         used = np.isfinite(one.residuals)
         H, g = one.model(used)
-        inverse = np.linalg.inv(H)
+        sizes, axes = principal(H)
+        inverse = (axes / sizes) @ axes.T
         step = inverse @ g
         cost = one.cost(used) - 0.5 * float(g @ step)
         return cls(one, one.slopes[used], np.asarray(inverse), step, cost)

@@ -19,7 +19,7 @@ from livepde.fem import Scalar
 from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, beyond_rounding, hats
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
-from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
 from livepde.verdict.directions import sensor_shifts, stated_positions
 from livepde.verdict.evidence import Causes, Family, LinearModel, Mixture, averaged
@@ -176,7 +176,8 @@ def _best(samples: StoredSamples, options: Refit) -> tuple[Passed, Mask] | None:
     used = plausible(samples, options, one) & np.isfinite(one.residuals)
     # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
     H, g = one.model(used)
-    step = np.linalg.solve(H, g)
+    sizes, axes = principal(H)
+    step = axes @ (axes.T @ g / sizes)
     if not samples.state.start.U.any() or step @ H @ step < NEAR**2:
         return one, used
     better = samples.about(samples.within_bounds(one.xi + step))
