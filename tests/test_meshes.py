@@ -222,6 +222,21 @@ def test_the_size_of_cells():
         _ = lp.fem.Place(np.zeros((0,)), None, lp.fem.Moment()).h
 
 
+@pytest.mark.parametrize(("start", "length"), [(5e5, 4.0), (-3e6, 1.0), (0.0, 1e-8), (1e3, 1e-3)])
+def test_sides_are_the_same_wherever_the_mesh_is_and_however_large(start: float, length: float):
+    x, y, z = (start, start + length), (-start, -start + length), (start, start + 2 * length)
+    line = lp.interval(*x, 20)
+    assert {name: len(facets) for name, facets in line.boundaries.items()} == dict.fromkeys(
+        ("left", "right"), 1
+    )
+    sides = {"left": 5, "right": 5, "bottom": 20, "top": 20}
+    sheet = lp.rectangle(x, y, (20, 5))
+    assert {name: len(facets) for name, facets in sheet.boundaries.items()} == sides
+    faces = {"left": 24, "right": 24, "front": 16, "back": 16, "bottom": 12, "top": 12}
+    block = lp.fem.box(x, y, z, (2, 3, 4))
+    assert {name: len(facets) for name, facets in block.boundaries.items()} == faces
+
+
 @pytest.mark.slow
 def test_a_penalty_imposes_an_unknown_boundary_value():
     """Weakly: beta (u - q) v with beta = 100 k/h, identified from one sensor inside."""

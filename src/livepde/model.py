@@ -38,6 +38,7 @@ from livepde.fem import (
     source_density,
     with_constants,
 )
+from livepde.fem.meshes import halved
 from livepde.linalg import Array, IntArray
 from livepde.records import Layout, name_clashes
 from livepde.showing import Shown, expression, listed
@@ -359,7 +360,7 @@ class Model(Shown):
         ModelError, SpaceError
             Something that was given belongs to this mesh alone.
         """
-        mesh = self.mesh.refined()
+        mesh = halved(self.mesh)
 
         def finer(part: Any) -> Any:
             if isinstance(part, Mapping):

@@ -86,6 +86,17 @@ def ignores(function: Any, position: int) -> bool:
     return position < len(names) and names[position] == "_"
 
 
+def at_end(axis: int, end: float, ends: Sequence[float]) -> Predicate:
+    """Return the predicate of points at one of the ends of a mesh along an axis.
+
+    The slack is that of rounding: a share of the coordinate would take cells next to the end as
+    well, where coordinates are large, as those of a map, or the mesh is small.
+    """
+    extent, size = abs(ends[1] - ends[0]), max(map(abs, ends))
+    slack = 1e-9 * extent + 8 * float(np.finfo(float).eps) * size
+    return lambda p: np.abs(p[axis] - end) <= slack
+
+
 def interval(
     start: float,
     stop: float,
@@ -123,7 +134,7 @@ def interval(
     spaced = np.geomspace if geometric else np.linspace
     mesh = MeshLine(_moved(spaced(start, stop, int(cells) + 1), through))
     mesh = mesh.with_boundaries(
-        {"left": lambda x: np.isclose(x[0], start), "right": lambda x: np.isclose(x[0], stop)}
+        {"left": at_end(0, start, (start, stop)), "right": at_end(0, stop, (start, stop))}
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh
 
@@ -148,7 +159,7 @@ def line(nodes: Sequence[float]) -> MeshLine:
     if x.ndim != 1 or len(x) < 2 or not (np.diff(x) > 0).all():
         raise SpaceError(f"line: needs at least two increasing nodes; got {x.tolist()}.")
     return MeshLine(x).with_boundaries(
-        {"left": lambda p: np.isclose(p[0], x[0]), "right": lambda p: np.isclose(p[0], x[-1])}
+        {"left": at_end(0, x[0], (x[0], x[-1])), "right": at_end(0, x[-1], (x[0], x[-1]))}
     )
 
 

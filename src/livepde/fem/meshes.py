@@ -34,7 +34,7 @@ from skfem.element import (
 from skfem.element.element_global import ElementGlobal
 
 from livepde.errors import SpaceError, optional
-from livepde.fem.fields import Field, Predicate
+from livepde.fem.fields import Field, Predicate, at_end
 from livepde.linalg import Array, IntArray
 
 LINEAR: dict[Any, Any] = {
@@ -136,10 +136,10 @@ def grid(
         raise SpaceError("grid: needs at least two increasing nodes in x and in y.")
     mesh = MeshQuad.init_tensor(np.array(x), np.array(y)).with_boundaries(
         {
-            "left": lambda p: np.isclose(p[0], x[0]),
-            "right": lambda p: np.isclose(p[0], x[-1]),
-            "bottom": lambda p: np.isclose(p[1], y[0]),
-            "top": lambda p: np.isclose(p[1], y[-1]),
+            "left": at_end(0, x[0], (x[0], x[-1])),
+            "right": at_end(0, x[-1], (x[0], x[-1])),
+            "bottom": at_end(1, y[0], (y[0], y[-1])),
+            "top": at_end(1, y[-1], (y[0], y[-1])),
         }
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh
@@ -169,12 +169,32 @@ def box(
     names = (("left", "right"), ("front", "back"), ("bottom", "top"))
     mesh = mesh.with_boundaries(
         {
-            name: lambda p, axis=axis, end=end: np.isclose(p[axis], end)
+            name: at_end(axis, end, sides[axis])
             for axis in range(3)
             for name, end in zip(names[axis], sides[axis], strict=True)
         }
     )
     return mesh.with_subdomains(dict(regions)) if regions else mesh
+
+
+def halved(mesh: Mesh) -> Mesh:
+    """Return the mesh whose elements are halved in every direction, with the same subdomains.
+
+    scikit-fem 12 numbers the halves of the cells of a line in another way than their subdomains,
+    so that these would name other cells.
+
+    >>> line = MeshLine([0.0, 1.0, 2.0, 3.0]).with_subdomains({"left": lambda x: x[0] < 1.0})
+    >>> finer = halved(line)
+    >>> float(finer.p[0][finer.t[:, finer.subdomains["left"]]].max())
+    1.0
+    """
+    finer = mesh.refined()
+    if not (isinstance(mesh, MeshLine) and mesh.subdomains):
+        return finer
+    cell = mesh.element_finder()(finer.p[0][finer.t].mean(axis=0))
+    return finer.with_subdomains(
+        {name: np.flatnonzero(np.isin(cell, own)) for name, own in mesh.subdomains.items()}
+    )
 
 
 def read_mesh(path: str | Path, scale: float = 1.0) -> Mesh:

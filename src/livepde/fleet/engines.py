@@ -43,6 +43,31 @@ class Beliefs:
     factors: Factors | None = None
 
 
+def beginnings(
+    work: Any,
+    readings: Sequence[Mapping[str, laws.InitialReading]],
+    errors: Sequence[Array],
+    initial: Sequence[Any],
+) -> list[Any]:
+    """Return the parts of a law with which each member begins.
+
+    `readings` are those that the initial state of each member was made of, `errors` its own errors,
+    (errors, n), `initial` how it was given: laws with a covariance evaluate it on other meshes.
+    """
+    if not isinstance(work, SensitivityWork):
+        return [work] * len(initial)
+    made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
+    found = []
+    for one, off, u0 in zip(readings, errors, initial, strict=True):
+        own = bool(one) or bool(len(off))
+        begin = made.get(id(u0)) if not own else None
+        if begin is None:
+            begin = work.made_of(one, off, u0)
+            made |= {} if own else {id(u0): begin}
+        found.append(begin)
+    return found
+
+
 class FleetEngine(ABC):
     """Abstract stepper of all members by one law.
 
@@ -97,21 +122,32 @@ class FleetEngine(ABC):
 class SeparateEngine(FleetEngine):
     """Any law, member by member, with its precomputed parts shared by all members.
 
-    The state is a tuple of the states of the law.
+    The state is a tuple of the states of the law. `begins` are the parts with which each member
+    begins.
     """
 
-    def __init__(self, law: laws.AnyLaw, work: Any, problem: laws.Problem) -> None:
+    def __init__(
+        self, law: laws.AnyLaw, work: Any, problem: laws.Problem, begins: Sequence[Any]
+    ) -> None:
         super().__init__(law, work)
         self.problem = problem
+        self._begins = begins
+
+    def subset(self, which: IntArray) -> SeparateEngine:
+        return SeparateEngine(self.law, self.work, self.problem, [self._begins[k] for k in which])
 
     def start(
         self, q0: Sequence[Array], u0: Sequence[Array], moments: Sequence[Moment]
     ) -> tuple[Any, ...]:
-        each = zip(q0, u0, moments, strict=True)
-        return tuple(self.law.start(self.work, q, u, moment) for q, u, moment in each)
+        each = zip(self._begins, q0, u0, moments, strict=True)
+        return tuple(self.law.start(*one) for one in each)
 
     def begin(self, state: tuple[Any, ...], span: Span) -> tuple[Any, ...]:
-        return tuple(one for one, _ in self._stepped(state, span))
+        each = zip(self._begins, state, strict=True)
+        return tuple(
+            laws.stepped(self.law, work, self.problem, one, span.member(k))[0]
+            for k, (work, one) in enumerate(each)
+        )
 
     def step(
         self, state: tuple[Any, ...], span: Span
@@ -151,31 +187,15 @@ class SeparateEngine(FleetEngine):
 class BlockEngine(FleetEngine):
     """All members as arrays, by `SensitivityLaw.step_members`; the leading axis is the members.
 
-    `readings` are those that the initial state of each member was made of, `errors` its own errors,
-    (errors, n), `initial` how it was given.
+    `begins` are the parts with which each member begins.
     """
 
     law: laws.SensitivityLaw
     work: SensitivityWork
 
-    def __init__(
-        self,
-        law: Any,
-        work: SensitivityWork,
-        readings: Sequence[Mapping[str, laws.InitialReading]],
-        errors: Sequence[Array],
-        initial: Sequence[Any],
-    ) -> None:
+    def __init__(self, law: Any, work: SensitivityWork, begins: Sequence[SensitivityWork]) -> None:
         super().__init__(law, work)
-        made: dict[int, SensitivityWork] = {}  # of members that begin alike: it caches matrices
-        self._begins = []
-        for one, off, u0 in zip(readings, errors, initial, strict=True):
-            own = bool(one) or bool(len(off))
-            begin = made.get(id(u0)) if not own else None
-            if begin is None:
-                begin = work.made_of(one, off, u0)
-                made |= {} if own else {id(u0): begin}
-            self._begins.append(begin)
+        self._begins = begins
 
     def subset(self, which: IntArray) -> BlockEngine:
         other = copy.copy(self)

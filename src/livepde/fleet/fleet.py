@@ -15,7 +15,13 @@ from numpy.typing import ArrayLike
 from livepde import checkpoint, errors
 from livepde.checkpoint import Fingerprint
 from livepde.fem import Inputs, Moment
-from livepde.fleet.engines import Beliefs, BlockEngine, FleetEngine, SeparateEngine
+from livepde.fleet.engines import (
+    Beliefs,
+    BlockEngine,
+    FleetEngine,
+    SeparateEngine,
+    beginnings,
+)
 from livepde.fleet.estimate import FleetEstimate, FleetResult
 from livepde.frames import layout_of
 from livepde.identifier import Identifier
@@ -148,9 +154,10 @@ class Fleet:
 
     def _stepper(self, made_of: list[Mapping[str, Any]], u0s: list[Any]) -> FleetEngine:
         """Return the engine that steps members as blocks if the law can, else one by one."""
+        readings = [self._one._initial_readings(one) for one in made_of]
+        begins = beginnings(self._work, readings, self._errors, u0s)
         if not self.note:
-            readings = [self._one._initial_readings(one) for one in made_of]
-            return BlockEngine(self.law, self._work, readings, self._errors, u0s)
+            return BlockEngine(self.law, self._work, begins)
         if any(not np.array_equal(one, self._errors[0]) for one in self._errors):
             raise errors.ConfigurationError(
                 "u0_errors differ between members, which are stepped separately, as "
@@ -161,7 +168,7 @@ class Fleet:
                 "u0_from differs between members, which are stepped separately, as "
                 f"{self.note}: give all the same."
             )
-        return SeparateEngine(self.law, self._work, self.problem)
+        return SeparateEngine(self.law, self._work, self.problem, begins)
 
     def _each(self, what: str, value: Any) -> list[Any]:
         """Return a value for each member: a list has one for each."""

@@ -27,10 +27,10 @@ from livepde.laws.member_arrays import changed
 from livepde.laws.policies import Refit
 from livepde.laws.refit import WILD, Found, near_most, near_neighbours, refitted
 from livepde.laws.sensitivity_state import SensitivityState, SensitivityWork
-from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, nonfinite_allowed
 from livepde.verdict import Cause, channel_setting
-from livepde.verdict.sentences import LIKELY, amount_of, table_of
+from livepde.verdict.sentences import LIKELY, amount_of, estimating, table_of
 
 MOST_ROWS = 600  # samples that are looked at, from the start of the stored ones
 FEWEST_ROWS = 40
@@ -44,6 +44,7 @@ RIVAL = 0.8
 STEP = 0.02  # of the range of a column, or of its size: the error of which g is taken
 LONGEST = 0.2  # of the samples, by which a column may be late
 PLAIN = 0.02  # range of a column over its size below which it is constant
+SAME = 1e-6  # of an interval: times that are the same but for rounding
 SETTLED = 0.02  # relative change of a size that is none
 # Of the misfit, and of the noise: within the smaller one nothing is left to explain, and the error
 # with fewer numbers is likelier.
@@ -203,10 +204,11 @@ class Columns:
         t, held = self.state.log[0, :, 0], self.work.filter.problem.control.held
         seen = np.isfinite(values)
         known, times, asked = values[seen], t[seen], t + by
+        near = SAME * self.interval  # late by whole samples, a row is met but for rounding
         if name in held.last:
-            place = np.searchsorted(times, asked, side="right") - 1
+            place = np.searchsorted(times, asked + near, side="right") - 1
         elif name in held.next:
-            place = np.searchsorted(times, asked, side="left")
+            place = np.searchsorted(times, asked - near, side="left")
         else:
             return np.where(seen, np.interp(asked, times, known), np.nan)
         return np.where(seen, known[np.clip(place, 0, len(known) - 1)], np.nan)
@@ -248,7 +250,8 @@ class _Fit:
     def about(cls, one: Passed) -> _Fit:
         used = np.isfinite(one.residuals)
         H, g = one.model(used)
-        inverse = np.linalg.inv(H)
+        sizes, axes = principal(H)
+        inverse = (axes / sizes) @ axes.T
         step = inverse @ g
         cost = one.cost(used) - 0.5 * float(g @ step)
         return cls(one, one.slopes[used], np.asarray(inverse), step, cost)
@@ -514,12 +517,18 @@ def _cause(columns: Columns, error: Error, share: float) -> Cause:
             values |= {"factor": unit_of.times, "side": "large" if large else "small"}
             values |= {"correction": f"{factor:.6g}", "table": table_of(first)}
     text, remedy = LIKELY[kind].filled(**values)
+    wide = f"{2.0 * abs(size):.2g}"
+    if kind == "offset" and first in problem.observed.names:
+        unit = columns.unit(first).replace("degC", "K")
+        remedy = estimating(kind, first, f'"{wide} {unit}"' if unit else wide)
     late = f'"{size:.4g} {problem.model.time_unit}"' if problem.model.time_unit else f"{size:.4g}"
     keys = {
         "gain": ("factor", f"{factor:.6g}"),
         "lag": ("late", late),
         "unit": ("unit", f'"{unit_of.name}"') if unit_of.name else ("factor", f"{factor:.6g}"),
     }
+    if first in problem.observed.names:
+        keys["offset"] = ("offset", wide)
     setting = channel_setting(first, *keys[error.kind]) if error.kind in keys else ""
     if error.kind == "exchange":
         pairs = (error.names, error.names[::-1])

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -33,6 +33,7 @@ STARTS = (0.25, 0.5, 0.75)  # of the run, where something is switched on or chan
 PLACES = (0.2, 0.4, 0.6, 0.8)  # of the length, where a contact may resist
 STEP = 0.01  # of a difference: prior standard deviations of an unknown, share of a channel
 NARROW = 0.03  # of the length: a contact
+ROUNDING = 1e-11  # share of its terms, below which an effect is none: it would be scaled to one
 
 Load: TypeAlias = Callable[["StatePoint"], Array]
 
@@ -53,7 +54,7 @@ class Answer(NamedTuple):
     # "channel", "contact", "initial", "unknown"; and its channel, boundary or unknown.
     kind: str
     subject: str = ""
-    mode: int = 0  # number of its shape in space
+    mode: float = 0.0  # number of its shape in space
     # Its load, its boundary values, and its value at the start, (n,); None for zero.
     load: Load | Array | None = None
     lift: Load | Array | None = None
@@ -78,8 +79,7 @@ SWITCHED = Course(1 + len(STARTS), lambda s: np.array([1.0, *(float(s > one) for
 CHANGES = Course(1 + len(STARTS), lambda s: np.array([s, *(float(s > one) for one in STARTS)]))
 
 
-@dataclass(frozen=True)
-class _Numbers:
+class _Numbers(NamedTuple):
     """How many shapes in space and time the families have."""
 
     source: tuple[int, int]
@@ -119,12 +119,27 @@ class ErrorColumns:
         stage = ForwardStage(self.model)
         return stage.symmetric or not stage.keeps
 
+    @cached_property
+    def _powers(self) -> list[tuple[float, tuple[int, ...]]]:
+        """Half waves along each axis of the shapes, the longest waves first, with their number.
+
+        Waves of one length have one number, their mean: it depends on no order of the axes.
+        """
+        span, most = self.high - self.low, max(max(one) for one in self.numbers[:3])
+        some = [
+            (round(float(np.sum((np.array(one) * span.max() / span) ** 2)), 9), one)
+            for one in itertools.product(range(most + 1), repeat=len(span))
+        ]
+        some.sort(key=lambda one: (one[0], [-part for part in one[1]]))
+        found: list[tuple[float, tuple[int, ...]]] = []
+        for _, group in itertools.groupby(some, key=lambda one: one[0]):
+            same = [powers for _, powers in group]
+            found += [(len(found) + 0.5 * (len(same) - 1), powers) for powers in same]
+        return found
+
     def _mode(self, number: int) -> Callable[[Any], Any]:
-        """Return a product of cosines over the box of the domain, the smoothest first."""
-        dim = len(self.low)
-        some = itertools.product(range(number + 1), repeat=dim)
-        powers = sorted(some, key=lambda one: (sum(one), [-part for part in one]))[number]
-        low, span = self.low, self.high - self.low
+        """Return a product of cosines over the box of the domain, the longest waves first."""
+        low, span, (_, powers) = self.low, self.high - self.low, self._powers[number]
 
         def shape(x: Any) -> Any:
             found = 1.0
@@ -143,9 +158,9 @@ class ErrorColumns:
             for k in range(modes):
                 u = model.state_space.interpolate({name: self._mode(k)})
                 load = np.asarray(model.mass @ (u - model.state_space.prior))
-                yield Answer("source", name, k, load), hats(times)
+                yield Answer("source", name, self._powers[k][0], load), hats(times)
                 if k == 0:
-                    yield Answer("switched", name, 0, load), SWITCHED
+                    yield Answer("switched", name, load=load), SWITCHED
 
     def _initial(self) -> Iterator[tuple[Answer, Course]]:
         free = self.model.X.free
@@ -154,7 +169,7 @@ class ErrorColumns:
                 continue
             for k in range(2):
                 u = self.model.state_space.interpolate({name: self._mode(k)})
-                yield Answer("initial", name, k, start=u * free), ALWAYS
+                yield Answer("initial", name, start=u * free), ALWAYS
 
     def _boundaries(self) -> Iterator[tuple[Answer, Course]]:
         model, lifts = self.model, boundary_lifts(self.model)
@@ -179,32 +194,31 @@ class ErrorColumns:
     def _operators(self) -> Iterator[tuple[Answer, Course]]:
         """Iterate over flows, losses, and conductivities that vary in space and with the state."""
         model, (modes, times) = self.model, self.numbers.conductivity
-        low, span = float(self.low[0]), float(self.high[0] - self.low[0])
 
         def stiffness(shape: Callable[[Any], Any]) -> Any:
             return model.bilinear(lambda u, v, x: shape(x) * dot(grad(u), grad(v)))
 
         for k in range(1, 1 + modes):
             load = _minus(stiffness(self._mode(k)))
-            yield Answer("conductivity", "", k, load), hats(times)
+            yield Answer("conductivity", "", self._powers[k][0], load), hats(times)
         plain = stiffness(self._mode(0))
-        yield Answer("state", load=lambda now: -0.5 * (plain @ (now.u - now.u.mean()) ** 2)), ALWAYS
-        half = stiffness(lambda x: np.asarray((x[0] - low) / span > 0.5, dtype=float))
-        yield Answer("layer", load=_minus(half)), ALWAYS
-        wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
-        for k, place in enumerate(PLACES if self._resists else ()):
-            matrix = stiffness(_band(low + place * span, wide * span))
-            yield Answer("contact", "", k, _minus(matrix)), ALWAYS
+        yield Answer("state", load=_by_state(plain)), ALWAYS
+        for axis, (low, span) in enumerate(zip(self.low, self.high - self.low, strict=True)):
+            halves = stiffness(_halves(axis, low + 0.5 * span))
+            yield Answer("layer", "xyz"[axis], load=_minus(halves)), ALWAYS
+            wide = max(NARROW, 1.5 * float(model.mesh.param()) / span)
+            for place in PLACES if self._resists else ():
+                matrix = stiffness(_band(axis, low + place * span, wide * span))
+                yield Answer("contact", "xyz"[axis], load=_minus(matrix)), ALWAYS
         modes, times = self.numbers.flow
         axes = len(self.low)
-        for k in range(max(modes, axes)):
-            axis = k % axes
-            matrix = self._flow(axis, self._mode(k // axes))
-            yield Answer("flow", "", k, _minus(matrix)), hats(times)
-            if k < axes:
-                yield Answer("steady flow", "xyz"[axis], k, _minus(matrix)), ALWAYS
-        mass = model.mass
-        yield Answer("loss", load=lambda now: -(mass @ (now.u - now.u.mean()))), SWITCHED
+        for k in range(axes * math.ceil(modes / axes)):  # along each axis as many
+            axis, number = k % axes, k // axes
+            load = _minus(self._flow(axis, self._mode(number)))
+            yield Answer("flow", "", axes * self._powers[number][0], load), hats(times)
+            if number == 0:
+                yield Answer("steady flow", "xyz"[axis], load=load), ALWAYS
+        yield Answer("loss", load=_lost(model.mass)), SWITCHED
 
     def _flow(self, axis: int, shape: Callable[[Any], Any]) -> Any:
         return self.model.bilinear(lambda u, v, x: shape(x) * grad(u)[axis] * v)
@@ -225,6 +239,7 @@ class ErrorColumns:
         late = max(begin, first - PAUSE * (end - first) / steps)
         p = self._start()
         found = np.full((len(spans), self.observed.size, self.count), np.nan)
+        largest = np.abs(p).max(axis=1)
         states: list[Array] = []
         predicted = np.empty(found.shape[:2])
         last = begin
@@ -239,11 +254,16 @@ class ErrorColumns:
                 if t > last:
                     share = max(0.5 * (t + last) - late, 0.0) / (end - late)
                     p = self._advanced(stage, p, now, t - last, share, free)
+                    largest = np.maximum(largest, np.abs(p).max(axis=1))
                     last = t
                 H, _ = self.observed.jacobian(now.u, model.latent.value(q), moment)
                 found[number] = np.asarray(H @ p.T)
         times = np.array([float(span.t1) for span in spans])
-        return _filled(found, times), states, predicted
+        # By symmetry some answers do not reach the sensors.
+        found = _filled(found, times)
+        for column, most in enumerate(largest):
+            found[:, :, column] = beyond_rounding(found[:, :, column], most)
+        return found, states, predicted
 
     def _start(self) -> Array:
         p = np.zeros((self.count, self.model.X.dim))
@@ -273,12 +293,39 @@ class ErrorColumns:
         return solved * free + lifts
 
 
-def _band(place: float, wide: float) -> Callable[[Any], Any]:
-    return lambda x: np.maximum(1.0 - np.abs(x[0] - place) / wide, 0.0)
+def _halves(axis: int, middle: float) -> Callable[[Any], Any]:
+    """Return a shape that tells two layers apart, the same from either side but for its sign."""
+    return lambda x: np.where(x[axis] > middle, 0.5, -0.5)
+
+
+def _band(axis: int, place: float, wide: float) -> Callable[[Any], Any]:
+    return lambda x: np.maximum(1.0 - np.abs(x[axis] - place) / wide, 0.0)
+
+
+def beyond_rounding(values: Array, terms: Array) -> Array:
+    """Return values, or zeros where all of them are rounding of the terms they are sums of.
+
+    The average over errors scales each column to the size of the noise: one of rounding alone, as
+    that of a flow across a state that does not vary along it, would count as an error.
+    """
+    largest, of = (float(np.fmax.reduce(np.abs(one), axis=None)) for one in (values, terms))
+    return np.zeros_like(values) if math.isfinite(of) and largest <= ROUNDING * of else values
 
 
 def _minus(matrix: Any) -> Load:
-    return lambda now: -(matrix @ now.u)
+    size = abs(matrix)
+    return lambda now: beyond_rounding(-(matrix @ now.u), size @ np.abs(now.u))
+
+
+def _by_state(stiffness: Any) -> Load:
+    """Return the load of a conductivity that varies with the state about its mean."""
+    bent = _minus(0.5 * stiffness)
+    return lambda now: bent(now._replace(u=(now.u - now.u.mean()) ** 2))
+
+
+def _lost(mass: Any) -> Load:
+    size = abs(mass)
+    return lambda now: beyond_rounding(-(mass @ (now.u - now.u.mean())), size @ np.abs(now.u))
 
 
 def _late(lift: Array, name: str) -> Load:
@@ -287,7 +334,12 @@ def _late(lift: Array, name: str) -> Load:
 
 def _scaled(model: Model, name: str) -> Load:
     """Return the load of a channel that is larger by its own size."""
-    return lambda now: scaled_channel(model, name, now.u, now.q, now.moment, STEP) / STEP
+
+    def load(now: StatePoint) -> Array:
+        more = scaled_channel(model, name, now.u, now.q, now.moment, STEP) / STEP
+        return beyond_rounding(more, force(model, now.u, now.q, now.moment) / STEP)
+
+    return load
 
 
 def _changed(model: Model, direction: Array) -> Load:
@@ -296,7 +348,7 @@ def _changed(model: Model, direction: Array) -> Load:
     def load(now: StatePoint) -> Array:
         more, less = now.q + STEP * direction, now.q - STEP * direction
         up, down = (force(model, now.u, q, now.moment) for q in (more, less))
-        return (up - down) / (2.0 * STEP)
+        return beyond_rounding(up - down, up) / (2.0 * STEP)
 
     return load
 

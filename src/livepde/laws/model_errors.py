@@ -16,13 +16,12 @@ from typing import TypeAlias
 import numpy as np
 
 from livepde.fem import Scalar
-from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, hats
+from livepde.laws.error_columns import FULL, SMALL, ErrorColumns, beyond_rounding, hats
 from livepde.laws.policies import Refit
 from livepde.laws.refit import plausible
-from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, IntArray, Mask, nonfinite_allowed
-from livepde.observation import Points
-from livepde.verdict.directions import sensor_shifts
+from livepde.verdict.directions import sensor_shifts, stated_positions
 from livepde.verdict.evidence import Causes, Family, LinearModel, Mixture, averaged
 from livepde.verdict.model_errors import Allowed, ModelErrors
 
@@ -57,8 +56,12 @@ def _sensor_columns(
     times = np.array([float(span.t1) for span in samples.spans])
     share = (times - times[0]) / max(float(np.ptp(times)), 1e-300)
     count, sensors = predicted.shape
-    rate = np.gradient(predicted, times, axis=0) if count > 1 else np.zeros_like(predicted)
-    change = predicted - predicted[0]
+    # A sensor that moves may have no place at first.
+    seen = np.isfinite(predicted)
+    change = predicted - predicted[seen.argmax(axis=0), np.arange(sensors)]
+    for column, level in zip(change.T, predicted.T, strict=True):
+        column[:] = beyond_rounding(column, level)
+    rate = np.gradient(change, times, axis=0) if count > 1 else np.zeros_like(predicted)
     problem = samples.filter.problem
     each = [
         (np.ones_like(predicted), math.inf),
@@ -67,15 +70,19 @@ def _sensor_columns(
         (-rate, math.inf),
     ]
     common = [(change, MOST_GAIN), (-rate, math.inf)]
-    observation = problem.observed.observation
+    positions = stated_positions(problem.observed)
     shifts, step = sensor_shifts(problem.model, problem.observed)
-    for axis, matrix in enumerate(shifts if isinstance(observation, Points) else ()):
+    for axis, matrix in enumerate(shifts):
+        size = abs(matrix)
         slope = np.array([matrix @ u for u in states]) / step
+        terms = np.array([size @ np.abs(u) for u in states]) / step
+        for k in range(sensors):
+            slope[:, k] = beyond_rounding(slope[:, k], terms[:, k])
         vertices = np.asarray(problem.model.mesh.p)[axis]
-        length = float(np.ptp(vertices))
-        each.append((slope, FARTHEST * length))
-        depth = observation.positions[:, axis] - float(vertices.min())  # type: ignore[attr-defined]
-        common.append((slope * depth, FARTHEST))
+        low, high = float(vertices.min()), float(vertices.max())
+        each.append((slope, FARTHEST * (high - low)))
+        at = np.zeros(sensors) if positions is None else np.nan_to_num(positions[:, axis])
+        common += [(slope * (at - end), FARTHEST) for end in (low, high)]  # depths from either
     for effect, most in each:
         for k in range(sensors):
             own = np.zeros_like(predicted)
@@ -169,7 +176,8 @@ def _best(samples: StoredSamples, options: Refit) -> tuple[Passed, Mask] | None:
     used = plausible(samples, options, one) & np.isfinite(one.residuals)
     # Coordinates of an uncertain start are no unknowns: they are those of the linear model.
     H, g = one.model(used)
-    step = np.linalg.solve(H, g)
+    sizes, axes = principal(H)
+    step = axes @ (axes.T @ g / sizes)
     if not samples.state.start.U.any() or step @ H @ step < NEAR**2:
         return one, used
     better = samples.about(samples.within_bounds(one.xi + step))
@@ -260,7 +268,7 @@ def linear_model(
         return np.arange(place - flat.shape[1], place)
 
     own = add(answers)
-    family: dict[str, list[tuple[int, IntArray, int]]] = {}
+    family: dict[str, list[tuple[float, IntArray, int]]] = {}
     for first, (answer, course) in zip(errors.first, errors.answers, strict=True):
         columns = own[first : first + course.size]
         if answer.kind in ("source", "conductivity", "flow"):
@@ -268,7 +276,7 @@ def linear_model(
             continue
         causes += [(column, math.inf) for column in columns.tolist()]
     for kind, members in family.items():
-        modes = np.array([mode for mode, _, _ in members], dtype=float)
+        modes = np.array([mode for mode, _, _ in members])
         modes -= modes.min()
         count = members[0][2]
         columns = np.concatenate([one for _, one, _ in members])

@@ -37,7 +37,7 @@ from livepde.laws.sensitivity_state import (
     new_window,
 )
 from livepde.laws.step_diagnostics import Diagnostics
-from livepde.laws.stored_samples import Passed, StoredSamples
+from livepde.laws.stored_samples import Passed, StoredSamples, principal
 from livepde.linalg import Array, Mask, nonfinite_allowed
 
 NEIGHBOURS = 3  # in time, to each side of a value
@@ -225,8 +225,9 @@ class _Search:
         if one is None:
             return self.used
         H, _ = one.model(self.used)
+        sizes, axes = principal(H)
         J, r = one.slopes, one.residuals
-        shown = np.einsum("skr,skr->sk", J @ np.linalg.inv(H), J)
+        shown = ((J @ axes) ** 2 / sizes).sum(axis=-1)
         # Residuals of readings in use vary less than the noise, those of others more.
         e = r / np.sqrt(np.where(self.used, np.maximum(1.0 - shown, LEVERAGE), 1.0 + shown))
         near = near_neighbours(r, GATE)
@@ -291,7 +292,7 @@ class _Search:
         """Return by how much the quadratic model of the cost falls to its minimum."""
         H, g = one.model(self.used)
         free = self._free(one, g)
-        sizes, axes = np.linalg.eigh(free.T @ H @ free)
+        sizes, axes = principal(free.T @ H @ free)
         along = axes.T @ (free.T @ g)
         return 0.5 * float((along**2 / sizes).sum())
 
@@ -315,7 +316,7 @@ class _Search:
         """Return the pass after an accepted step, None if there is none, and the trust region."""
         H, g = one.model(self.used)
         free, cost = self._free(one, g), one.cost(self.used)
-        sizes, axes = np.linalg.eigh(free.T @ H @ free)
+        sizes, axes = principal(free.T @ H @ free)
         axes = free @ axes
         along, bend = axes.T @ g, None
         several = 1  # one trial, and where it fails shorter ones at once
@@ -385,7 +386,9 @@ class _Search:
         H, _ = self.best.model(self.used)
         # Of the unknowns: rows of an uncertain start, and padding, may stay as they were.
         C = self.samples.state.start.C[0]
-        before, after = C.T @ C, C.T @ np.linalg.solve(H, C)
+        sizes, axes = principal(H)
+        left = axes.T @ C
+        before, after = C.T @ C, left.T @ (left / sizes[:, None])
         floor = ROUNDING * np.trace(before) * np.eye(len(before))
         shares = scipy.linalg.eigh(after, before + floor, eigvals_only=True)
         return math.sqrt(max(shares[-1], 0.0)) > UNSURE

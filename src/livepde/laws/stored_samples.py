@@ -29,6 +29,16 @@ TOGETHER = 6  # trajectories that are tried at once where one array holds them
 AT_ONCE = 32  # trajectories that are followed as one array
 
 
+def principal(H: Array) -> tuple[Array, Array]:
+    """Return principal values and axes of a Hessian of the cost.
+
+    It is the identity, of the prior, and more: values below one are rounding, beside readings that
+    tell another direction up to the last digit.
+    """
+    sizes, axes = np.linalg.eigh(H)
+    return np.maximum(sizes, 1.0), axes
+
+
 @dataclass(frozen=True, eq=False)
 class Passed:
     """The samples about one trajectory."""
@@ -291,8 +301,9 @@ class StoredSamples:
         the gate, which is wider where the residuals in use are larger than their noise.
         """
         (H, g), there = one.model(used), np.isfinite(self.readings)
-        lowest = one.cost(used) - 0.5 * float(g @ np.linalg.solve(H, g))
-        found = -lowest - 0.5 * float(np.linalg.slogdet(H)[1])
+        sizes, axes = principal(H)
+        lowest = one.cost(used) - 0.5 * float(((axes.T @ g) ** 2 / sizes).sum())
+        found = -lowest - 0.5 * float(np.log(sizes).sum())
         found -= float((np.log(self.noise) + HALF_LOG)[there].sum())
         refused = (there & ~used).sum(axis=0)
         for k in np.flatnonzero(refused).tolist():

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from livepde.observation.combined import Calibrated, Combined, Transformed, TransformedObserved
+from livepde.observation.combined import (
+    Calibrated,
+    Combined,
+    CombinedObserved,
+    Transformed,
+    TransformedObserved,
+)
 from livepde.observation.functionals import FluxPlates, Functionals
 from livepde.observation.operator import Observation, Observed
 from livepde.observation.reconstruction import (
@@ -25,6 +31,7 @@ __all__ = [
     "Averages",
     "Calibrated",
     "Combined",
+    "CombinedObserved",
     "Discrepancy",
     "FluxPlates",
     "Full",

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -20,7 +20,7 @@ from livepde.errors import ObservationError
 from livepde.fem import Inputs, Moment, On
 from livepde.linalg import Array, IntArray, RowProduct, row_product
 from livepde.model import Model
-from livepde.observation import Observed, Points
+from livepde.observation import CombinedObserved, Observed, Points
 from livepde.stepping import ForwardStage
 
 FIXED = "the fixed boundary"  # constants of the model, which may be wrong as well
@@ -364,37 +364,75 @@ def _within_reach(
     model: Model, observed: Observed, found: list[ScoreDirection]
 ) -> list[ScoreDirection]:
     """Return the directions of positions, bounded by the body and by the nearest other sensor."""
-    observation = observed.observation
-    if not isinstance(observation, Points):
+    at = stated_positions(observed)
+    if at is None:
         return found
-    at = observation.positions
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     apart = np.linalg.norm(at[:, None] - at[None], axis=2)
     apart[apart == 0.0] = np.inf  # itself, and sensors at the same place
-    reach = np.broadcast_to(apart.min(axis=1, initial=np.inf), len(at))
+    reach = np.fmin.reduce(apart, axis=1, initial=np.inf)
     bounded = []
     for number, one in enumerate(found):
         sensor, k = number % len(at), one.axis
+        if np.isnan(at[sensor, k]):
+            bounded.append(one)
+            continue
         least = max(float(low[k] - at[sensor, k]), -float(reach[sensor]))
         most = min(float(high[k] - at[sensor, k]), float(reach[sensor]))
         bounded.append(replace(one, least=least, most=most, at=float(at[sensor, k])))
     return bounded
 
 
+def _leaves(observed: Observed) -> list[Observed]:
+    """Return the observations that an observation is made of, in the order of its sensors."""
+    if isinstance(observed, CombinedObserved):
+        return [leaf for part in observed.parts for leaf in _leaves(part)]
+    return [observed]
+
+
+def _stated(observed: Observed) -> Points | None:
+    """Return the sensors of an observation if each has a position that is not estimated anyway."""
+    observation = observed.observation
+    found = isinstance(observation, Points) and observation.position_std is None
+    return cast("Points", observation) if found else None
+
+
+def stated_positions(observed: Observed) -> Array | None:
+    """Return the stated positions of sensors, (sensors, d); NaN for those without; None if all."""
+    leaves = [(leaf.size, _stated(leaf)) for leaf in _leaves(observed)]
+    known = [points.positions for _, points in leaves if points is not None]
+    if not known:
+        return None
+    none = np.full(known[0].shape[1], np.nan)
+    parts = [np.tile(none, (n, 1)) if points is None else points.positions for n, points in leaves]
+    return np.concatenate(parts)
+
+
+def _rows_at(observed: Observed, at: Array) -> sp.csr_array:
+    """Return the matrix of the values at other places; zero for sensors without a position."""
+    rows, first = [], 0
+    for leaf in _leaves(observed):
+        points, own = _stated(leaf), at[first : first + leaf.size]
+        none = sp.csr_array((leaf.size, observed.state.dim))
+        rows.append(none if points is None else points.rows(observed.state, own, range(leaf.size)))
+        first += leaf.size
+    return sp.csr_array(sp.vstack(rows))
+
+
 def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array], float]:
     """Return how readings change if sensors are shifted along each axis, and by how much.
 
-    No axes for sensors that have no position, or an uncertain one that is estimated anyway.
+    No axes if no sensor has a position, or only uncertain ones that are estimated anyway; zero for
+    single ones.
     """
-    observation = observed.observation
-    if not isinstance(observation, Points) or observation.position_std is not None:
+    at = stated_positions(observed)
+    if at is None:
         return [], np.nan
-    at = observation.positions
     vertices = np.asarray(model.mesh.p)
     low, high = vertices.min(axis=1), vertices.max(axis=1)
     step = SHIFT * float((high - low).max())
-    found, sensors = [], range(len(at))
+    found = []
     for axis in range(at.shape[1]):
         ends, width = [], np.zeros(len(at))
         # Central differences; at the edge of the box they are one-sided, and `width` is shorter.
@@ -402,10 +440,10 @@ def sensor_shifts(model: Model, observed: Observed) -> tuple[list[sp.csr_array],
             moved = at.copy()
             moved[:, axis] = np.clip(moved[:, axis] + sign * step, low[axis], high[axis])
             try:
-                ends.append(observation.rows(observed.state, moved, sensors))
+                ends.append(_rows_at(observed, moved))
             except ObservationError:  # outside of a mesh that is no box
                 moved = at.copy()
-                ends.append(observation.rows(observed.state, moved, sensors))
+                ends.append(_rows_at(observed, moved))
             width += sign * moved[:, axis]
         scale = sp.diags_array(step / np.where(width > 0.0, width, np.inf))
         found.append(sp.csr_array(scale @ (ends[1] - ends[0])))

@@ -40,6 +40,7 @@ from livepde.verdict.ledger import WINDOWS, Ledger, batch_of, blocked, changed, 
 MOST_MEMBERS = 16  # of a fleet in which missing terms are looked for
 MOST_RECORDED = 400  # numbers in a block of the record of the unknowns
 SAME = 1e-12  # relative difference of readings that are the same
+REACHED = 1e-6  # of a step: times that are the same but for rounding
 
 
 class ScoredSample(NamedTuple):
@@ -133,7 +134,7 @@ class Judge:
         # sums a copy and changes nothing. None waits before the first sample, too.
         if np.count_nonzero(ledger.waiting % self.batch) < members:
             M, ledger = self._begin_batch(ledger, sample)
-        reached = ledger.reached[:, 1] >= sample.at.t
+        reached = _reached(ledger, sample.at.t)
         if self.answered(members) and np.count_nonzero(reached) < members:
             ledger = self._extend_answers(ledger, sample)
         rows, at, waiting = ledger.rows.copy(), self._at, ledger.waiting
@@ -351,7 +352,7 @@ class Judge:
         rows[:, :, self._at["answers"]] = self._answers(ledger)
         p, readings = ledger.process.copy(), ledger.readings.copy()
         reached, q = ledger.reached.copy(), sample.q()
-        for k in np.flatnonzero(~(reached[:, 1] >= t)).tolist():
+        for k in np.flatnonzero(~_reached(ledger, t)).tolist():
             # Without a better guess, what the sensors showed first is where nothing is lost.
             first = ledger.first[k, np.isfinite(ledger.first[k])]
             rest = float(first.sum()) / max(len(first), 1)
@@ -369,6 +370,13 @@ class Judge:
             readings[k] = low, (process.readings(p[k], now) - low) / h
             reached[k] = begin, begin + h
         return changed(ledger, rows=rows, process=p, readings=readings, reached=reached)
+
+
+def _reached(ledger: Ledger, t: float) -> Mask:
+    """Return whether the responses reach a time; where samples are regular, they end at one."""
+    begin, end = ledger.reached.T
+    found: Mask = end >= t - REACHED * (end - begin)
+    return found
 
 
 def _in_windows(effect: Array, growth: Array) -> Array:
