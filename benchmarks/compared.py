@@ -8,6 +8,7 @@ the truth within its intervals.
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Sequence
@@ -77,7 +78,11 @@ class Ended(NamedTuple):
 
 
 def compared(
-    wrongs: Sequence[Fault | Stated], *, seeds: int, workers: int = 1, progress: bool = False
+    wrongs: Sequence[Fault | Stated],
+    *,
+    seeds: int,
+    workers: int | None = None,
+    progress: bool = False,
 ) -> Outcome:
     """Compare variants of each wrong case.
 
@@ -86,11 +91,11 @@ def compared(
     seeds
         Truths of each.
     workers
-        Processes.
+        Processes, default one for each processor.
     """
     todo = [(wrong, seed) for wrong in wrongs for seed in range(seeds)]
     rows, right, trusted = [], 0, 0
-    found = each(_ended, todo, "cases", workers=workers, progress=progress)
+    found = each(_ended, todo, "cases", workers=workers or os.cpu_count() or 1, progress=progress)
     for (wrong, seed), ended in found:
         right += not ended.outside and ended.level in USABLE
         trusted += ended.outside != "" and ended.level == "trusted"
