@@ -469,7 +469,7 @@ def _normal(count: int, size: int) -> Array:
     for _ in range(60):
         root = (1.0 + root) ** (1.0 / (size + 1))
     steps = root ** -np.arange(1.0, size + 1.0)
-    uniform = (0.5 + np.arange(1.0, count + 1.0)[:, None] * steps) % 1.0
+    uniform = (np.arange(1.0, count + 1.0)[:, None] * steps) % 1.0
     return np.asarray(scipy.special.ndtri(uniform))
 
 
