@@ -213,3 +213,12 @@ def test_times_without_a_date_stay_numbers(tmp_path: Path) -> None:
     with xr.open_dataset(tmp_path / "run" / "estimates.nc", engine="scipy") as other:
         assert other["time"].values.tolist() == [0.0, 1.5, 3.0]
     xr.testing.assert_identical(open_run(tmp_path / "run").dataset, data)
+
+
+@pytest.mark.parametrize("character", ["\x0c", "\x1c", "\x85", "\u2028"])
+def test_a_line_ends_at_its_end_and_nowhere_else(tmp_path, character):
+    path = tmp_path / "log.csv"
+    path.write_text(f"time_s,T{character}5\r\n0,20.5\r\n60,21.0\r\n", encoding="utf-8", newline="")
+    written = how_written(path)
+    assert list(written.header) == ["time_s", f"T{character}5"]
+    assert [list(row) for row in written.rows] == [["0", "20.5"], ["60", "21.0"]]

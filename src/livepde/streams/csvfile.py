@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import csv
+import io
 import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -237,7 +238,8 @@ def _first_lines(path: Path, encoding: str) -> tuple[list[str], str]:
         raise DataError(f"{path} cannot be read: {error.strerror or error}.") from error
     # The last line may be cut off.
     whole = text if len(text) < LOOK else text.rpartition("\n")[0]
-    return whole.splitlines(), encoding
+    # Not `splitlines`, which also splits at form feeds and at separators of Unicode in a cell.
+    return [line.rstrip("\n") for line in io.StringIO(whole, newline=None)], encoding
 
 
 def _time_formats(
