@@ -424,5 +424,7 @@ def test_a_measured_flux_leaves_the_matrices_constant() -> None:
     driven = with_conditions(slab(), ends)
     assert driven.steady
     assert not BandedStage.refuses(driven)
+    unknown = conduction(lp.interval(0.0, LENGTH, 8), lp.LogNormal(K, 1.0), C=lp.LogNormal(C, 1.0))
+    assert not BandedStage.refuses(with_conditions(unknown, ends, per="C"))
     moving = with_conditions(slab(), {"right": Exchange(lp.Channel("h"), 20.0)})
     assert not moving.steady

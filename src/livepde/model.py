@@ -185,6 +185,7 @@ class Model(Shown):
         self.physical_A = self.linear_A = self._form("A", terms, triple, "u", dA, "q")
         # Numbers computed from the unknowns, and A in both; None if there are none.
         self.coefficients = computed if computed is not None and computed.numeric else None
+        self.computed = () if computed is None else tuple(computed.names)  # what A reads besides q
         if self.coefficients is not None:
             more = triple | {"q": self.coefficients.space}
             self.linear_A = self._form("A", A, more, "u", None, "q")

@@ -82,7 +82,8 @@ def with_conditions(
         Unknowns named by these conditions, in addition to those of the model.
     per
         Unknown of the model by which its equation is divided, as an unknown heat capacity:
-        conditions are divided by it, too.
+        conditions are divided by it, too. A model with the coefficient per_NAME, one over this
+        unknown, stays linear where they are known.
 
     Raises
     ------
@@ -110,7 +111,8 @@ def with_conditions(
             f"with_conditions: per='{per}' is not an unknown of the model; it has "
             f"{list(model.parameter_space.labels)}."
         )
-    terms = _Terms(tuple(more), per)
+    inverse = f"per_{per}" if f"per_{per}" in model.computed else None
+    terms = _Terms(tuple(more), per, inverse)
     for name, given in (boundary or {}).items():
         _check_boundary(model, name)
         for condition in given if isinstance(given, Sequence) else [given]:
@@ -130,8 +132,8 @@ def _everywhere(x: Place) -> float:
 class _Terms:
     """Additional terms of A, which contain unknowns, and of B, which do not."""
 
-    def __init__(self, unknowns: tuple[str, ...], per: str | None) -> None:
-        self.unknowns, self.per = unknowns, per
+    def __init__(self, unknowns: tuple[str, ...], per: str | None, inverse: str | None) -> None:
+        self.unknowns, self.per, self.inverse = unknowns, per, inverse
         self.named: set[str] = set()
         self.inputs: list[str] = []
         self.A: list[Any] = []
@@ -172,8 +174,12 @@ class _Terms:
 
     def _divided(self, value: Amount) -> Callable[[Any, Place], Any]:
         """Return an amount over the unknown that divides the equation, if one does."""
-        amount, per = self._amount(value), self.per
-        return amount if per is None else lambda q, x: amount(q, x) / getattr(q, per)
+        amount, per, inverse = self._amount(value), self.per, self.inverse
+        if per is None:
+            return amount
+        if inverse is not None and not isinstance(value, str | Multiple):
+            return lambda q, x: amount(q, x) * getattr(q, inverse)
+        return lambda q, x: amount(q, x) / getattr(q, per)
 
     def _amount(self, value: Amount) -> Callable[[Any, Place], Any]:
         """Return an amount as a function of q and x."""

@@ -145,39 +145,46 @@ def _model(
     # A term without an unknown of its own is left out of the form, and its input with it.
     given = {key: unknown for key, unknown in unknowns.items() if unknown is not None}
 
-    def per(q: Any) -> Any:
-        """Return what the equation is divided by: an unknown heat capacity."""
-        return q.C if "C" in given else 1.0
+    # The equation is divided by an unknown heat capacity. The ratios are coefficients of the form,
+    # which stays linear in them.
+    own, divided = [key for key in given if key != "C"], "C" in given
+
+    def ratios(q: Any) -> dict[str, Any]:
+        return {"per_C": 1.0 / q.C, **{f"{key}_per_C": getattr(q, key) / q.C for key in own}}
+
+    def part(q: Any, key: str) -> Any:
+        return getattr(q, f"{key}_per_C" if divided else key)
 
     terms: list[Any] = [
-        lambda q, u, v, x: getattr(q, conductivity) / per(q) * fem.dot(fem.grad(u), fem.grad(v))
+        lambda q, u, v, x: part(q, conductivity) * fem.dot(fem.grad(u), fem.grad(v))
     ]
     if "loss" in given:
-        terms += _exchange("loss", per)
+        terms += _exchange("loss", part)
     if "transfer" in given:
-        terms += _transfer(name, mesh, held, per)
+        terms += _transfer(name, mesh, held, part)
     if "source" in given:
-        terms.append(lambda q, _, v, x: -q.source / per(q) * v)
+        terms.append(lambda q, _, v, x: -part(q, "source") * v)
     return Model(
         fem.Field(mesh, element or fem.linear(mesh), dirichlet=held, unit=unit),
         given,
         A=terms,
         M=lambda u, v, x: capacity(x) * u * v,
         inputs=[AMBIENT] if {"loss", "transfer"} & set(given) else [],
+        coefficients=ratios if divided else None,
         **(HEAT if name == "heat" else CONDUCTION).about(given),
     )
 
 
-def _exchange(coefficient: str, per: Callable[[Any], Any]) -> list[Any]:
+def _exchange(coefficient: str, part: Callable[[Any, str], Any]) -> list[Any]:
     """Return coefficient (u - ambient) v as two terms, so that the term in u reads no input."""
     return [
-        lambda q, u, v, x: getattr(q, coefficient) / per(q) * u * v,
-        lambda q, _, v, x: -getattr(q, coefficient) / per(q) * x.inputs[AMBIENT] * v,
+        lambda q, u, v, x: part(q, coefficient) * u * v,
+        lambda q, _, v, x: -part(q, coefficient) * x.inputs[AMBIENT] * v,
     ]
 
 
 def _transfer(
-    name: str, mesh: Any, held: Mapping[str, Any], per: Callable[[Any], Any]
+    name: str, mesh: Any, held: Mapping[str, Any], part: Callable[[Any, str], Any]
 ) -> list[fem.On]:
     """Return the Robin terms at the named boundaries without a value."""
     free = (
@@ -188,7 +195,7 @@ def _transfer(
             f"{name}: transfer acts at named boundaries without a value, and there is none: leave "
             "it out, or leave one out of dirichlet."
         )
-    return [fem.On(side, term) for side in free for term in _exchange("transfer", per)]
+    return [fem.On(side, term) for side in free for term in _exchange("transfer", part)]
 
 
 SURROUNDINGS = {
