@@ -386,7 +386,7 @@ def first_hour(
     return benchmark(tuple(chosen(only, WALKS, "walk", WALKS)), seeds=seeds, progress=True)
 
 
-@program.command(quick="Four wrong cases.")
+@program.command(quick="Two wrong cases.")
 def compared(
     *,
     seeds: Annotated[int, Count(2, 1, "Truths of each wrong case.")],

@@ -51,7 +51,7 @@ from livepde.streams.table import Column
 
 MONTH = 43_830  # rows, one a minute
 WEEK = 7 * 1440
-WARM = 20_000  # steps before memory is looked at: until then the samples kept become more
+WARM = 10_000  # steps before memory is looked at
 BLOCK = 1000  # steps of one measurement
 FRESH = 50  # steps of the one beside it
 GROWTH = 5.0  # MiB of memory, at most

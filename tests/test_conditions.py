@@ -428,3 +428,19 @@ def test_a_measured_flux_leaves_the_matrices_constant() -> None:
     assert not BandedStage.refuses(with_conditions(unknown, ends, per="C"))
     moving = with_conditions(slab(), {"right": Exchange(lp.Channel("h"), 20.0)})
     assert not moving.steady
+
+
+def test_a_product_of_an_unknown_and_an_input_that_vanishes_at_the_prior_mean_is_seen() -> None:
+    """A load that is no line in its input for most unknowns is assembled at each stage."""
+    mesh = lp.interval(0.0, LENGTH, 8)
+    model = lp.Model(
+        lp.Field(mesh, lp.fem.linear(mesh), dirichlet={"left": 0.0}),
+        {"a": lp.Normal(0.0, 1.0)},
+        A=lambda q, _, v, x: -np.exp(q.a * x.inputs["p"]) * v,
+        B=lambda u, v, x: lp.dot(lp.grad(u), lp.grad(v)),
+        inputs=["p"],
+    )
+    u = steady(model, {"a": 0.7}, lambda t: {"p": 1.5})
+    x = mesh.p[0]
+    exact = np.exp(0.7 * 1.5) * (LENGTH * x - 0.5 * x**2)
+    assert np.abs(u - exact).max() < 1e-5

@@ -158,3 +158,18 @@ def test_a_sensor_that_is_stuck_is_no_jump_and_hides_none():
     assert 599 <= alarms[0] < 629
     value, std = found[-1].parameters["a"]
     assert abs(value - 0.36) < 3.0 * std
+
+
+def test_a_sensor_that_stays_stuck_hides_no_slow_evidence_of_the_others():
+    """Its repetitions are left out, and the sums of the other sensors go on."""
+    rng, jumps, alarms = np.random.default_rng(3), Jumps(settle=10), []
+    watch = jumps.start(3)
+    for k in range(300):
+        e = rng.standard_normal((1, 3)) + (1.5 if k >= 220 else 0.0)
+        run_of = max(k - 100, 0)  # of the first sensor, which then brings no reading at all
+        if k >= 150:
+            e[0, 0], run_of = np.nan, 50
+        watch, alarm = jumps.add(watch, e, None, np.array([[run_of, 0, 0]]))
+        alarms += [k] * bool(alarm[0])
+    assert alarms
+    assert 220 <= alarms[0] < 245

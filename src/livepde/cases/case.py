@@ -228,7 +228,7 @@ class Case(CaseContent):
         self._check_names()
 
     def _check_names(self) -> None:
-        """Refuse names of unknowns and channels that are reserved for other numbers of a run."""
+        """Refuse names that a run uses for other numbers, and outputs that no run has."""
         kinds = (
             ("unknowns", "unknown", self.model.parameter_space.labels, TOTALS),
             ("channels", "channel", self.roles(*SENSORS), ROLES),

@@ -58,10 +58,9 @@ def figures_of(dataset: Any, title: str, journal: Journal | None = None) -> dict
         return {}
     kinds = [of for of in ("sensor", "validation") if of in dataset]
     names = [str(name) for of in kinds for name in dataset[of].values]
-    if journal is None or not names or len(journal) > MOST_CURVES:
-        return {"overview": lambda: plots.overview(dataset, title=title)}
-    kept = journal.readings(names)
-    return {"overview": lambda: plots.overview(dataset, title=title, measured=kept)}
+    few = journal is not None and names and len(journal) <= MOST_CURVES
+    measured = journal.readings(names) if journal is not None and few else None
+    return {"overview": lambda: plots.overview(dataset, title=title, measured=measured)}
 
 
 def report_outcome(outcome: Outcome, command: Sequence[str], as_json: bool) -> None:

@@ -166,11 +166,13 @@ class Columns:
         values = log[0][:, at]
         if error.kind == "exchange":
             values = values[:, ::-1].copy()
-            for k in (k for k, name in enumerate(names) if name in self.inputs):
+            for k, name in enumerate(names):
+                if name not in self.inputs:
+                    continue
                 # A sensor has no reading where the stored samples begin; an input needs a value.
                 known = np.flatnonzero(np.isfinite(values[:, k]))
-                at_most = np.searchsorted(known, np.arange(len(values)), side="right") - 1
-                values[:, k] = values[known[np.maximum(at_most, 0)], k]
+                last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+                values[:, k] = values[known[np.maximum(last, 0)], k]
             if not set(names) & set(self.inputs):  # the noise of a reading goes with it
                 noise = [place + len(self.work.filter.noise) for place in at]
                 log[0][:, noise] = log[0][:, noise[::-1]]

@@ -271,7 +271,7 @@ def _watched(
         known = [*_since(work, state, row), interval]
         # Values that the gate has refused in a row do not count in the onset, and belong to it.
         doubted = int(np.where(screened.aside, 0, screened.refused).max())
-        moving = np.where(state.watch.stuck(screened.run), np.nan, e)
+        moving = np.where(state.watch.repeating(screened.run), np.nan, e)
         onset = max(jumps.onset(state.watch, moving), doubted)
         guess = len(known) - reaching([bool(item.present.any()) for item in known], onset)
         before = _most_likely(work, jumps, state.older, known, guess)

@@ -144,11 +144,13 @@ class Watch:
     usual: Innovations
     # Usual scatter before each of the last samples, newest first, shape (members, samples).
     scatters: Array
-    # Readings that repeated the one before, of sensors that did not seem stuck, (members, sensors).
+    # Readings that repeated the one before, of sensors that did not seem stuck; and which sensors
+    # seemed stuck at the last sample, (members, sensors).
     repeats: IntArray
+    stuck: Mask
 
-    def stuck(self, run: IntArray) -> Mask:
-        """Return which sensors seem stuck; they tell nothing on a jump.
+    def repeating(self, run: IntArray) -> Mask:
+        """Return which sensors seem stuck; their readings are not evidence of a jump.
 
         `run`: how often in a row each reading has been repeated, (members, sensors). A sensor of a
         coarse resolution repeats its readings often.
@@ -180,7 +182,9 @@ class Watch:
             usual = new if counted.all() else where(counted, new, usual)
         scatters = np.concatenate([self.usual.scatter[:, None], self.scatters[:, :-1]], axis=1)
         resting = np.maximum(self.resting - 1, 0)
-        return Watch(squares, counts, self.seen + 1, resting, usual, scatters, self.repeats)
+        return Watch(
+            squares, counts, self.seen + 1, resting, usual, scatters, self.repeats, self.stuck
+        )
 
 
 @dataclass(frozen=True)
@@ -254,7 +258,7 @@ class Jumps:
         zero, none = np.zeros((members, self.window)), np.zeros(members, dtype=np.int64)
         usual = Innovations.start(sensors, members)
         repeats = np.zeros((members, sensors), dtype=np.int64)
-        return Watch(zero, zero, none, none + self.settle, usual, zero + 1.0, repeats)
+        return Watch(zero, zero, none, none + self.settle, usual, zero + 1.0, repeats, repeats > 0)
 
     def add(
         self,
@@ -270,17 +274,18 @@ class Jumps:
         e
             Normalised innovations, shape (members, sensors), NaN where missing.
         refused, run
-            As for `Watch.add` and `Watch.stuck`; None: no reading repeats one.
+            As for `Watch.add` and `Watch.repeating`; None: no reading repeats one.
         """
-        if run is not None and np.count_nonzero(run):
-            stuck = watch.stuck(run)
-            # The reading that is repeated has counted: the test begins anew.
-            fresh = stuck.any(axis=1, keepdims=True)
+        if run is not None and np.count_nonzero(run) + np.count_nonzero(watch.stuck):
+            stuck = watch.repeating(run)
+            # The sums contain the first reading of the repeated value, and are cleared.
+            begins = (stuck & ~watch.stuck).any(axis=1, keepdims=True)
             watch = replace(
                 watch,
-                squares=np.where(fresh, 0.0, watch.squares),
-                counts=np.where(fresh, 0.0, watch.counts),
+                squares=np.where(begins, 0.0, watch.squares),
+                counts=np.where(begins, 0.0, watch.counts),
                 repeats=watch.repeats + ((run > 0) & ~stuck),
+                stuck=stuck,
             )
             e = np.where(stuck, np.nan, e)
         new = watch.add(e, watch.seen < self.settle, refused)

@@ -461,16 +461,9 @@ def _shift(sizes: Array, g: Array, delta: float) -> float:
 
 
 def _normal(count: int, size: int) -> Array:
-    """Return points of N(0, I) that fill its space evenly, shape (count, size).
-
-    A Kronecker sequence: its steps are powers of the root of x^(size + 1) = x + 1.
-    """
-    root = 2.0
-    for _ in range(60):
-        root = (1.0 + root) ** (1.0 / (size + 1))
-    steps = root ** -np.arange(1.0, size + 1.0)
-    uniform = (np.arange(1.0, count + 1.0)[:, None] * steps) % 1.0
-    return np.asarray(scipy.special.ndtri(uniform))
+    """Return Sobol points of N(0, I), shape (count, size)."""
+    sobol = scipy.stats.qmc.Sobol(size, seed=0)
+    return np.asarray(scipy.special.ndtri(np.clip(sobol.random(count), 1e-6, 1.0 - 1e-6)))
 
 
 def _misfit(residuals: Array, readings: Array, used: Mask) -> float:

@@ -118,9 +118,8 @@ def conduction(
     ... )
     """
     unknowns = {"k": k, "loss": loss, "transfer": transfer, "source": source}
-    if isinstance(
-        C, fem.Field | fem.Piecewise | fem.Scalars
-    ):  # grad(1/C) would be a term of its own
+    # Where C varies, the gradient of 1/C is a further term.
+    if isinstance(C, fem.Field | fem.Piecewise | fem.Scalars):
         raise ModelError("conduction: an unknown C must be one number; give a Scalar or a prior.")
     if isinstance(C, fem.Scalar | fem.Prior):
         unknowns["C"] = C

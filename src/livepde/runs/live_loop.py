@@ -858,5 +858,8 @@ class Live:
 
 
 def _due(look: int) -> bool:
-    """Return whether a look at the verdict computes errors of the model."""
+    """Return whether a look is at a doubling, or one of `SELDOM`.
+
+    Such a look computes errors of the model in a live run, and is the only kind in a batch run.
+    """
     return look > 1 and (look & (look - 1) == 0 or look % SELDOM == 0)

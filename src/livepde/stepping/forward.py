@@ -59,6 +59,7 @@ class ForwardStage:
         self._made: tuple[At, Factor] | None = None
         self._last: tuple[At, _System] | None = None
         self._rate: tuple[float, Array] | None = None
+        # q, the load without inputs, and its derivative by each input.
         self._driving: tuple[Array, Array, Array] | None = None
 
     def twin(self) -> ForwardStage:
@@ -273,9 +274,14 @@ class ForwardStage:
 
     @cached_property
     def _driven_affinely(self) -> bool:
-        """True if inputs drive the state affinely and time does not, probed at the prior q."""
-        model = self.model
-        return self._load(model.latent.value(model.latent.prior)).responses is not None
+        """True if inputs drive the state affinely and time does not.
+
+        Probed at a drawn q: at the prior mean a product of an unknown and an input may vanish.
+        """
+        latent = self.model.latent
+        some = np.random.default_rng(0).standard_normal(latent.dim) * latent.deviations
+        with np.errstate(all="ignore"):
+            return self._load(latent.value(latent.prior + some)).responses is not None
 
     def solve(self, c: Array, q: Array, h: float, moment: Moment) -> Array:
         """Return the state at the end of a stage; raise `StepFailed` without a solution."""
