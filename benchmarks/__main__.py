@@ -535,12 +535,15 @@ def soak(
 ) -> Outcome:
     """Run for months with a fault of each kind a week: memory and time of a step must not grow.
 
+    The run ends with a whole week, after the last of its faults.
+
     Example:  python -m benchmarks soak --months 2 --json
     """
-    from benchmarks.soak import MONTH
+    from benchmarks.soak import MONTH, WEEK
     from benchmarks.soak import soak as benchmark
 
-    return benchmark(months * MONTH, share=0.1 if quick else 1.0, progress=True)
+    weeks = round(months * MONTH / WEEK)
+    return benchmark(weeks * WEEK, share=0.1 if quick else 1.0, progress=True)
 
 
 @program.command(quick="The first samples only.")

@@ -50,10 +50,11 @@ from livepde.streams.sources import Rows
 from livepde.streams.table import Column
 
 MONTH = 43_830  # rows, one a minute
-WEEK = 7 * 1440
+WEEK = 7 * 1440  # its last fault ends 2500 rows before it does
 WARM = 10_000  # steps before memory is looked at
 BLOCK = 1000  # steps of one measurement
-FRESH = 50  # steps of the one beside it
+FRESH = 24  # steps of the one beside it, between two of its refits
+BEGUN = 36  # steps before them
 GROWTH = 5.0  # MiB of memory, at most
 SLOWER = 1.2  # last tenth of the steps over the first one, at most
 KEPT = 20.0  # bytes that the journal may grow by with a step: those of the estimates that stay
@@ -280,14 +281,20 @@ def _identifier() -> Identifier:
 def _fresh() -> Callable[[], float]:
     """Return what measures the CPU seconds of a step of an identifier that has just begun."""
     identifier = _identifier()
-    rows = list(islice(_rows(identifier.model), FRESH))
+    rows = list(islice(_rows(identifier.model), BEGUN + FRESH))
+
+    def take(row: Row) -> None:
+        identifier.step(DT * row["t"], {name: row[name] for name in COLUMNS})
+
+    for row in rows[:BEGUN]:
+        take(row)
     begun = identifier.dump()
 
     def measure() -> float:
         identifier.restore(begun)
         since = process_time()
-        for row in rows:
-            identifier.step(DT * row["t"], {name: row[name] for name in COLUMNS})
+        for row in rows[BEGUN:]:
+            take(row)
         return (process_time() - since) / FRESH
 
     return measure

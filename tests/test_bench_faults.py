@@ -154,7 +154,7 @@ def test_soak_in_small(monkeypatch):
     law = partial(lp.SensitivityLaw, refit=lp.laws.Refit(start=4))
     law.scheme = lp.SensitivityLaw.scheme
     monkeypatch.setattr(soak, "SensitivityLaw", law)
-    monkeypatch.setattr(soak, "WARM", 200)
+    monkeypatch.setattr(soak, "WARM", 300)
     monkeypatch.setattr(soak, "BLOCK", 100)
     # All faults in 700 rows, each of a few rows.
     few = {
@@ -173,7 +173,7 @@ def test_soak_in_small(monkeypatch):
     assert checks["steps that failed"].ok
     assert checks["estimates that a reader does not find"].ok
     assert checks["samples lost or doubled"].ok
-    with pytest.raises(lp.errors.RunError, match="at least 400"):
+    with pytest.raises(lp.errors.RunError, match="at least 600"):
         soak.soak(100)
 
 

@@ -39,6 +39,7 @@ DIGEST = 16  # bytes
 START = struct.Struct(f"<8sQ{DIGEST}s")
 ALIGNED = 16  # bytes
 MOST = 1 << 40  # values in one array
+FEW = 4  # descriptions that are kept: each has some 200 KiB, and those of growing states differ
 PLAIN = "biufcU"  # kinds of arrays that are plain numbers or text
 
 
@@ -168,7 +169,7 @@ def _digest(*parts: Any) -> bytes:
     return found.digest()
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=FEW)
 def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) -> bytes:
     """Return header and descriptions as text, cached: those of successive states repeat."""
     for name, kind, _ in described:
@@ -177,7 +178,7 @@ def _text(header: str, described: tuple[tuple[str, str, tuple[int, ...]], ...]) 
     return f"[{header}, {json.dumps(described)}]".encode()
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=FEW)
 def _read(text: bytes) -> tuple[dict[str, Any], list[tuple[str, np.dtype[Any], tuple[int, ...]]]]:
     """Return what `_text` has written, its types checked."""
     header, described = json.loads(text)
