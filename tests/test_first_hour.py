@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy.special import exp1
 
-from benchmarks import ROOT
+from benchmarks import ROOT, first_hour
 from benchmarks.first_hour import FOLDER, WALKS, WELLS, WRITTEN, aquifer, write
+from benchmarks.honest.linear import fine_times
 
 PAGE = (ROOT / "docs" / "first-hour.md").read_text(encoding="utf-8")
 
@@ -55,3 +56,19 @@ def test_each_case_is_one_file_without_a_law() -> None:
     for name in ("furnace.toml", "borehole.toml", "pumping.toml", "wall.toml"):
         case = tomllib.loads((FOLDER / name).read_text(encoding="utf-8"))
         assert not {"law", "steps", "intake"} & set(case)
+
+
+def test_noise_of_the_inputs_of_the_wall_spreads_as_draws_do() -> None:
+    k, C, rows = 0.8, 1.5e6, 60
+    rng, times = np.random.default_rng(0), first_hour.WALL_STEP * np.arange(rows)
+    fine, faces = fine_times(times), first_hour._faces(k, C)
+    noise = rng.standard_normal((1600, rows, 2)) * [first_hour.WALL_FLUX, first_hour.WALL_KELVIN]
+    noise[:, 0] = 0.0  # the covariance has triangles of two intervals only
+    drawn = [
+        faces.respond(
+            np.column_stack([np.interp(fine, times, c) for c in one.T]), first_hour.WALL_STEP
+        )[:, 0]
+        for one in noise
+    ]
+    found = first_hour.wall_noise({"k": k, "C": C}, rows - 1)
+    np.testing.assert_allclose(np.cov(np.array(drawn)[:, 1:].T), found, atol=0.2 * found.max())
