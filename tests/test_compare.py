@@ -324,6 +324,26 @@ def test_an_offset_that_is_estimated_already_is_not_recommended(tmp_path):
     assert (found.setting, found.remedy) == ("", "Check the offset and the position of T_10.")
 
 
+def test_a_stated_start_that_the_first_readings_miss_may_be_uncertain(tmp_path):
+    path = short_rod(tmp_path)
+    first = cases.load(path).prepare().first.z
+    stated = float(np.mean([first[name] for name in ("T_10", "T_30")])) + 5.0
+    settings = parse([f"initial='{stated} degC'"])
+    prepared = cases.load(path, settings=settings).prepare()
+    cause = Cause("initial", "", "", setting='initial="interpolate"')
+    verdict = Verdict.of([Finding("misfit", "caution", "It misfits.", causes=(cause,))])
+    once = with_settings(prepared, verdict)
+    (found,) = once.findings[0].causes
+    assert found.setting == f'initial={{ from = "{stated} degC", std = "10 K" }}'
+    assert found.setting in found.remedy
+    assert with_settings(prepared, once) == once
+    sizes = {"T_10": 0.2, "T_30": 0.2}
+    names = [one.name for one in proposed(prepared, ended("as stated", 0.0, 1.0, errors=sizes))]
+    assert names[0] == "uncertain start"
+    freed = cases.load(path, settings=(settings, parse(found.setting.split("; ")))).prepare()
+    assert len(freed.identifier.problem.initial_errors)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("equation", ROD)
 def test_every_proposed_variant_is_a_case(tmp_path, equation):

@@ -49,7 +49,9 @@ def with_settings(prepared: Prepared, verdict: Verdict) -> Verdict:
 
 
 def _with_remedy(case: Case, cause: Cause, settings: tuple[str, ...]) -> Cause:
-    """Return a cause whose remedy, for an error of a sensor, has the value of its setting."""
+    """Return a cause whose remedy has the setting, for an error of a sensor or of the start."""
+    if cause.kind == "initial" and settings and settings != settings_in(cause.setting):
+        return replace(cause, remedy=f"Specify its uncertainty: `{settings[0]}`.")
     if cause.kind not in KEYS or cause.subject not in case.roles("sensor"):
         return cause
     if settings == settings_in(cause.setting):  # the remedy has the value, and its unit
@@ -74,6 +76,8 @@ def freed(prepared: Prepared, cause: Cause) -> tuple[str, ...]:
         return _of_sensor(case, cause)
     if cause.kind == "exchange":
         return _exchanged(case, cause)
+    if cause.kind == "initial" and (settings := _initial(prepared)):
+        return settings
     return _stated(case, cause)
 
 
@@ -121,6 +125,28 @@ def _exchanged(case: Case, cause: Cause) -> tuple[str, ...]:
         return ()
     pairs = zip(names, columns, strict=True)
     return tuple(channel_setting(name, "column", toml_value(column)) for name, column in pairs)
+
+
+def _initial(prepared: Prepared) -> tuple[str, ...]:
+    """Return the setting of a stated start that is as uncertain as the first readings miss it."""
+    case, stated = prepared.case, prepared.case.spec.initial
+    missed = first_miss(prepared)
+    if stated is None or isinstance(stated, dict) or stated.std is not None or not missed:
+        return ()
+    unit = "K" if (of := case.equation.state.unit) == "degC" else of
+    given = {"from": stated.start, "std": f"{WIDE * missed:.2g} {unit}".strip()}
+    return (f"initial={toml_value(given)}",)
+
+
+def first_miss(prepared: Prepared) -> float:
+    """Return the root mean square of the first readings less the start, 0 if it is no number."""
+    case = prepared.case
+    if case.equation.components or not isinstance(prepared.u0, float):
+        return 0.0
+    given = prepared.first.z if isinstance(prepared.first.z, Mapping) else {}
+    seen = np.array([float(np.ravel(given[name])[0]) for name in case.sensors if name in given])
+    seen = seen[np.isfinite(seen)]
+    return float(np.sqrt(np.mean((seen - prepared.u0) ** 2))) if len(seen) else 0.0
 
 
 def _capacity(case: Case) -> float:

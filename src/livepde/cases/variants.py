@@ -14,7 +14,7 @@ from livepde.cases.case import Prepared, load
 from livepde.cases.case_channels import columns_of
 from livepde.cases.data import clock_of, delays
 from livepde.cases.read import parse, settings_in, toml_key, toml_value
-from livepde.cases.remedies import PLACE, freed, with_settings
+from livepde.cases.remedies import PLACE, first_miss, freed, with_settings
 from livepde.dates import since_1970
 from livepde.errors import CaseError
 from livepde.plots.style import modes_told
@@ -472,6 +472,8 @@ def _process(prepared: Prepared, base: VariantRun) -> Iterator[Variant]:
     error, table = _usual_error(base), prepared.raw
     if not (isinstance(table, DataTable) and len(table) > 1 and error > 0.0):
         return
+    if first_miss(prepared) > error:
+        yield Variant(NAMES["initial"], freed(prepared, Cause("initial", "", "")))
     time = SAMPLES * float(np.median(np.diff(table.t)))
     for kind, size in (("source", error / time), ("loss", 0.1 / time)):
         yield Variant(kind, freed(prepared, Cause(kind, "", "", size=size)))
