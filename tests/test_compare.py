@@ -13,9 +13,10 @@ import pytest
 from commands import bad, call
 from factories import short_rod
 
+from benchmarks.first_hour import FOLDER
 from livepde import cases
 from livepde.cases.read import parse
-from livepde.cases.remedies import NO_SETTING, with_settings
+from livepde.cases.remedies import NO_SETTING, freed, with_settings
 from livepde.cases.variants import (
     LastEstimate,
     Variant,
@@ -340,8 +341,14 @@ def test_a_stated_start_that_the_first_readings_miss_may_be_uncertain(tmp_path):
     sizes = {"T_10": 0.2, "T_30": 0.2}
     names = [one.name for one in proposed(prepared, ended("as stated", 0.0, 1.0, errors=sizes))]
     assert names[0] == "uncertain start"
-    freed = cases.load(path, settings=(settings, parse(found.setting.split("; ")))).prepare()
-    assert len(freed.identifier.problem.initial_errors)
+    again = cases.load(path, settings=(settings, parse(found.setting.split("; ")))).prepare()
+    assert len(again.identifier.problem.initial_errors)
+
+
+def test_the_uncertainty_of_a_start_without_a_unit_is_a_number():
+    case = cases.load(FOLDER / "column.toml", settings=parse(["initial=0.1"]))
+    (setting,) = freed(case.prepare(), Cause("initial", "", ""))
+    assert setting.startswith("initial={ from = 0.1, std = 0.")
 
 
 @pytest.mark.long

@@ -134,7 +134,8 @@ def _initial(prepared: Prepared) -> tuple[str, ...]:
     if stated is None or isinstance(stated, dict) or stated.std is not None or not missed:
         return ()
     unit = "K" if (of := case.equation.state.unit) == "degC" else of
-    given = {"from": stated.start, "std": f"{WIDE * missed:.2g} {unit}".strip()}
+    size = f"{WIDE * missed:.2g}"
+    given = {"from": stated.start, "std": f"{size} {unit}" if unit else float(size)}
     return (f"initial={toml_value(given)}",)
 
 
