@@ -57,7 +57,7 @@ FRESH = 24  # steps of the one beside it, between two of its refits
 BEGUN = 36  # steps before them
 GROWTH = 5.0  # MiB of memory, at most
 SLOWER = 1.2  # last tenth of the steps over the first one, at most
-KEPT = 20.0  # bytes that the journal may grow by with a step: those of the estimates that stay
+KEPT = 1.5  # times the numbers of the estimates that stay, by which the journal may grow
 LOG = 32.0  # MiB of the write-ahead log, at most
 RETAINED = 20_000  # samples of which all is kept
 EVERY = 24  # of older estimates one in so many
@@ -198,20 +198,30 @@ def soak(steps: int, *, share: float = 1.0, progress: bool = False) -> Outcome:
             )
             live.run()
             kept, accepted, counts = len(journal), journal.accepted, journal.counts
+            layout = journal.layout
         with Journal.open(path) as after:
             read = sum(1 for _ in after)
     last = identifier.estimate().parameters
     error = max(abs(last[name][0] / true - 1.0) for name, true in (("k", K), ("loss", LOSS)))
     lost = abs(plant.right - accepted)
-    outcome = _outcome(meter, steps, kept - read, error, lost, share)
+    numbers = sum(map(len, (layout.numbers, layout.sensors)))
+    outcome = _outcome(meter, steps, kept - read, error, numbers=numbers, lost=lost, share=share)
     told = [(kind, channel, number) for (kind, channel), number in sorted(counts.items())]
     table = Table("What was counted", ("kind", "channel", "number"), told)
     return replace(outcome, tables=[*outcome.tables, table])
 
 
 def _outcome(
-    meter: Meter, steps: int, unread: int, error: float, lost: int = 0, share: float = 1.0
+    meter: Meter,
+    steps: int,
+    unread: int,
+    error: float,
+    *,
+    numbers: int,
+    lost: int = 0,
+    share: float = 1.0,
 ) -> Outcome:
+    """Return the outcome; `numbers` are those of an estimate in the journal."""
     warm, retained = round(share * WARM), round(share * RETAINED)
     found = [reading for reading in meter.readings if reading.steps >= warm]
     tenth = max(len(found) // 10, 1)
@@ -244,7 +254,8 @@ def _outcome(
             for r in shown
         ],
     )
-    per_step = (last.file - middle.file) / (last.steps - middle.steps)
+    stays = 8.0 * numbers / EVERY  # bytes of a step
+    kept = (last.file - middle.file) / (last.steps - middle.steps) / stays
     checks = [
         Check(
             f"memory: growth after {warm} steps (MiB)",
@@ -255,7 +266,7 @@ def _outcome(
         Check(
             "time of a step over a fresh one: last tenth / first tenth", late / early, SLOWER, "<="
         ),
-        Check("journal: growth in the second half (bytes a step)", per_step, KEPT, "<="),
+        Check("journal: growth in the second half over the estimates that stay", kept, KEPT, "<="),
         Check("write-ahead log: largest (MiB)", max(r.log for r in found) / MIB, LOG, "<="),
         Check("steps that failed", meter.failed, 0, "<="),
         Check("estimates that a reader does not find", unread, 0, "<="),
