@@ -21,12 +21,19 @@ from livepde.stepping.member_stage import SeparateStages
 MESH = lp.interval(0.0, 1.0, 14)
 
 
-def rod(ends: Any, f: Any = 0.0, A: Any = None, element: Any = None, inputs: Any = ()) -> lp.Model:
+def rod(
+    ends: Any,
+    f: Any = 0.0,
+    A: Any = None,
+    element: Any = None,
+    inputs: Any = (),
+    B: Any = lambda u, v, x: 0.1 * u * v,
+) -> lp.Model:
     return lp.Model(
         lp.Field(MESH, element or ElementLineP1(), dirichlet=ends),
         {"a": lp.Normal(0.2, 0.1), "s": lp.Normal(0.5, 0.2)},
         A=A or (lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) - q.s * v * x[0]),
-        B=lambda u, v, x: 0.1 * u * v,
+        B=B,
         f=f,
         inputs=inputs,
     )
@@ -47,6 +54,26 @@ MODELS = {
             lambda q, _, v, x: -q.s * x.inputs["T_0"] * v,
         ],
         inputs=["T_0"],
+    ),
+    "unknown flow of an input": rod(
+        {"left": lp.Channel("T_0"), "right": lp.Channel("T_1")},
+        A=[
+            lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)),
+            lambda q, u, v, x: q.s * (1.0 + 0.1 * x.inputs["w"]) * lp.grad(u)[0] * v,
+            lambda q, _, v, x: -q.s * x.inputs["w"] * v,
+        ],
+        inputs=["w"],
+    ),
+    "known flow of an input": rod(
+        {"left": 20.0, "right": lp.Channel("T_1")},
+        A=lambda q, u, v, x: q.a * lp.dot(lp.grad(u), lp.grad(v)) + q.s * (u - x.inputs["T_2"]) * v,
+        B=lambda u, v, x: 0.01 * x.inputs["w"] * (lp.grad(u)[0] + u) * v,
+        inputs=["w", "T_2"],
+    ),
+    "exchange at an end, by an input": rod(
+        {"left": lp.Channel("T_0")},
+        B=lp.On("right", lambda u, v, x: 0.01 * x.inputs["h"] * (u - 20.0) * v),
+        inputs=["h"],
     ),
     "quadratic elements": rod({"left": 1.0, "right": lp.Channel("T_1")}, element=ElementLineP2()),
 }
@@ -77,6 +104,14 @@ def test_a_banded_stage_gives_the_state_and_tangents_of_each_member(name: str, m
         kept = KeptFactors.none(1).member(0)
         wanted, _ = forward.advance(columns[:, k].T, q[k], directions[k].T, 0.1, moment, kept)
         np.testing.assert_allclose(new[:, k].T, wanted, rtol=0, atol=1e-11 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize(
+    "flow", [lambda x: abs(x.inputs["w"]), lambda x: x.t, lambda x: x.t * x.inputs["w"]]
+)
+def test_matrices_that_time_or_bent_inputs_change_are_not_kept(flow: Any):
+    model = rod({"left": 0.0}, B=lambda u, v, x: flow(x) * lp.grad(u)[0] * v, inputs=["w"])
+    assert "depend on time, or on inputs other than linearly" in BandedStage.refuses(model)
 
 
 def test_stages_that_share_factors_have_their_own_directions():

@@ -71,13 +71,15 @@ class DrivenVector:
         base, changes = self.assembled()
         return None if self._timed() else (base[None], changes)
 
+    def without_inputs(self) -> Array:
+        """Return the vector at time 0 without inputs, (n,)."""
+        return self._at(0.0, np.zeros(len(self.channels)))
+
     def assembled(self) -> tuple[Array, Array]:
         """Return vector without inputs, (n,), and derivative, as if it were affine in them."""
-        zero = np.zeros(len(self.channels))
-        base = self._at(0.0, zero)
-        units = LARGE * np.eye(len(zero))
+        base, units = self.without_inputs(), LARGE * np.eye(len(self.channels))
         changes = [(self._at(0.0, unit) - base) / LARGE for unit in units]
-        return base, np.reshape(changes, (len(zero), len(base)))
+        return base, np.reshape(changes, (len(units), len(base)))
 
     @cached_property
     def zero(self) -> bool:

@@ -6,14 +6,14 @@ Column arrays have the shape (1 + r, members, n): the state and r tangents of ea
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from livepde.fem import Channel, Form, Inputs, Moment
+from livepde.fem import Channel, Form, Moment
 from livepde.linalg import (
     Array,
     Assembler,
@@ -188,16 +188,29 @@ class BandedStep(NamedTuple):
     """
 
     factor: BlockFactor
+    h: float
     amounts: Array
     slopes: Array | None
     forced: tuple[Array, Array] | None
 
 
-class BandedStage(MemberStage):
-    """Batched stage of models whose matrices are constant, banded and affine in q.
+class MatrixTerm(NamedTuple):
+    """One matrix of a stage, by its entries: part of A_j, or of B for `unknown` = -1.
 
-    The matrices M/h + B and A_j are assembled once. The matrices of all members are the diagonal
-    blocks of one banded matrix, which is factorised by one LAPACK call.
+    It is multiplied by the input of a channel, or is the part without inputs for `channel` = -1.
+    """
+
+    unknown: int
+    channel: int
+    data: Array
+
+
+class BandedStage(MemberStage):
+    """Batched stage of models whose matrices are banded, and affine in q and in the inputs.
+
+    The matrices M, B and A_j are assembled once, those of each input apart: the flow that carries
+    heat, say. The matrices of all members are the diagonal blocks of one banded matrix, which is
+    factorised by one LAPACK call.
     """
 
     def __init__(self, model: Model) -> None:
@@ -210,24 +223,28 @@ class BandedStage(MemberStage):
         rows, cols = self.pattern.rows, self.pattern.indices
         # Masks of the entries between free coefficients, and of free rows with Dirichlet columns.
         inner, outer = free[rows] * free[cols], free[rows] * (1.0 - free[cols])
-        # The matrices depend on neither time nor inputs; the forms still need some moment as
-        # argument.
-        some = Moment(0.0, Inputs(dict.fromkeys(model.channels, 0.0)))
         mass = maps["M"] @ model.mass.data
-        rest = maps["B"] @ model.form_B.data("v", "u", some, u=zero)
-        slopes = [maps["A"] @ form.data("v", "u", some, u=zero, q=q) for q in units]
         self._mass = row_product(self._stacked(mass * free[rows]))
+        # Those without inputs first: one of each unknown, then of B.
+        terms = _matrix_terms(model, maps)
+        self._terms = terms[len(units) + 1 :]
+        slopes = [term.data for term in terms if term.unknown >= 0]
         self._slopes = row_product(self._stacked(*(slope * inner for slope in slopes)))
         # Fixed coefficients have rows of the identity, multiplied by h like all of the rest.
         ones = np.where(rows == cols, 1.0 - free[rows], 0.0)
-        parts = np.array([*(slope * inner for slope in slopes), rest * inner + ones, mass * inner])
-        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *parts)
-        # The matrix of a stage is the sum of these with weights h q, h and 1.
-        self._bands = self._blocks.band(parts)
+        parts = [term.data * inner for term in terms]
+        parts[len(units)] = parts[len(units)] + ones
+        every = np.array([*parts, mass * inner])
+        self._blocks = BandedBlocks.of(BandedSolver(self.pattern), *every)
+        # The matrix of a stage is the sum of these with weights h q, h, those times inputs, and 1.
+        self._bands = self._blocks.band(every)
         # The couplings of free coefficients to Dirichlet values are moved to the right-hand side.
         # They have few entries, and stay sparse: their products are formed once.
-        mass_edge, rest_edge = self._stacked(mass * outer), self._stacked(rest * outer)
-        slope_edge = self._stacked(*(slope * outer for slope in slopes))
+        mass_edge = self._stacked(mass * outer)
+        rest_edge = self._stacked(terms[len(units)].data * outer)
+        slope_edge = self._stacked(*(term.data * outer for term in terms[: len(units)]))
+        edges = ((term, self._stacked(term.data * outer)) for term in self._terms)
+        self._edges = [(term, edge) for term, edge in edges if edge.nnz]
 
         def boundary(moment: Moment) -> Array:
             return model.impose(zero, moment)
@@ -258,8 +275,8 @@ class BandedStage(MemberStage):
             return "the model is not affine in its state and its unknowns"
         if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
             return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
-        if not model.steady:
-            return "the matrices of the model depend on time or inputs"
+        if not model.steady and not _affine_in_inputs(model):
+            return "the matrices of the model depend on time, or on inputs other than linearly"
         if not isinstance(analyse(_analysed(model)[0]), BandedSolver):
             return "the matrices of the model are not banded: the mesh has more than one dimension"
         return ""
@@ -289,6 +306,7 @@ class BandedStage(MemberStage):
         # columns.
         (size, n), at = columns.shape[1:], stage.at
         step = stage.factors.get(stage.h) or self._begin(stage)
+        inputs = at.inputs
         if size == 1 and len(step.factor.bad):
             raise StepFailed("singular", f"the {n} by {n} matrix is singular or not finite")
         # BLAS may round products of other shapes differently, so the separate columns share no
@@ -305,10 +323,12 @@ class BandedStage(MemberStage):
             base, changes = step.forced
             u += base
             if len(changes):
-                u += at.inputs[:, : len(changes)].dot(changes)
+                u += inputs[:, : len(changes)].dot(changes)
         else:
             u += stage.h * self._load(at) - self._mass_boundary(at)
         offset = None if self._offset.zero else self._offset(at).reshape(-1, len(step.amounts.T), n)
+        if self._edges:
+            offset = self._along_edges(u, offset, step, at)
         if offset is not None:
             u -= (step.amounts[:, None] @ offset)[:, 0]
         # The state first: the tangents need it.
@@ -317,6 +337,8 @@ class BandedStage(MemberStage):
             # A(u) e_j = A_j u + offset_j of each unknown, (members, unknowns, n), drives the
             # tangents.
             driven = self._slopes(u).reshape(size, -1, n)
+            if self._terms:
+                driven = self._by_inputs(driven, step, inputs)
             if offset is not None:
                 driven = driven + offset
             along, chosen = stage.h * stage.directions, together // size - 1
@@ -339,13 +361,44 @@ class BandedStage(MemberStage):
         if coefficients is not None:
             slopes = np.array([coefficients.slopes(q) for q in unknowns])
             unknowns = np.array([coefficients.value(q) for q in unknowns])
-        weights = np.empty((len(unknowns), unknowns.shape[1] + 2))
-        amounts = np.multiply(unknowns, h, out=weights[:, :-2])
-        weights[:, -2], weights[:, -1] = h, 1.0
+        count = unknowns.shape[1]
+        weights = np.empty((len(unknowns), count + len(self._terms) + 2))
+        amounts = np.multiply(unknowns, h, out=weights[:, :count])
+        weights[:, count], weights[:, -1] = h, 1.0
+        for place, term in enumerate(self._terms, count + 1):
+            weights[:, place] = weights[:, term.unknown if term.unknown >= 0 else count]
+            weights[:, place] *= stage.at.inputs[:, term.channel]
         factor = self._blocks.factorise(weights.dot(self._bands))
-        step = BandedStep(factor, amounts, slopes, self._forced(h))
-        stage.factors[h] = step
+        step = BandedStep(factor, h, amounts, slopes, self._forced(h))
+        if not self._terms:  # else it is that of the inputs of this stage alone
+            stage.factors[h] = step
         return step
+
+    def _along_edges(
+        self, u: Array, offset: Array | None, step: BandedStep, at: Moments
+    ) -> Array | None:
+        """Return the offset with what inputs times boundary values add to it, and add to u."""
+        h, boundary = step.h, self._boundary(at)
+        members, unknowns = step.amounts.shape
+        offset = None if offset is None else offset.repeat(members // len(offset), axis=0)
+        for term, edge in self._edges:
+            drawn = at.inputs[:, term.channel, None] * (edge @ boundary.T).T
+            if term.unknown < 0:
+                u -= h * drawn
+                continue
+            if offset is None:
+                offset = np.zeros((members, unknowns, u.shape[1]))
+            offset[:, term.unknown] += drawn
+        return offset
+
+    def _by_inputs(self, driven: Array, step: BandedStep, inputs: Array) -> Array:
+        """Return A(u) e_j of each unknown from its parts, (members, unknowns, n)."""
+        count = step.amounts.shape[1]
+        found, more = driven[:, :count].copy(), iter(range(count, driven.shape[1]))
+        for term in self._terms:
+            if term.unknown >= 0:
+                found[:, term.unknown] += inputs[:, term.channel, None] * driven[:, next(more)]
+        return found
 
     def _forced(self, h: float) -> tuple[Array, Array] | None:
         """Return what drives the state in a stage, (1, n), and its derivative in the inputs.
@@ -366,6 +419,44 @@ def _along(directions: Array, driven: Array) -> Array:
         return np.asarray(directions[0].dot(driven[0]))
     found: Array = (directions @ driven).transpose(1, 0, 2)
     return found.reshape(-1, driven.shape[2])
+
+
+def _entries(model: Model, form: Form, **values: Array) -> DrivenVector:
+    """Return the entries of the matrix of a form in u, as the inputs drive them."""
+    zero = np.zeros(model.X.dim)
+
+    def data(moment: Moment) -> Array:
+        return form.data("v", "u", moment, u=zero, **values)
+
+    return DrivenVector(data, model.channels, lambda: "t" in form.uses)
+
+
+def _affine_in_inputs(model: Model) -> bool:
+    """Return whether the matrices of a model are affine in its inputs, and ignore the time."""
+    A, B = model.linear_A, model.form_B
+    drawn = np.random.default_rng(4).standard_normal(A.spaces["q"].dim)
+    return (A.steady or _entries(model, A, q=drawn).responses is not None) and (
+        B.steady or _entries(model, B).responses is not None
+    )
+
+
+def _matrix_terms(model: Model, maps: Mapping[str, sp.csr_array]) -> list[MatrixTerm]:
+    """Return the matrices of A_j and B: those without inputs, then those of inputs that matter."""
+    A, bases, more = model.linear_A, list[MatrixTerm](), list[MatrixTerm]()
+    units = enumerate(np.eye(A.spaces["q"].dim))
+    parts = [(j, A, maps["A"], _entries(model, A, q=q)) for j, q in units]
+    for unknown, form, place, entries in (
+        *parts,
+        (-1, model.form_B, maps["B"], _entries(model, model.form_B)),
+    ):
+        if form.steady:
+            bases.append(MatrixTerm(unknown, -1, place @ entries.without_inputs()))
+            continue
+        base, changes = entries.assembled()
+        bases.append(MatrixTerm(unknown, -1, place @ base))
+        each = (MatrixTerm(unknown, c, place @ change) for c, change in enumerate(changes))
+        more += [term for term in each if term.data.any()]
+    return bases + more
 
 
 def _analysed(model: Model) -> tuple[Pattern, dict[str, sp.csr_array]]:
