@@ -70,6 +70,15 @@ MODELS = {
         B=lambda u, v, x: 0.01 * x.inputs["w"] * (lp.grad(u)[0] + u) * v,
         inputs=["w", "T_2"],
     ),
+    "known parts of A": rod(
+        {"left": lp.Channel("T_0"), "right": 1.0},
+        A=lambda q, u, v, x: (
+            (1.0 + q.a) * lp.dot(lp.grad(u), lp.grad(v))
+            + (q.s + 0.01 * x.inputs["w"]) * lp.grad(u)[0] * v
+            - (2.0 + x.inputs["w"] * q.s) * v
+        ),
+        inputs=["w"],
+    ),
     "exchange at an end, by an input": rod(
         {"left": lp.Channel("T_0")},
         B=lp.On("right", lambda u, v, x: 0.01 * x.inputs["h"] * (u - 20.0) * v),

@@ -320,6 +320,13 @@ class Form(FormMatrices):
         """True if the form is affine in its nonlinear argument (probed at several magnitudes)."""
         return self.nonlinear is None or self._affine(self.nonlinear, homogeneous=False)
 
+    @cached_property
+    def affine_in_parameter(self) -> bool:
+        """True if the form is linear in the parameter but for a part without it (probed alike)."""
+        if self.linear_in_parameter or self.parameter is None:
+            return True
+        return self._affine(self.parameter, homogeneous=False)
+
     def _affine(self, slot: str, homogeneous: bool) -> bool:
         """Return True if the form is affine (linear, if homogeneous) in an argument."""
         # Probing has a fixed seed: whether a form counts as affine must not differ between two

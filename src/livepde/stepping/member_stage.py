@@ -6,8 +6,9 @@ Column arrays have the shape (1 + r, members, n): the state and r tangents of ea
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +28,7 @@ from livepde.linalg import (
     row_product,
 )
 from livepde.model import Model
-from livepde.stepping.driven_vector import DrivenVector
+from livepde.stepping.driven_vector import LARGE, DrivenVector
 from livepde.stepping.forward import ForwardStage
 from livepde.stepping.interval import Moments
 from livepde.stepping.newton import Kept, StepFailed
@@ -216,8 +217,8 @@ class BandedStage(MemberStage):
     def __init__(self, model: Model) -> None:
         self.model = model
         form, zero, free = model.linear_A, np.zeros(model.X.dim), model.X.free
-        known = (int, float, Channel)
-        fixed_in_time = all(isinstance(value, known) for value in model.boundary_values)
+        timeless = (int, float, Channel)
+        fixed_in_time = all(isinstance(value, timeless) for value in model.boundary_values)
         units = np.eye(form.spaces["q"].dim)
         self.pattern, maps = _analysed(model)
         rows, cols = self.pattern.rows, self.pattern.indices
@@ -250,12 +251,17 @@ class BandedStage(MemberStage):
             return model.impose(zero, moment)
 
         def load(moment: Moment) -> Array:
-            known = (model.form_F.vector("v", moment) - model.B(zero, moment)) * free
-            return np.asarray(known - rest_edge @ boundary(moment))
+            known = model.form_F.vector("v", moment) - model.B(zero, moment)
+            if not form.linear_in_parameter:
+                known = known - form.vector("v", moment, q=0.0 * units[0], u=zero)
+            return np.asarray(known * free - rest_edge @ boundary(moment))
 
         def offset(moment: Moment) -> Array:
-            at_zero = [form.vector("v", moment, q=q, u=zero) * free for q in units]
-            return np.asarray(np.concatenate(at_zero) + slope_edge @ boundary(moment))
+            def at_zero(q: Array) -> Array:
+                return form.vector("v", moment, q=q, u=zero)
+
+            each = [_along(form, q, at_zero) * free for q in units]
+            return np.asarray(np.concatenate(each) + slope_edge @ boundary(moment))
 
         def driven(vector: Callable[[Moment], Array], *forms: Form) -> DrivenVector:
             def timed() -> bool:
@@ -265,19 +271,21 @@ class BandedStage(MemberStage):
 
         self._boundary = driven(boundary)
         self._mass_boundary = driven(lambda moment: mass_edge @ boundary(moment))
-        self._load = driven(load, model.form_F, model.form_B)
+        known = () if form.linear_in_parameter else (form,)
+        self._load = driven(load, model.form_F, model.form_B, *known)
         self._offset = driven(offset, form)
 
     @staticmethod
     def refuses(model: Model) -> str:
         """Return the reason why a model does not fit this stage; empty if it fits."""
-        if not (model.linear_A.linear_in_parameter and model.affine):
+        if not (model.linear_A.affine_in_parameter and model.affine):
             return "the model is not affine in its state and its unknowns"
         if model.linear_A.spaces["q"].dim > MOST_UNKNOWNS:
             return f"there are more than {MOST_UNKNOWNS} unknown coefficients"
-        if not model.steady and not _affine_in_inputs(model):
+        pattern, maps = _analysed(model)
+        if not (model.steady or all(each.responses for each in _matrices(model, maps))):
             return "the matrices of the model depend on time, or on inputs other than linearly"
-        if not isinstance(analyse(_analysed(model)[0]), BandedSolver):
+        if not isinstance(analyse(pattern), BandedSolver):
             return "the matrices of the model are not banded: the mesh has more than one dimension"
         return ""
 
@@ -345,9 +353,9 @@ class BandedStage(MemberStage):
             if step.slopes is not None:
                 along = along @ step.slopes.transpose(0, 2, 1)
             if chosen:
-                known[size:together] -= _along(along[:, :chosen], driven)
+                known[size:together] -= _sums_along(along[:, :chosen], driven)
             if stage.apart:
-                known[together:] -= _along(along[:, chosen:], driven)
+                known[together:] -= _sums_along(along[:, chosen:], driven)
             new[1:] = step.factor.solve(new[1:])
         if not self._boundary.zero:
             u += self._boundary(at)
@@ -413,7 +421,7 @@ class BandedStage(MemberStage):
         return h * load[0] - boundary[0], h * load[1] - boundary[1]
 
 
-def _along(directions: Array, driven: Array) -> Array:
+def _sums_along(directions: Array, driven: Array) -> Array:
     """Return sums of what drives the tangents along their directions, (r * members, n)."""
     if len(driven) == 1:  # a product of stacks costs more
         return np.asarray(directions[0].dot(driven[0]))
@@ -421,40 +429,49 @@ def _along(directions: Array, driven: Array) -> Array:
     return found.reshape(-1, driven.shape[2])
 
 
-def _entries(model: Model, form: Form, **values: Array) -> DrivenVector:
-    """Return the entries of the matrix of a form in u, as the inputs drive them."""
-    zero = np.zeros(model.X.dim)
+def _along(form: Form, unit: Array, of: Callable[[Array], Array]) -> Array:
+    """Return the change of what is affine in q with one of the unknowns, `unit` a row of ones.
 
-    def data(moment: Moment) -> Array:
-        return form.data("v", "u", moment, u=zero, **values)
+    Where A has a part without unknowns it is a difference, at values so large that it loses none
+    of its digits.
+    """
+    if form.linear_in_parameter:
+        return of(unit)
+    return (of(LARGE * unit) - of(0.0 * unit)) / LARGE
 
-    return DrivenVector(data, model.channels, lambda: "t" in form.uses)
 
+def _matrices(model: Model, maps: Mapping[str, sp.csr_array]) -> Iterator[DrivenVector]:
+    """Iterate over the entries of A_j and B as the inputs drive them; B has what A knows."""
+    A, B, zero = model.linear_A, model.form_B, np.zeros(model.X.dim)
+    units = np.eye(A.spaces["q"].dim)
 
-def _affine_in_inputs(model: Model) -> bool:
-    """Return whether the matrices of a model are affine in its inputs, and ignore the time."""
-    A, B = model.linear_A, model.form_B
-    drawn = np.random.default_rng(4).standard_normal(A.spaces["q"].dim)
-    return (A.steady or _entries(model, A, q=drawn).responses is not None) and (
-        B.steady or _entries(model, B).responses is not None
-    )
+    def slope(moment: Moment, unit: Array) -> Array:
+        data = _along(A, unit, lambda q: A.data("v", "u", moment, u=zero, q=q))
+        return np.asarray(maps["A"] @ data)
+
+    def rest(moment: Moment) -> Array:
+        found = maps["B"] @ B.data("v", "u", moment, u=zero)
+        if not A.linear_in_parameter:
+            found = found + maps["A"] @ A.data("v", "u", moment, u=zero, q=0.0 * units[0])
+        return np.asarray(found)
+
+    for unit in units:
+        yield DrivenVector(partial(slope, unit=unit), model.channels, lambda: "t" in A.uses)
+    uses = B.uses if A.linear_in_parameter else A.uses | B.uses
+    yield DrivenVector(rest, model.channels, lambda: "t" in uses)
 
 
 def _matrix_terms(model: Model, maps: Mapping[str, sp.csr_array]) -> list[MatrixTerm]:
     """Return the matrices of A_j and B: those without inputs, then those of inputs that matter."""
-    A, bases, more = model.linear_A, list[MatrixTerm](), list[MatrixTerm]()
-    units = enumerate(np.eye(A.spaces["q"].dim))
-    parts = [(j, A, maps["A"], _entries(model, A, q=q)) for j, q in units]
-    for unknown, form, place, entries in (
-        *parts,
-        (-1, model.form_B, maps["B"], _entries(model, model.form_B)),
-    ):
-        if form.steady:
-            bases.append(MatrixTerm(unknown, -1, place @ entries.without_inputs()))
+    bases, more = list[MatrixTerm](), list[MatrixTerm]()
+    every = list(_matrices(model, maps))
+    for unknown, entries in zip((*range(len(every) - 1), -1), every, strict=True):
+        if model.steady:
+            bases.append(MatrixTerm(unknown, -1, entries.without_inputs()))
             continue
         base, changes = entries.assembled()
-        bases.append(MatrixTerm(unknown, -1, place @ base))
-        each = (MatrixTerm(unknown, c, place @ change) for c, change in enumerate(changes))
+        bases.append(MatrixTerm(unknown, -1, base))
+        each = (MatrixTerm(unknown, c, change) for c, change in enumerate(changes))
         more += [term for term in each if term.data.any()]
     return bases + more
 
