@@ -27,7 +27,14 @@ from livepde.laws.filter_state import FilterState, along, extended, with_rows
 from livepde.laws.law import Problem
 from livepde.laws.member_arrays import changed, join, product, put, take
 from livepde.laws.member_sensors import Anchor, MemberSensors
-from livepde.laws.noise_rows import NoiseRows, after_pause, grades, pieces, with_input_noise
+from livepde.laws.noise_rows import (
+    NoiseRows,
+    after_pause,
+    grades,
+    lines,
+    pieces,
+    with_input_noise,
+)
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
 from livepde.linalg import Array, IntArray, Mask
@@ -107,6 +114,22 @@ class Filter:
     def span(self, interval: Interval) -> Span:
         """Return the interval of one process as that of its one member."""
         return Span.of(interval.driven(self.problem.control.held), self.problem.channels)
+
+    @cached_property
+    def _driving(self) -> IntArray:
+        """Columns of the channels that drive the model as lines."""
+        channels = self.problem.channels
+        return np.array([channels.index(name) for name in lines(self.problem)], dtype=np.int64)
+
+    def blind(self, span: Span) -> Mask | None:
+        """Return for which members an input was not read in a span, (members,); None: for none.
+
+        What the innovations tell then may be what that input has done.
+        """
+        if span.gaps is None:
+            return None
+        found: Mask = np.asarray((span.gaps[:, :, self._driving] > 0.0).any(axis=(1, 2)))
+        return found if np.count_nonzero(found) else None
 
     def noise_of(self, x: FilterState, z: Span | Interval) -> Array:
         """Return the standard deviation of each reading at the end, shape (members, sensors).

@@ -22,6 +22,7 @@ from livepde.verdict import Ledger
 
 PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # intervals before which none is usual
+FORGOTTEN = 50.0  # intervals after which a long one is hardly usual any more
 SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 
@@ -34,7 +35,9 @@ class InputHistory:
     low: Array
     high: Array
     steepest: Array
-    pace: Array  # longest usual interval, shape (members,); 0 before
+    # Longest usual interval, which fades while shorter ones follow: a pause a week is no pace.
+    # Shape (members,); 0 before.
+    pace: Array
     count: Array  # intervals so far, at most `SETTLED`, shape (members,)
     pause: Mask  # whether the last interval was a pause, shape (members,)
 
@@ -67,7 +70,7 @@ class InputHistory:
             low=np.fmin(self.low, last),
             high=np.fmax(self.high, last),
             steepest=np.fmax(self.steepest, slopes),
-            pace=np.maximum(pace, length),
+            pace=np.maximum(pace + (length - pace) / FORGOTTEN, length),
             count=np.minimum(self.count + 1.0, SETTLED),
             pause=pause,
         )
@@ -88,7 +91,7 @@ def pauses(times: Sequence[float] | Array) -> list[int]:
         if k >= SETTLED and length > PAUSE * pace:
             found.append(k + 1)
             length = PAUSE * pace
-        pace = max(pace, length)
+        pace = max(pace + (length - pace) / FORGOTTEN, length)
     return found
 
 

@@ -147,6 +147,8 @@ def _iterated(work: SensitivityWork, state: SensitivityState) -> tuple[Sensitivi
         # as much again.
         searched = samples.unaccompanied
         best = iterated_smoother(searched)
+        if best is not None and not searched.believable(best):
+            best = None  # such a trajectory has not found the samples but lost them
         moved = math.inf if best is None else apart(work.filter, best.x, state.now)
         found = None if best is None else best.x
         if best is not None and searched is not samples:
@@ -286,6 +288,13 @@ class _Samples:
         """
         readings = sum(int(np.isfinite(interval.z1).sum()) for interval in self.intervals)
         return one.misfit <= readings + 3.0 * math.sqrt(2.0 * readings)
+
+    def believable(self, one: _Pass) -> bool:
+        """True if a pass ends as near to the prior at its end as unknowns may be (`within`)."""
+        reduction = self.work.filter.reduction
+        parts = reduction.problem.model.latent.parts.values()
+        last = reduction.in_prior_units(one.smoothed[-1][None, None], one.x.age)
+        return bool(np.abs(last).max() <= max(item.unknown.within for item in parts))
 
     @property
     def reached(self) -> Array:

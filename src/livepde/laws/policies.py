@@ -158,6 +158,16 @@ class Watch:
         usual = (self.repeats + 1.0) / (self.seen[:, None] + 2.0)
         return np.asarray(run * np.log(usual) < np.log(CHANCE))
 
+    def interrupted(self, which: Mask, rest: int) -> Watch:
+        """Return the value in which some members forget their sums, and rest for some samples."""
+        rows = which[:, None]
+        return replace(
+            self,
+            squares=np.where(rows, 0.0, self.squares),
+            counts=np.where(rows, 0.0, self.counts),
+            resting=np.where(which, np.maximum(self.resting, rest), self.resting),
+        )
+
     def add(self, e: Array, opening: Mask, refused: IntArray | None = None) -> Watch:
         """Return the value after normalised innovations (members, sensors), NaN where missing.
 
@@ -266,6 +276,7 @@ class Jumps:
         e: Array,
         refused: IntArray | None = None,
         run: IntArray | None = None,
+        blind: Mask | None = None,
     ) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
@@ -275,18 +286,18 @@ class Jumps:
             Normalised innovations, shape (members, sensors), NaN where missing.
         refused, run
             As for `Watch.add` and `Watch.repeating`; None: no reading repeats one.
+        blind
+            Members with an input that was not read, (members,): what it did is no jump of an
+            unknown, and moves the state for some time; None: there are none.
         """
+        if blind is not None:
+            watch, e = watch.interrupted(blind, self.settle), np.where(blind[:, None], np.nan, e)
         if run is not None and np.count_nonzero(run) + np.count_nonzero(watch.stuck):
             stuck = watch.repeating(run)
             # The sums contain the first reading of the repeated value, and are cleared.
-            begins = (stuck & ~watch.stuck).any(axis=1, keepdims=True)
-            watch = replace(
-                watch,
-                squares=np.where(begins, 0.0, watch.squares),
-                counts=np.where(begins, 0.0, watch.counts),
-                repeats=watch.repeats + ((run > 0) & ~stuck),
-                stuck=stuck,
-            )
+            begins = np.asarray((stuck & ~watch.stuck).any(axis=1))
+            repeats = watch.repeats + ((run > 0) & ~stuck)
+            watch = replace(watch.interrupted(begins, 0), repeats=repeats, stuck=stuck)
             e = np.where(stuck, np.nan, e)
         new = watch.add(e, watch.seen < self.settle, refused)
         early = watch.resting > 0  # the first linearisations are poor: what they miss is no jump
@@ -317,13 +328,7 @@ class Jumps:
             alarm = unlikely(sums / new.scatters[:, lengths] ** 2)
             alarm &= ~early & (new.counts[:, 0] > 0.0)
         if alarm.any():
-            clear = alarm[:, None]
-            new = replace(
-                new,
-                squares=np.where(clear, 0.0, new.squares),
-                counts=np.where(clear, 0.0, new.counts),
-                resting=np.where(alarm, self.settle, new.resting),
-            )
+            new = new.interrupted(alarm, self.settle)
         return new, alarm
 
     def onset(self, watch: Watch, e: Array) -> int:
