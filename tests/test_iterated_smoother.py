@@ -1,5 +1,7 @@
 """The iterated start: exact for linear problems, and what it mends for others."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from factories import truth
@@ -97,9 +99,15 @@ def test_a_moving_unknown_is_smoothed_as_by_the_filter_of_all_samples():
     np.testing.assert_allclose(found[1:], exact[0], atol=0.1 * growth / prior_std + 0.02)
 
 
+def lost(samples):
+    one = samples.about(None)
+    return replace(one, smoothed=one.smoothed + 1e3)
+
+
 @pytest.mark.slow
-def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch):
-    monkeypatch.setattr(iterated_smoother, "iterated_smoother", lambda samples: None)
+@pytest.mark.parametrize("search", [lambda samples: None, lost], ids=["none", "far away"])
+def test_a_trajectory_that_cannot_be_followed_leaves_the_plain_filter(monkeypatch, search):
+    monkeypatch.setattr(iterated_smoother, "iterated_smoother", search)
     model = sourced()
     samples = list(readings(model, [1.5]))
     plain = ends(model, lp.SensitivityLaw(**FADING, refit=None), samples)[-1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from factories import driven_rod, filter_alone, line, readings
 
 import livepde as lp
+from benchmarks import soak
 from livepde.laws.policies import Jumps
 
 pytestmark = pytest.mark.slow
@@ -173,3 +175,31 @@ def test_a_sensor_that_stays_stuck_hides_no_slow_evidence_of_the_others():
         alarms += [k] * bool(alarm[0])
     assert alarms
     assert 220 <= alarms[0] < 245
+
+
+def test_an_input_that_is_not_read_is_no_jump():
+    """A boundary is held for 30 samples while it moves: readings tell of it, not of unknowns."""
+    identifier = soak._identifier()
+    alarms = []
+    for row in islice(soak._rows(identifier.model), 700):
+        k = row["t"]
+        z = {name: row[name] for name in soak.COLUMNS}
+        z["left"] = None if 300 <= k < 330 else z["left"]
+        estimate = identifier.step(soak.DT * k, z)
+        alarms += [k] * (estimate.diagnostics.jump > 0.0)
+    assert not alarms
+    for name, truth in (("k", soak.K), ("loss", soak.LOSS)):
+        value, std = estimate.parameters[name]
+        assert abs(value - truth) < 3.0 * std < truth
+
+
+def test_innovations_beside_an_unread_input_count_for_no_alarm():
+    rng, jumps = np.random.default_rng(3), Jumps(settle=10)
+    watch, alarms = jumps.start(2), []
+    for k in range(200):
+        far = 20.0 if 100 <= k < 109 or k == 150 else 0.0  # the input returns at 102
+        e = rng.standard_normal((1, 2)) + far
+        blind = np.array([100 <= k < 103]) if 100 <= k < 103 else None
+        watch, alarm = jumps.add(watch, e, None, None, blind)
+        alarms += [k] * bool(alarm[0])
+    assert alarms == [150]

@@ -264,6 +264,18 @@ def test_the_law_and_the_report_have_the_same_pauses(seed: int) -> None:
     assert found
 
 
+def test_a_pause_a_week_stays_a_pause() -> None:
+    steps = np.ones(3000)
+    weekly = np.arange(99, 3000, 200)
+    steps[weekly] = 60.0
+    assert pauses(np.concatenate([[0.0], np.cumsum(steps)])) == (weekly + 1).tolist()
+
+
+def test_a_pause_each_night_is_usual_after_some() -> None:
+    steps = np.tile([*np.ones(24), 8.0], 10)
+    assert len(pauses(np.concatenate([[0.0], np.cumsum(steps)]))) < 4
+
+
 @pytest.mark.slow
 def test_the_last_smoothed_is_the_last_filtered_across_a_pause() -> None:
     rows = samples()
