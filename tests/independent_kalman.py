@@ -26,12 +26,16 @@ class Inputs:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Row:
-    """What is measured at one time: NaN where nothing is, and the deviation of each reading."""
+    """What is measured at one time: NaN where nothing is, and the deviation of each reading.
+
+    `unread`: deviation of the error of T_0, constant over the interval before, where it is held.
+    """
 
     t: float
     inputs: Inputs
     z: np.ndarray
     std: np.ndarray
+    unread: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,15 +117,18 @@ class Rod:
         return np.concatenate([u, state[n:]])
 
     def linear(
-        self, t0: float, t1: float, first: Inputs, last: Inputs
+        self, t0: float, t1: float, first: Inputs, last: Inputs, unread: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return F, g and Q of state -> F state + g + N(0, Q)."""
         size = self.cells + 4
         g = self.step(np.zeros(size), t0, t1, first, last)
         F = np.column_stack([self.step(e, t0, t1, first, last) - g for e in np.eye(size)])
-        ends = (replace(one, T_0=one.T_0 + self.input_std) for one in (first, last))
-        off = self.step(np.zeros(size), t0, t1, *ends) - g
-        return F, g, np.outer(off, off)
+        Q = np.zeros((size, size))
+        for std in (self.input_std, unread):
+            ends = (replace(one, T_0=one.T_0 + std) for one in (first, last))
+            off = self.step(np.zeros(size), t0, t1, *ends) - g
+            Q += np.outer(off, off)
+        return F, g, Q
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -157,7 +164,7 @@ def filtered(
     for row in rows:
         F = np.eye(len(start.mean))
         if row.t > t0:
-            F, g, Q = rod.linear(t0, row.t, inputs, row.inputs)
+            F, g, Q = rod.linear(t0, row.t, inputs, row.inputs, row.unread)
             belief = Gaussian(mean=F @ belief.mean + g, cov=F @ belief.cov @ F.T + Q)
         evidence += log_density(belief, row, H)
         belief, left, information, score = updated(belief, row, H)

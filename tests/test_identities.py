@@ -424,6 +424,29 @@ LINEAR = {
 }
 
 
+def unread(o: Options, rows: list[kalman.Row]) -> list[kalman.Row]:
+    """Return the rows with the error of a line that is held: twice as long, it might be a sine.
+
+    It is no larger than inputs so far: half of their steepest change, the deviation of a sine.
+    Filters of constant unknowns have none, since their refits have none.
+    """
+    found, seen, steepest, held = [], list[float](), 0.0, 0.0
+    t0, last = 0.0, opening(rows[0].inputs, rows[0].t).T_0
+    for k, row in enumerate(rows):
+        length, missing = row.t - t0, k > 0 and row.inputs.T_0 == rows[k - 1].inputs.T_0
+        uncertain = rod(o).between[0] == "line" and (o.motion != "stays" or o.input_noise)
+        if missing and seen and uncertain:
+            spread = (max(seen) - min(seen)) / np.sqrt(8.0)
+            row = replace(row, unread=min(spread, steepest * (held + length)))
+        held = held + length if missing else 0.0
+        if length > 0.0:
+            seen.append(row.inputs.T_0)
+            steepest = max(steepest, abs(row.inputs.T_0 - last) / length)
+        t0, last = row.t, row.inputs.T_0
+        found.append(row)
+    return found
+
+
 def exact(o: Options) -> kalman.Filtered:
     """Return what the independent filter finds."""
     rows = shown(o, np.random.default_rng([o.seed, 0]))
@@ -432,6 +455,7 @@ def exact(o: Options) -> kalman.Filtered:
         rows = [replace(r, std=np.where(own & (r.std > NOISE), r.std, NOISE)) for r in rows]
     if o.spin_up:
         rows = [replace(r, z=np.where(r.t < 0.15, np.nan, r.z)) for r in rows]
+    rows = unread(o, rows)
     u = np.full(CELLS + 1, 0.3)
     mean, std = np.array([PRIOR[name] for name in "sco"]).T
     zero = np.zeros(CELLS + 1)

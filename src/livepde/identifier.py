@@ -66,7 +66,7 @@ from livepde.verdict import InputLedger, ValidationLedger, Verdict
 if TYPE_CHECKING:
     import xarray as xr
 
-FORMAT = 12  # of the checkpoint
+FORMAT = 13  # of the checkpoint
 INPUTS = ("inputs", "known")  # of the last accepted sample, and those that hold now
 
 

@@ -34,6 +34,7 @@ from livepde.laws.noise_rows import (
     lines,
     pieces,
     with_input_noise,
+    with_unread_inputs,
 )
 from livepde.laws.reduction import Reduction
 from livepde.laws.shadows import ShadowSet
@@ -248,6 +249,11 @@ class Filter:
         x, end, taken, failure = self._divided(x, span)
         if failure is None and self.problem.input_noise:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
+        # A refit of constant unknowns takes held values as they are, and so does their filter.
+        refitted = not (self.moves or self.problem.input_noise)
+        if failure is None and not refitted and self.blind(span) is not None:
+            end, failure = with_unread_inputs(self.carried, self.problem, x, end, span)
+            end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if failure is not None:
             return x, taken, failure
         end = changed(end, driven=x.driven.after(span))

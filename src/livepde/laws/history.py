@@ -1,7 +1,8 @@
 """The samples since a law may have to begin again, of all members: a log that only grows.
 
-A log has the shape (members, rows, 2 + 2 sensors + channels): time, measurements, their noise (NaN:
-that of the sensor), inputs, and in how many parts the substeps since the row before were divided.
+A log has the shape (members, rows, 2 + 2 sensors + 2 channels): time, measurements, their noise
+(NaN: that of the sensor), inputs, for how long each input has been held without a reading, and in
+how many parts the substeps since the row before were divided.
 Rows of a member that did not take a sample have the time NaN.
 """
 
@@ -22,7 +23,14 @@ ROWS = 64  # least room of a log
 
 def empty_log(members: int, sensors: int, channels: int) -> Array:
     """Return a log without rows."""
-    return np.zeros((members, 0, 2 + 2 * sensors + channels))
+    return np.zeros((members, 0, 2 + 2 * sensors + 2 * channels))
+
+
+def _inputs(log: Array, sensors: int) -> tuple[slice, slice]:
+    """Return the columns of the inputs of a log, and of how long they have been held."""
+    first = 1 + 2 * sensors
+    middle = first + (log.shape[2] - 1 - first) // 2
+    return slice(first, middle), slice(middle, -1)
 
 
 def opened(log: Array, span: Span) -> Array:
@@ -33,9 +41,10 @@ def opened(log: Array, span: Span) -> Array:
     row, sensors = begun[:, -1], span.z1.shape[1]
     row[:] = np.nan
     row[:, 0] = span.t0
+    inputs, held = _inputs(log, sensors)
     # Validation sensors of a fleet may read more channels, which come last.
-    row[:, 1 + 2 * sensors : -1] = span.inputs0[:, : log.shape[2] - 2 - 2 * sensors]
-    row[:, -1] = 1.0
+    row[:, inputs] = span.inputs0[:, : inputs.stop - inputs.start]
+    row[:, held], row[:, -1] = 0.0, 1.0
     return begun
 
 
@@ -46,8 +55,13 @@ def added(log: Array, span: Span, taken: Mask, parts: IntArray) -> Array:
     row[:, 0] = span.t1
     row[:, 1 : 1 + sensors] = span.z1
     row[:, 1 + sensors : 1 + 2 * sensors] = np.nan if span.noise is None else span.noise
-    row[:, 1 + 2 * sensors : -1] = span.stated[:, : log.shape[2] - 2 - 2 * sensors]
-    row[:, -1] = parts
+    inputs, held = _inputs(log, sensors)
+    known = inputs.stop - inputs.start
+    row[:, inputs] = span.stated[:, :known]
+    row[:, held], row[:, -1] = 0.0, parts
+    if span.gaps is not None:
+        before, missing = span.gaps[:, 0, :known], span.gaps[:, 1, :known]
+        row[:, held] = missing * (before + (span.t1 - span.t0)[:, None])
     if np.count_nonzero(taken) < len(taken):
         row[~taken] = np.nan
     return longer
@@ -96,13 +110,28 @@ def trimmed(log: Array, first: int) -> Array:
 
 
 def _rows(log: Array, channels: tuple[str, ...]) -> list[End]:
-    sensors = (log.shape[2] - 2 - len(channels)) // 2
-    found = []
+    sensors = (log.shape[2] - 2 - 2 * len(channels)) // 2
+    values, held = _inputs(log, sensors)
+    found = list[End]()
+    before = [0.0] * len(channels)
     for row in log[0][np.isfinite(log[0, :, 0])]:
-        t, z, noise, inputs = np.split(row[:-1], [1, 1 + sensors, 1 + 2 * sensors])
-        named = Inputs(dict(zip(channels, inputs.tolist(), strict=True)))
-        parts = int(row[-1])
-        found.append(End(t=float(t[0]), inputs=named, z=z, noise=own_noise(noise), parts=parts))
+        t, z, noise = np.split(row[: values.start], [1, 1 + sensors])
+        named = Inputs(dict(zip(channels, row[values].tolist(), strict=True)))
+        gaps, now = {}, row[held].tolist()
+        if any(before) or (any(now) and found):
+            each = zip(channels, before, now, strict=True)
+            gaps = {name: (past, again > 0.0) for name, past, again in each if past or again}
+        before = now
+        found.append(
+            End(
+                t=float(t[0]),
+                inputs=named,
+                z=z,
+                noise=own_noise(noise),
+                gaps=gaps,
+                parts=int(row[-1]),
+            )
+        )
     return found
 
 

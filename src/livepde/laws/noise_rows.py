@@ -221,9 +221,36 @@ def _bare(x: FilterState) -> FilterState:
     )
 
 
-def _moved(span: Span, name: str, change: float) -> Span:
+def with_unread_inputs(
+    propagate: Propagate, problem: Problem, x: FilterState, end: FilterState, span: Span
+) -> tuple[FilterState, StepFailed | None]:
+    """Return the state after a span with one more row for each channel that is held in a gap.
+
+    The channel may be as far from the value that it is held at as inputs have moved before in such
+    a time (`InputHistory.deviation`). Parameters are those of `with_input_noise`.
+    """
+    if span.gaps is None:
+        return end, None
+    members, k, bare, rows = len(x), x.C.shape[2], _bare(x), []
+    for name in lines(problem):
+        held, missing = span.gaps[:, :, span.channels.index(name)].T
+        if not np.count_nonzero(missing):
+            continue
+        length = 2.0 * (held + span.t1 - span.t0)  # the end of a gap is open
+        size = x.driven.deviation(length)[:, problem.channels.index(name)] * missing
+        off, _, failure = propagate(bare, _moved(span, name, size[:, None]))
+        if failure is not None:
+            return end, failure
+        rows.append(off.u - end.u)
+    if not rows:
+        return end, None
+    return with_rows(end, np.stack(rows, axis=1), np.zeros((members, len(rows), k))), None
+
+
+def _moved(span: Span, name: str, change: Any) -> Span:
     shift = np.zeros(len(span.channels))
-    shift[span.channels.index(name)] = change
+    shift[span.channels.index(name)] = 1.0
+    shift = change * shift
     last = span.inputs1 + shift
     first = last if span.inputs0 is span.inputs1 else span.inputs0 + shift
     return replace(span, inputs0=first, inputs1=last, interval=None)
