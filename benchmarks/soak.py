@@ -9,8 +9,10 @@ time. A row comes every minute, and each week has one fault of each kind.
 from __future__ import annotations
 
 import os
+import sqlite3
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import count, islice
 from pathlib import Path
@@ -57,7 +59,7 @@ FRESH = 24  # steps of the one beside it, between two of its refits
 BEGUN = 36  # steps before them
 GROWTH = 5.0  # MiB of memory, at most
 SLOWER = 1.2  # last tenth of the steps over the first one, at most
-KEPT = 1.5  # times the numbers of the estimates that stay, by which the journal may grow
+KEPT = 1.5  # times the estimates that stay, by which the journal may grow
 LOG = 32.0  # MiB of the write-ahead log, at most
 RETAINED = 20_000  # samples of which all is kept
 EVERY = 24  # of older estimates one in so many
@@ -198,14 +200,13 @@ def soak(steps: int, *, share: float = 1.0, progress: bool = False) -> Outcome:
             )
             live.run()
             kept, accepted, counts = len(journal), journal.accepted, journal.counts
-            layout = journal.layout
         with Journal.open(path) as after:
             read = sum(1 for _ in after)
+        record = _record_size(path)
     last = identifier.estimate().parameters
     error = max(abs(last[name][0] / true - 1.0) for name, true in (("k", K), ("loss", LOSS)))
     lost = abs(plant.right - accepted)
-    numbers = sum(map(len, (layout.numbers, layout.sensors)))
-    outcome = _outcome(meter, steps, kept - read, error, numbers=numbers, lost=lost, share=share)
+    outcome = _outcome(meter, steps, kept - read, error, record=record, lost=lost, share=share)
     told = [(kind, channel, number) for (kind, channel), number in sorted(counts.items())]
     table = Table("What was counted", ("kind", "channel", "number"), told)
     return replace(outcome, tables=[*outcome.tables, table])
@@ -217,11 +218,11 @@ def _outcome(
     unread: int,
     error: float,
     *,
-    numbers: int,
+    record: float,
     lost: int = 0,
     share: float = 1.0,
 ) -> Outcome:
-    """Return the outcome; `numbers` are those of an estimate in the journal."""
+    """Return the outcome; `record` is the size of an estimate in the journal, in bytes."""
     warm, retained = round(share * WARM), round(share * RETAINED)
     found = [reading for reading in meter.readings if reading.steps >= warm]
     tenth = max(len(found) // 10, 1)
@@ -254,8 +255,7 @@ def _outcome(
             for r in shown
         ],
     )
-    stays = 8.0 * numbers / EVERY  # bytes of a step
-    kept = (last.file - middle.file) / (last.steps - middle.steps) / stays
+    kept = (last.file - middle.file) / (last.steps - middle.steps) / (record / EVERY)
     checks = [
         Check(
             f"memory: growth after {warm} steps (MiB)",
@@ -329,6 +329,15 @@ def _rows(model: Model) -> Iterator[Row]:
         noise = NOISE * rng.standard_normal(len(SENSORS))
         z = {n: x + e for n, x, e in zip(SENSORS, seen[k % PERIOD], noise.tolist(), strict=True)}
         yield {"t": k, **z, "left": float(left[1 + k % PERIOD])}
+
+
+def _record_size(path: Path) -> float:
+    """Return the mean size of an estimate in a journal, in bytes."""
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as journal:
+        columns = [name for _, name, *_ in journal.execute("PRAGMA table_info(estimates)")]
+        sizes = " + ".join(f"LENGTH(CAST({name} AS BLOB))" for name in columns)
+        ((mean,),) = journal.execute(f"SELECT AVG({sizes}) FROM estimates")
+    return float(mean)
 
 
 def _memory() -> tuple[float, float]:

@@ -182,13 +182,13 @@ def test_soak_sees_what_grows():
     meter = soak.Meter(None, lambda: 1e-3)
     flat = soak.Reading(0, 1e-3, 1e-3, 1e8, 2e8, 5e6, 4e6)
     meter.readings = [replace(flat, steps=k) for k in steps]
-    assert not failed(soak._outcome(meter, 30_000, 0, 0.0, numbers=80))
+    assert not failed(soak._outcome(meter, 30_000, 0, 0.0, record=640.0))
     meter.readings = [
         soak.Reading(k, 1e-3 * k / soak.WARM, 1e-3, 1e8 + 1e3 * k, 2e8, 100.0 * k, 1e4 * k)
         for k in steps
     ]
     meter.failed = 1
-    assert len(failed(soak._outcome(meter, 30_000, 1, 0.1, numbers=80, lost=1))) == 8
+    assert len(failed(soak._outcome(meter, 30_000, 1, 0.1, record=640.0, lost=1))) == 8
 
 
 def test_the_commands_print_json(monkeypatch):
