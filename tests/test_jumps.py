@@ -163,7 +163,7 @@ def test_a_sensor_that_is_stuck_is_no_jump_and_hides_none():
 
 
 def test_a_sensor_that_stays_stuck_hides_no_slow_evidence_of_the_others():
-    """Its repetitions are left out, and the sums of the other sensors go on."""
+    """The sums leave out repeated readings, and keep those of the other sensors."""
     rng, jumps, alarms = np.random.default_rng(3), Jumps(settle=10), []
     watch = jumps.start(3)
     for k in range(300):
@@ -179,18 +179,20 @@ def test_a_sensor_that_stays_stuck_hides_no_slow_evidence_of_the_others():
 
 def test_an_input_that_is_not_read_is_no_jump():
     """A boundary is held for 30 samples while it moves: readings tell of it, not of unknowns."""
-    identifier = soak._identifier()
+    model = soak._identifier().model
+    law = lp.SensitivityLaw(jumps=Jumps(), refit=None)
+    identifier = lp.Identifier(model, lp.Points(soak.SENSORS, noise=soak.NOISE), law)
     alarms = []
-    for row in islice(soak._rows(identifier.model), 700):
+    for row in islice(soak._rows(model), 1150):
         k = row["t"]
         z = {name: row[name] for name in soak.COLUMNS}
-        z["left"] = None if 300 <= k < 330 else z["left"]
+        z["left"] = None if 1000 <= k < 1030 else z["left"]
         estimate = identifier.step(soak.DT * k, z)
         alarms += [k] * (estimate.diagnostics.jump > 0.0)
     assert not alarms
     for name, truth in (("k", soak.K), ("loss", soak.LOSS)):
         value, std = estimate.parameters[name]
-        assert abs(value - truth) < 3.0 * std < truth
+        assert abs(value - truth) < 3.0 * std < 0.2 * truth
 
 
 def test_innovations_beside_an_unread_input_count_for_no_alarm():
@@ -199,7 +201,7 @@ def test_innovations_beside_an_unread_input_count_for_no_alarm():
     for k in range(200):
         far = 20.0 if 100 <= k < 109 or k == 150 else 0.0  # the input returns at 102
         e = rng.standard_normal((1, 2)) + far
-        blind = np.array([100 <= k < 103]) if 100 <= k < 103 else None
-        watch, alarm = jumps.add(watch, e, None, None, blind)
+        unread = np.array([100 <= k < 103]) if 100 <= k < 103 else None
+        watch, alarm = jumps.add(watch, e, None, None, unread)
         alarms += [k] * bool(alarm[0])
     assert alarms == [150]

@@ -122,7 +122,7 @@ class Filter:
         channels = self.problem.channels
         return np.array([channels.index(name) for name in lines(self.problem)], dtype=np.int64)
 
-    def blind(self, span: Span) -> Mask | None:
+    def input_gaps(self, span: Span) -> Mask | None:
         """Return for which members an input was not read in a span, (members,); None: for none.
 
         What the innovations tell then may be what that input has done.
@@ -249,9 +249,9 @@ class Filter:
         x, end, taken, failure = self._divided(x, span)
         if failure is None and self.problem.input_noise:
             end, failure = with_input_noise(self.carried, self.problem, x, end, span)
-        # A refit of constant unknowns takes held values as they are, and so does their filter.
-        refitted = not (self.moves or self.problem.input_noise)
-        if failure is None and not refitted and self.blind(span) is not None:
+        # A refit of constant unknowns takes held values as exact, and so does their filter.
+        uncertain = self.moves or bool(self.problem.input_noise)
+        if failure is None and uncertain and self.input_gaps(span) is not None:
             end, failure = with_unread_inputs(self.carried, self.problem, x, end, span)
             end = self.compressed(end) if end.U.shape[1] > self.rank else end
         if failure is not None:

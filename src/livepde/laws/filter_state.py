@@ -22,7 +22,7 @@ from livepde.verdict import Ledger
 
 PAUSE = 5.0  # usual intervals: in a longer one inputs are not known
 SETTLED = 20  # intervals before which none is usual
-FORGOTTEN = 50.0  # intervals after which a long one is hardly usual any more
+FORGOTTEN = 50.0  # shorter intervals that follow, until the pace has fallen by 63 %
 SPREAD = 1.0 / np.sqrt(8.0)  # standard deviation of a sine over its range
 NO_LEDGER = Ledger.start(0, 0, 0, 0, 0, 0, 0, 1, 0)  # of a filter that is not judged
 

@@ -264,8 +264,8 @@ def _watched(
     if not interval.present.any():  # there is no innovation, and `newest` is that of before
         return new, report
     screened, e = new.now.screened, new.now.innovations.newest
-    blind = work.filter.blind(work.filter.span(interval))
-    watch, alarms = jumps.add(state.watch, e, screened.refused, screened.run, blind)
+    gaps = work.filter.input_gaps(work.filter.span(interval))
+    watch, alarms = jumps.add(state.watch, e, screened.refused, screened.run, gaps)
     alarm, new = bool(alarms[0]), changed(new, watch=watch)
     if alarm:
         row = int(state.since_older[0])

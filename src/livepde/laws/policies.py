@@ -276,7 +276,7 @@ class Jumps:
         e: Array,
         refused: IntArray | None = None,
         run: IntArray | None = None,
-        blind: Mask | None = None,
+        unread: Mask | None = None,
     ) -> tuple[Watch, Mask]:
         """Return the value after a sample, and for which members there is an alarm.
 
@@ -286,12 +286,12 @@ class Jumps:
             Normalised innovations, shape (members, sensors), NaN where missing.
         refused, run
             As for `Watch.add` and `Watch.repeating`; None: no reading repeats one.
-        blind
+        unread
             Members with an input that was not read, (members,): what it did is no jump of an
             unknown, and moves the state for some time; None: there are none.
         """
-        if blind is not None:
-            watch, e = watch.interrupted(blind, self.settle), np.where(blind[:, None], np.nan, e)
+        if unread is not None:
+            watch, e = watch.interrupted(unread, self.settle), np.where(unread[:, None], np.nan, e)
         if run is not None and np.count_nonzero(run) + np.count_nonzero(watch.stuck):
             stuck = watch.repeating(run)
             # The sums contain the first reading of the repeated value, and are cleared.

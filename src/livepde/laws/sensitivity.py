@@ -444,8 +444,8 @@ class SensitivityLaw(Law[SensitivityWork, SensitivityState]):
                 usual = usual & ~(beyond > guards.runaway)
         if (jumps := self.jumps) is not None and (present := span.present).any():
             screened, newest = x.screened, x.innovations.newest
-            blind = filter_.blind(span)
-            seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run, blind)
+            gaps = filter_.input_gaps(span)
+            seen, alarm = jumps.add(state.watch, newest, screened.refused, screened.run, gaps)
             # Without a reading `newest` is that of an earlier sample, which has been counted.
             parts["watch"] = where(np.broadcast_to(present, alarm.shape), seen, state.watch)
             usual = usual & ~(alarm & present)
